@@ -1,0 +1,36 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: demo test check data bench clean
+
+$(VENV)/ready: setup.cfg pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable '.[test,check]'
+	touch $@
+
+demo: $(VENV)/ready
+	$(BIN)/ertis process data/synthetic/reflectors.h5 --output demo.h5 --directions 2d:181 --force
+	$(BIN)/ertis peaks demo.h5 --top 5
+	$(BIN)/ertis plot demo.h5 --output demo.png --force
+
+test: $(VENV)/ready
+	$(BIN)/python -m pytest
+
+check: $(VENV)/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+data: $(VENV)/ready  ## rebuild data/synthetic from its scenes
+	$(BIN)/python data/synthetic/build.py
+
+bench: $(VENV)/ready  ## measure this machine and write bench/README.md
+	$(BIN)/ertis bench paper --update bench/README.md
+	$(BIN)/ertis bench scaling --update bench/README.md
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo.h5 demo.png

@@ -1,0 +1,76 @@
+"""The wording of argument errors: what came, what was wanted, the remedy."""
+
+import difflib
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["between", "choice", "finite", "finite_array", "interval", "positive", "shape", "whole"]
+
+
+def finite(name: str, value: float) -> float:
+    """Return ``value`` as a float; refuse NaN, infinities and what is no number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ArgumentError(f"{name} is {value!r}; give a number")
+    if not math.isfinite(value):
+        raise ArgumentError(f"{name} is {value}; give a finite number")
+    return float(value)
+
+
+def positive(name: str, value: float) -> float:
+    """Return ``value`` if it is finite and above zero."""
+    if finite(name, value) <= 0:
+        raise ArgumentError(f"{name} is {value:g}; give a number above 0")
+    return float(value)
+
+
+def between(name: str, value: float, low: float, high: float) -> float:
+    """Return ``value`` if it lies in ``[low, high]``."""
+    if not low <= finite(name, value) <= high:
+        raise ArgumentError(f"{name} is {value:g}; give a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def interval(name: str, value: tuple[float, float], low: float, high: float) -> None:
+    """Refuse an interval that is not ``low <= first <= last <= high``."""
+    first, last = (between(name, edge, low, high) for edge in value)
+    if first > last:
+        raise ArgumentError(f"{name} runs from {first:g} to {last:g}; give the smaller number first")
+
+
+def whole(name: str, value: int, low: int, high: int | None = None) -> int:
+    """Return ``value`` if it is a whole number in ``[low, high]``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ArgumentError(f"{name} is {value!r}; give a whole number")
+    if value < low or (high is not None and value > high):
+        wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise ArgumentError(f"{name} is {value}; give a whole number {wanted}")
+    return int(value)
+
+
+def choice(name: str, value: object, known: Iterable[object]) -> None:
+    """Refuse a ``value`` that is not among ``known``, naming the nearest one."""
+    names = [str(item) for item in known]
+    if str(value) in names:
+        return
+    near = difflib.get_close_matches(str(value), names, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise ArgumentError(f"{name} {str(value)!r} is unknown{hint}; known are {', '.join(names)}")
+
+
+def finite_array(name: str, values: NDArray[np.floating]) -> None:
+    """Refuse an array that holds NaN or infinities, naming the first place."""
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        place = ", ".join(str(i) for i in bad[0])
+        raise ArgumentError(f"{name} holds {values[tuple(bad[0])]} at [{place}]; give finite numbers")
+
+
+def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+    """Refuse an array whose shape is not ``wanted``."""
+    if actual != wanted:
+        raise ArgumentError(f"{name} has shape {actual}; give shape {wanted}")

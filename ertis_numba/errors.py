@@ -1,0 +1,46 @@
+"""Every error this package raises on purpose, in one tree.
+
+::
+
+    ErtisError
+    ├── ArgumentError (ValueError)       a value given by the caller cannot be used
+    │   └── SettingsError                a settings file or structure cannot be used
+    ├── DataError (ValueError)           a file or measurement does not hold what it should
+    │   └── FormatVersionError           a file was written by a newer version
+    └── DeviceError (RuntimeError)       the compute device asked for is not there
+
+Each class also inherits the builtin that a caller would catch without knowing this package.
+"""
+
+__all__ = [
+    "ArgumentError",
+    "DataError",
+    "DeviceError",
+    "ErtisError",
+    "FormatVersionError",
+    "SettingsError",
+]
+
+
+class ErtisError(Exception):
+    """Base of all errors raised on purpose; its text is one line fit to show to a user."""
+
+
+class ArgumentError(ErtisError, ValueError):
+    """A value given by the caller cannot be used."""
+
+
+class SettingsError(ArgumentError):
+    """A settings file or structure cannot be used."""
+
+
+class DataError(ErtisError, ValueError):
+    """A file or a measurement does not hold what it should."""
+
+
+class FormatVersionError(DataError):
+    """A file was written by a newer version of this package."""
+
+
+class DeviceError(ErtisError, RuntimeError):
+    """The compute device asked for is not available."""

@@ -1,0 +1,103 @@
+"""What flows through the system: measurements in, energyscapes and peaks out."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.settings import Settings
+
+__all__ = ["Energyscape", "Measurement", "Peak", "Stamp"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stamp:
+    """Which sensor measured, which of its measurements this is, and when.
+
+    Attributes
+    ----------
+    sensor : str
+        Serial number or name of the sensor.
+    sequence : int
+        Number given at capture; a gap is a loss.
+    sync_count : int
+        Pulse of the SYNC chain; equal for all sensors that emitted together.
+    timestamp_ns : int
+        Nanoseconds since 1970-01-01 UTC.
+    timestamp_uncertainty_ns : int
+    """
+
+    sensor: str = "sensor"
+    sequence: int = 0
+    sync_count: int = 0
+    timestamp_ns: int = 0
+    timestamp_uncertainty_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """One emission's PDM words.
+
+    Attributes
+    ----------
+    words : (sample,) or (sample, word) uint8, uint16, uint32 or uint64
+        One word per PDM clock; bit m (least significant first) is channel m. An array with more
+        channels than a word has bits has a second axis.
+    settings : Settings
+    stamp : Stamp
+    """
+
+    words: NDArray[np.unsignedinteger[Any]]
+    settings: Settings
+    stamp: Stamp = Stamp()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Energyscape:
+    """An image: the envelope of every beam.
+
+    Attributes
+    ----------
+    energy : (direction, range) float32
+        Envelope amplitude; 1 is a full-scale echo of the whole call in every microphone.
+    azimuth_rad, elevation_rad : (direction,) float64
+        Sensor frame: x forward, azimuth towards y, elevation towards z.
+    range_m : (range,) float64
+        Half of the way of the sound, at the speed of sound of the settings' air.
+    settings : Settings
+    stamp : Stamp
+    """
+
+    energy: NDArray[np.float32]
+    azimuth_rad: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    settings: Settings
+    stamp: Stamp = Stamp()
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
+        return replace(self, **changes)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether all directions lie in the horizontal plane."""
+        return not np.any(self.elevation_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Peak:
+    """One reflector seen in an energyscape.
+
+    Attributes
+    ----------
+    azimuth_deg, elevation_deg, range_m : float
+    level_db : float
+        Below the strongest reflector of the same energyscape, so at most 0.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    range_m: float
+    level_db: float

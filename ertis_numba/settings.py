@@ -1,0 +1,284 @@
+"""Everything that can be chosen, as frozen structures with TOML in and out.
+
+A structure checks itself once, when it is made; whoever holds one may rely on it. Unknown keys are
+refused. ``Settings()`` is the default eRTIS measurement; ``Settings.from_preset`` knows the RTIS
+recording presets.
+"""
+
+import math
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import msgspec
+import numpy as np
+import tomli_w
+
+from ertis_numba import checks
+from ertis_numba.constants import (
+    ERTIS_PDM_RATE_HZ,
+    MAX_MICROPHONES,
+    STANDARD_HUMIDITY_PERCENT,
+    STANDARD_PRESSURE_PA,
+    STANDARD_TEMPERATURE_C,
+    WORD_BITS,
+)
+from ertis_numba.errors import ArgumentError, SettingsError
+
+__all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settings"]
+
+_WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
+_SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
+_BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
+PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
+"""Names of the RTIS recording presets: length of the record and band of the call."""
+
+
+class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of a settings file."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked again."""
+        unknown = set(changes) - set(self.__struct_fields__)
+        if unknown:
+            checks.choice(f"{type(self).__name__} field", min(unknown), self.__struct_fields__)
+        return msgspec.structs.replace(self, **changes)
+
+
+class Array(_Section, frozen=True):
+    """Where the microphones are and how their bits lie in a word.
+
+    Attributes
+    ----------
+    layout : str
+        Name of a shipped layout, or the path of a layout file (.toml, .csv). When
+        ``positions_m`` is given it is only a label.
+    positions_m : tuple of (x, y, z), optional
+        Positions in the sensor frame, one per channel, in the order of the bits.
+    enabled : tuple of bool, optional
+        Channels that carry a microphone; all of them by default.
+    word_bits : {8, 16, 32, 64}
+        Size of one PDM word. An array with more channels uses several words per sample.
+    """
+
+    layout: str = "eRTIS_v3D1"
+    positions_m: tuple[tuple[float, float, float], ...] | None = None
+    enabled: tuple[bool, ...] | None = None
+    word_bits: int = 32
+
+    def __post_init__(self) -> None:
+        checks.choice("array.word_bits", self.word_bits, WORD_BITS)
+        if self.positions_m is None:
+            if self.enabled is not None:
+                raise ArgumentError("array.enabled is given without array.positions_m; give both or neither")
+            return
+        checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
+        checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
+        if self.enabled is not None:
+            checks.shape("array.enabled", (len(self.enabled),), (len(self.positions_m),))
+            if not any(self.enabled):
+                raise ArgumentError("array.enabled is false for every channel; enable at least one")
+
+
+class Call(_Section, frozen=True):
+    """The emitted sweep: hyperbolic frequency modulation with a Hann ramp at both ends.
+
+    Attributes
+    ----------
+    start_frequency_hz, stop_frequency_hz : float
+        First and last instantaneous frequency; eRTIS sweeps downwards.
+    duration_s : float
+    sample_rate_hz : float
+        Rate of the converter that plays the call.
+    ramp_fraction : float
+        Share of the call under the Hann ramp at each end, 0 to 0.5.
+    """
+
+    start_frequency_hz: float = 50_000.0
+    stop_frequency_hz: float = 25_000.0
+    duration_s: float = 2.5e-3
+    sample_rate_hz: float = 450_000.0
+    ramp_fraction: float = 0.1
+
+    def __post_init__(self) -> None:
+        checks.positive("call.sample_rate_hz", self.sample_rate_hz)
+        for name in ("start_frequency_hz", "stop_frequency_hz"):
+            frequency_hz = checks.positive(f"call.{name}", getattr(self, name))
+            if frequency_hz >= self.sample_rate_hz / 2:
+                raise ArgumentError(
+                    f"call.{name} is {frequency_hz:g}; give less than half of call.sample_rate_hz "
+                    f"({self.sample_rate_hz:g})"
+                )
+        if self.start_frequency_hz == self.stop_frequency_hz:
+            raise ArgumentError(
+                f"call sweeps from {self.start_frequency_hz:g} Hz to itself; give two different frequencies"
+            )
+        checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
+        checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
+
+    @property
+    def low_frequency_hz(self) -> float:
+        """Lower edge of the band."""
+        return min(self.start_frequency_hz, self.stop_frequency_hz)
+
+    @property
+    def high_frequency_hz(self) -> float:
+        """Upper edge of the band."""
+        return max(self.start_frequency_hz, self.stop_frequency_hz)
+
+
+class Recording(_Section, frozen=True):
+    """How much is recorded: PDM clock and number of samples of one measurement."""
+
+    pdm_rate_hz: float = ERTIS_PDM_RATE_HZ
+    n_samples: int = _WORDS["default"]
+
+    def __post_init__(self) -> None:
+        checks.positive("recording.pdm_rate_hz", self.pdm_rate_hz)
+        checks.whole("recording.n_samples", self.n_samples, 1)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of one measurement."""
+        return self.n_samples / self.pdm_rate_hz
+
+
+class Air(_Section, frozen=True):
+    """The medium, which sets the speed of sound."""
+
+    temperature_c: float = STANDARD_TEMPERATURE_C
+    humidity_percent: float = STANDARD_HUMIDITY_PERCENT
+    pressure_pa: float = STANDARD_PRESSURE_PA
+
+    def __post_init__(self) -> None:
+        checks.between("air.temperature_c", self.temperature_c, -40.0, 60.0)
+        checks.between("air.humidity_percent", self.humidity_percent, 0.0, 100.0)
+        checks.between("air.pressure_pa", self.pressure_pa, 10_000.0, 200_000.0)
+
+
+class Processing(_Section, frozen=True):
+    """How a measurement becomes an energyscape.
+
+    Attributes
+    ----------
+    method : {"fast", "paper"}
+        ``fast``: analytic signals, beams at the output ranges only. ``paper``: the algorithm of the
+        2019 paper, for comparison.
+    directions : str
+        A grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file.
+    azimuth_limits_deg, elevation_limits_deg : (low, high)
+        Limits of the grids that are named by a count (``2d:N`` and ``3d:N``).
+    range_m : (first, last)
+        Window of the range axis.
+    decimation : int
+        PDM samples per signal sample.
+    output_decimation : int
+        Signal samples per range of the energyscape.
+    oversampling : int
+        Delays are kept in steps of ``1 / oversampling`` of the range spacing.
+    """
+
+    method: Literal["fast", "paper"] = "fast"
+    directions: str = "90"
+    azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
+    elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
+    range_m: tuple[float, float] = (0.5, 5.0)
+    decimation: int = 10
+    output_decimation: int = 10
+    oversampling: int = 10
+
+    def __post_init__(self) -> None:
+        checks.choice("processing.method", self.method, ("fast", "paper"))
+        checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
+        checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
+        checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
+        checks.whole("processing.decimation", self.decimation, 1, 1000)
+        checks.whole("processing.output_decimation", self.output_decimation, 1, 1000)
+        checks.whole("processing.oversampling", self.oversampling, 1, 64)
+
+
+class Settings(_Section, frozen=True):
+    """All settings of one sensor: the whole content of a settings file."""
+
+    array: Array = Array()
+    call: Call = Call()
+    recording: Recording = Recording()
+    air: Air = Air()
+    processing: Processing = Processing()
+
+    def __post_init__(self) -> None:
+        if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
+            raise ArgumentError(
+                f"processing.decimation {self.processing.decimation} leaves signals at "
+                f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
+                f"{self.call.high_frequency_hz:g} Hz"
+            )
+
+    @classmethod
+    def from_preset(cls, name: str, **sections: Any) -> Self:
+        """Return the settings of a recording preset, such as ``default_25_50``.
+
+        The range window ends where the whole echo still fits into the record, at most at 5 m.
+
+        Raises
+        ------
+        ArgumentError
+            The preset is unknown.
+        """
+        checks.choice("preset", name, PRESETS)
+        length, _, band = name.partition("_")
+        low_hz, high_hz = _BANDS_HZ[band]
+        made = cls(
+            call=Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz),
+            recording=Recording(n_samples=_WORDS[length]),
+        ).replace(**sections)
+        echo_m = (made.recording.duration_s - made.call.duration_s) * _SLOWEST_AIR_M_S / 2
+        first_m, last_m = made.processing.range_m
+        last_m = min(last_m, max(first_m, math.floor(10 * echo_m) / 10))
+        return made.replace(processing=made.processing.replace(range_m=(first_m, last_m)))
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "settings") -> Self:
+        """Read settings from TOML; ``source`` names them in errors.
+
+        Raises
+        ------
+        SettingsError
+            The text is not TOML, has unknown keys, or a value cannot be used.
+        """
+        try:
+            return msgspec.toml.decode(text, type=cls)
+        except msgspec.DecodeError as error:  # ValidationError is one, too
+            reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
+            raise SettingsError(f"{source}: {reason}; correct it or take it out") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a settings file.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read or used.
+        """
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: {error}; give a readable settings file") from error
+        return cls.from_toml(text, str(path))
+
+    def to_toml(self) -> str:
+        """Return the settings as TOML text that `from_toml` reads back to an equal structure."""
+        tables = msgspec.to_builtins(self)
+        return tomli_w.dumps(
+            {name: {key: value for key, value in table.items() if value is not None} for name, table in tables.items()}
+        )
+
+    @property
+    def signal_rate_hz(self) -> float:
+        """Rate of the demodulated signals."""
+        return self.recording.pdm_rate_hz / self.processing.decimation
+
+    @property
+    def output_rate_hz(self) -> float:
+        """Rate at which the energyscape samples its range axis."""
+        return self.signal_rate_hz / self.processing.output_decimation

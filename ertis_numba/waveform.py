@@ -1,0 +1,141 @@
+"""The emitted call, its matched filter and the decimation filter."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Call
+
+__all__ = [
+    "MatchedFilter",
+    "call_at",
+    "call_samples",
+    "decimation_taps",
+    "filter_response",
+    "matched_band_hz",
+    "matched_filter",
+    "matched_guard_s",
+]
+
+_TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
+_STOP_BAND_DB = 60.0  # image noise of a 4th order modulator stays below the float32 image's needs
+
+
+def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
+    """Return the emitted call: (sample,) float64, amplitude 1 between its ramps.
+
+    Hyperbolic frequency modulation, ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)``, whose phase is
+    ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse
+    compression by means of linear-period modulation, Proc. IEEE 57, 1969).
+
+    Parameters
+    ----------
+    call : Call
+    rate_hz : float, optional
+        Sample rate; the call's own by default.
+    """
+    rate_hz = call.sample_rate_hz if rate_hz is None else rate_hz
+    time_s = np.arange(math.floor(call.duration_s * rate_hz * (1 + 1e-12)) + 1) / rate_hz
+    return call_at(call, time_s)
+
+
+def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the call at any times, 0 outside ``[0, duration_s]``."""
+    inside_s = np.clip(time_s, 0.0, call.duration_s)
+    period_s = 1 / call.start_frequency_hz
+    period_rise = (1 / call.stop_frequency_hz - period_s) / call.duration_s
+    phase_rad = 2 * math.pi / period_rise * np.log1p(inside_s * period_rise / period_s)
+    edge_s = np.minimum(inside_s, call.duration_s - inside_s)
+    ramp_s = call.ramp_fraction * call.duration_s
+    ramp = np.sin(math.pi / 2 * np.minimum(edge_s / ramp_s, 1.0)) ** 2 if ramp_s else 1.0
+    return np.where(inside_s == time_s, np.sin(phase_rad) * ramp, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedFilter:
+    """The matched filter of a call as the occupied bins of a one-sided spectrum.
+
+    Attributes
+    ----------
+    first_bin : int
+        Bin of the first value.
+    values : (bin,) complex128
+    centre_hz : float
+        Mean frequency of the filtered call, weighted by its power.
+    """
+
+    first_bin: int
+    values: NDArray[np.complex128]
+    centre_hz: float
+
+
+def matched_band_hz(call: Call) -> tuple[float, float]:
+    """Return the band outside which the matched filter is 0: the call's, and its window's edges."""
+    edge_hz = min(_TRANSITION_HZ, call.low_frequency_hz / 2)
+    return call.low_frequency_hz - edge_hz, call.high_frequency_hz + edge_hz
+
+
+def matched_guard_s(call: Call) -> float:
+    """Return how long the matched filter rings before the call and after it."""
+    return 2 / (call.low_frequency_hz - matched_band_hz(call)[0])
+
+
+def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
+    """Return the matched filter for spectra of ``n_fft`` points at ``rate_hz``.
+
+    ``H(f) = 2 g conj(S(f)) W(f)`` for positive frequencies, with S the spectrum of the call, W a
+    window that is 1 over the call's band and falls to 0 outside it as a raised cosine, and g such
+    that the call itself gives an analytic signal with an envelope of 1 at its peak.
+    """
+    low_hz, high_hz = matched_band_hz(call)
+    bins = np.arange(math.ceil(low_hz * n_fft / rate_hz), math.floor(high_hz * n_fft / rate_hz) + 1)
+    frequency_hz = bins * rate_hz / n_fft
+    spectrum = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins]
+    outside_hz = np.maximum(call.low_frequency_hz - frequency_hz, frequency_hz - call.high_frequency_hz)
+    window = np.cos(math.pi / 2 * np.clip(outside_hz / (call.low_frequency_hz - low_hz), 0.0, 1.0)) ** 2
+    power = np.abs(spectrum) ** 2 * window
+    return MatchedFilter(
+        first_bin=int(bins[0]),
+        values=np.conj(spectrum) * window * (n_fft / np.sum(power)),
+        centre_hz=float(np.sum(frequency_hz * power) / np.sum(power)),
+    )
+
+
+def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> NDArray[np.float64]:
+    """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
+
+    A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
+    damped by at least 60 dB. The length is ``2 k · decimation + 1``, so that the group delay is k
+    samples of the decimated signal exactly.
+
+    Raises
+    ------
+    ArgumentError
+        The decimated rate cannot hold ``pass_hz``.
+    """
+    rate_hz = pdm_rate_hz / decimation
+    transition_hz = rate_hz - 2 * pass_hz
+    if transition_hz <= 0:
+        raise ArgumentError(
+            f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
+        )
+    width_rad = 2 * math.pi * transition_hz / pdm_rate_hz
+    wanted = (_STOP_BAND_DB - 7.95) / (2.285 * width_rad)
+    half = decimation * math.ceil(wanted / 2 / decimation)
+    stop_band_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
+    beta = 0.1102 * (stop_band_db - 8.7)  # Kaiser's formula above 50 dB
+    position = np.arange(-half, half + 1)
+    taps = np.sinc(position / decimation) * np.kaiser(2 * half + 1, beta)
+    return np.asarray(taps / taps.sum())
+
+
+def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gain of a symmetric filter, its group delay removed: (frequency,) float64.
+
+    ``frequency`` is in cycles per sample of the filter's input.
+    """
+    position = np.arange(len(taps)) - (len(taps) - 1) / 2
+    return np.asarray(np.cos(2 * math.pi * frequency[:, None] * position) @ taps)
