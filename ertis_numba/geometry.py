@@ -53,13 +53,19 @@ class Layout:
     positions_m : (channel, axis) float64
         From the centroid of the enabled microphones.
     enabled : (channel,) bool
+    gain : (channel,) float64
+        Calibrated sensitivity.
+    delay_s : (channel,) float64
+        Calibrated lateness.
     word_bits : int
     """
 
     name: str
     positions_m: NDArray[np.float64]
     enabled: NDArray[np.bool_]
-    word_bits: int = 32
+    gain: NDArray[np.float64]
+    delay_s: NDArray[np.float64]
+    word_bits: int
 
     @property
     def n_words(self) -> int:
@@ -76,7 +82,9 @@ class Layout:
         return Array(
             layout=self.name,
             positions_m=tuple((float(x), float(y), float(z)) for x, y, z in self.positions_m),
-            enabled=tuple(bool(flag) for flag in self.enabled),
+            enabled=tuple(self.enabled.tolist()),
+            gain=tuple(self.gain.tolist()),
+            delay_s=tuple(self.delay_s.tolist()),
             word_bits=self.word_bits,
         )
 
@@ -179,10 +187,16 @@ def microphones(array: Array) -> Layout:
     if array.positions_m is None:
         return load_layout(array.layout)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
-    checks.whole("number of microphones", len(positions_m), 1, MAX_MICROPHONES)
     enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
     centred_m = np.where(enabled[:, None], positions_m - positions_m[enabled].mean(axis=0), 0.0)
-    return Layout(array.layout, centred_m, enabled, array.word_bits)
+    return Layout(
+        name=array.layout,
+        positions_m=centred_m,
+        enabled=enabled,
+        gain=np.ones(len(enabled)) if array.gain is None else np.asarray(array.gain, dtype=np.float64),
+        delay_s=np.zeros(len(enabled)) if array.delay_s is None else np.asarray(array.delay_s, dtype=np.float64),
+        word_bits=array.word_bits,
+    )
 
 
 def direction_grid(processing: Processing) -> Grid:

@@ -56,6 +56,10 @@ class Array(_Section, frozen=True):
         Positions in the sensor frame, one per channel, in the order of the bits.
     enabled : tuple of bool, optional
         Channels that carry a microphone; all of them by default.
+    gain : tuple of float, optional
+        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
+    delay_s : tuple of float, optional
+        Calibrated lateness of each channel, 0 by default; it is taken out.
     word_bits : {8, 16, 32, 64}
         Size of one PDM word. An array with more channels uses several words per sample.
     """
@@ -63,20 +67,31 @@ class Array(_Section, frozen=True):
     layout: str = "eRTIS_v3D1"
     positions_m: tuple[tuple[float, float, float], ...] | None = None
     enabled: tuple[bool, ...] | None = None
+    gain: tuple[float, ...] | None = None
+    delay_s: tuple[float, ...] | None = None
     word_bits: int = 32
 
     def __post_init__(self) -> None:
         checks.choice("array.word_bits", self.word_bits, WORD_BITS)
         if self.positions_m is None:
-            if self.enabled is not None:
-                raise ArgumentError("array.enabled is given without array.positions_m; give both or neither")
+            for name in ("enabled", "gain", "delay_s"):
+                if getattr(self, name) is not None:
+                    raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
             return
-        checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
+        n_channels = checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
         checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
         if self.enabled is not None:
-            checks.shape("array.enabled", (len(self.enabled),), (len(self.positions_m),))
+            checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
                 raise ArgumentError("array.enabled is false for every channel; enable at least one")
+        if self.gain is not None:
+            checks.shape("array.gain", (len(self.gain),), (n_channels,))
+            for channel, gain in enumerate(self.gain):
+                checks.between(f"array.gain[{channel}]", gain, 1e-3, 1e3)
+        if self.delay_s is not None:
+            checks.shape("array.delay_s", (len(self.delay_s),), (n_channels,))
+            for channel, delay_s in enumerate(self.delay_s):
+                checks.between(f"array.delay_s[{channel}]", delay_s, -1e-3, 1e-3)
 
 
 class Call(_Section, frozen=True):

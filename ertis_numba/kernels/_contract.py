@@ -1,0 +1,198 @@
+"""What every kernel does, whatever device it runs on: the one docstring of each.
+
+Arrays come first, then numbers, then ``out``, which the kernel fills. Nothing is returned and nothing
+is checked: shapes and bounds are the business of the stages, which know them when they are made.
+Arrays are C-contiguous. Axes are named in this order: mic, phase, sample; direction, range.
+"""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["KernelSet"]
+
+Words = NDArray[np.unsignedinteger[Any]]
+Real = NDArray[np.float32]
+Complex = NDArray[np.complex64]
+Index = NDArray[np.int32]
+
+
+class UnpackBits(Protocol):
+    """Turn the bits of PDM words into signals of +1 and −1.
+
+    Parameters
+    ----------
+    words : (sample, word) uint8, uint16, uint32 or uint64
+        Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
+    channels : (mic,) int32
+        Channel of each microphone.
+    out : (mic, sample) float32
+    """
+
+    def __call__(self, words: Words, channels: Index, out: Real) -> None: ...
+
+
+class Decimate(Protocol):
+    """Filter signals and keep every ``factor``-th sample.
+
+    ``out[mic, n] = Σ_t taps[t] · signals[mic, n · factor + t − (n_taps − 1)]``; samples before the
+    first are 0. The result is late by the group delay of the taps, ``(n_taps − 1) / 2`` input samples.
+
+    Parameters
+    ----------
+    signals : (mic, sample) float32
+    taps : (tap,) float32
+        Symmetric.
+    factor : int
+    out : (mic, n) float32
+    """
+
+    def __call__(self, signals: Real, taps: Real, factor: int, out: Real) -> None: ...
+
+
+class RemoveGroupDelay(Protocol):
+    """Move signals ahead in time: ``out[mic, n] = signals[mic, n + delay]``, 0 past the end.
+
+    Parameters
+    ----------
+    signals : (mic, sample) float32
+    delay : int
+        In samples, at least 0.
+    out : (mic, n) float32
+    """
+
+    def __call__(self, signals: Real, delay: int, out: Real) -> None: ...
+
+
+class DemodulateWords(Protocol):
+    """Unpack, decimate and remove the group delay in one pass over the words.
+
+    ``out[mic, n] = Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]`` with x = ±1
+    from the bits, 0 outside the record. Samples of ``out`` past ``n_outputs`` are set to 0.
+
+    Parameters
+    ----------
+    words, channels
+        As in `UnpackBits`.
+    taps : (tap,) float32
+        Symmetric, an odd number.
+    factor, first, n_outputs : int
+    out : (mic, sample) float32
+    """
+
+    def __call__(
+        self, words: Words, channels: Index, taps: Real, factor: int, first: int, n_outputs: int, out: Real
+    ) -> None: ...
+
+
+class MultiplySpectra(Protocol):
+    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``.
+
+    Parameters
+    ----------
+    spectra : (mic, bin) complex64
+    response : (bin,) complex64
+    out : (mic, bin) complex64
+    """
+
+    def __call__(self, spectra: Complex, response: Complex, out: Complex) -> None: ...
+
+
+class MultiplyAndFold(Protocol):
+    """Multiply spectra by one filter per phase and fold each product to the length of ``out``.
+
+    ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[phase, b]`` over all b with
+    ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the
+    filtered signal at the output rate, once per phase: the polyphase form of one long transform.
+
+    Parameters
+    ----------
+    spectra : (mic, bin) complex64
+    responses : (phase, b) complex64
+    first_bin : int
+    out : (mic, phase, k) complex64
+    """
+
+    def __call__(self, spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None: ...
+
+
+class DelayAndSum(Protocol):
+    """Sum the delayed and weighted signals of all microphones for every direction and range.
+
+    ``out[direction, range] = Σ_mic weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``.
+    The offset names microphone, phase and first sample at once; the weight corrects the carrier's
+    phase for what the rounding of the delay left over.
+
+    Parameters
+    ----------
+    signals : (mic, phase, sample) complex64
+    offsets : (direction, mic) int32
+    weights : (direction, mic) complex64
+    out : (direction, range) complex64
+    """
+
+    def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None: ...
+
+
+class Envelope(Protocol):
+    """Take the magnitude of analytic beams.
+
+    Parameters
+    ----------
+    beams : (direction, range) complex64
+    out : (direction, range) float32
+    """
+
+    def __call__(self, beams: Complex, out: Real) -> None: ...
+
+
+class DelayAndSumEnvelope(Protocol):
+    """`DelayAndSum` and `Envelope` in one pass, so that no beam is written to memory.
+
+    Parameters
+    ----------
+    signals, offsets, weights
+        As in `DelayAndSum`.
+    out : (direction, range) float32
+    """
+
+    def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Real) -> None: ...
+
+
+class Threads(Protocol):
+    """Run the enclosed kernels of this Python thread on ``count`` threads.
+
+    Raises
+    ------
+    ArgumentError
+        There are fewer.
+    """
+
+    def __call__(self, count: int) -> AbstractContextManager[None]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class KernelSet:
+    """The kernels of one device, and how many threads they may use.
+
+    Attributes
+    ----------
+    device : str
+    max_threads : int
+    """
+
+    device: str
+    max_threads: int
+    threads: Threads
+    unpack_bits: UnpackBits
+    decimate: Decimate
+    remove_group_delay: RemoveGroupDelay
+    demodulate_words: DemodulateWords
+    multiply_spectra: MultiplySpectra
+    multiply_and_fold: MultiplyAndFold
+    delay_and_sum: DelayAndSum
+    envelope: Envelope
+    delay_and_sum_envelope: DelayAndSumEnvelope

@@ -1,0 +1,61 @@
+"""The kernels compiled by Numba for all cores of the processor."""
+
+import contextlib
+import os
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+# libgomp's idle threads spin by default and take the cores from SciPy's transforms between two
+# kernels: 1.7 times slower on two cores. It reads this once, when Numba first loads it.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numba
+
+from ertis_numba import checks
+from ertis_numba.kernels._contract import KernelSet
+from ertis_numba.kernels._cpu.decimate import decimate
+from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
+from ertis_numba.kernels._cpu.delay_and_sum_envelope import delay_and_sum_envelope
+from ertis_numba.kernels._cpu.demodulate_words import demodulate_words
+from ertis_numba.kernels._cpu.envelope import envelope
+from ertis_numba.kernels._cpu.multiply_and_fold import multiply_and_fold
+from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
+from ertis_numba.kernels._cpu.remove_group_delay import remove_group_delay
+from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
+
+__all__ = ["KERNELS"]
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """See `Threads`."""
+    checks.whole("threads", count, 1, numba.config.NUMBA_NUM_THREADS)
+    before = numba.get_num_threads()
+    numba.set_num_threads(count)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+def _guarded(kernel: Any) -> Any:
+    return kernel
+
+
+KERNELS = KernelSet(
+    device="cpu",
+    max_threads=numba.config.NUMBA_NUM_THREADS,
+    threads=threads,
+    unpack_bits=unpack_bits,
+    decimate=decimate,
+    remove_group_delay=remove_group_delay,
+    demodulate_words=demodulate_words,
+    multiply_spectra=multiply_spectra,
+    multiply_and_fold=multiply_and_fold,
+    delay_and_sum=delay_and_sum,
+    envelope=envelope,
+    delay_and_sum_envelope=delay_and_sum_envelope,
+)

@@ -1,0 +1,109 @@
+"""Unpack, decimate and remove the group delay in one pass over the PDM words.
+
+A word is a ready-made mask: bit m says whether microphone m takes a tap or not. So one tap of all
+microphones of a word is one masked vector addition, ``sums += bits(word) ? tap : 0``, and since
+``x = 2 · bit − 1``, twice that sum less the sum of the taps is the filtered signal. Against a table of
+the filter's response to 10 bits at a time, this is about four times faster with AVX-512 (whose mask
+registers take the word as it is) and about as fast with AVX2.
+"""
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+__all__ = ["demodulate_words"]
+
+_GROUP = 4  # outputs summed side by side: enough chains to hide the latency of an addition
+_TILE = 32  # outputs held before they are turned from (sample, mic) to (mic, sample)
+
+
+@intrinsic
+def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
+    """Fill rows ``row … row + _GROUP`` of ``tile`` (output, bit) with the sums of the masked taps.
+
+    ``tile[row + g, bit] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])``; n_words is
+    the last axis of ``words``. Written in LLVM's vector types because no loop over bits keeps the
+    sums of a whole word in registers.
+    """
+    signature = types.void(words, types.intp, types.intp, taps, tile, types.intp)
+
+    def codegen(context, builder, signature, arguments):
+        words_value, first, step, taps_value, tile_value, row = arguments
+        lanes = signature.args[0].dtype.bitwidth
+        words_array = context.make_array(signature.args[0])(context, builder, words_value)
+        taps_array = context.make_array(signature.args[3])(context, builder, taps_value)
+        tile_array = context.make_array(signature.args[4])(context, builder, tile_value)
+        n_words = cgutils.unpack_tuple(builder, words_array.shape)[1]
+        n_taps = cgutils.unpack_tuple(builder, taps_array.shape)[0]
+        vector = ir.VectorType(ir.FloatType(), lanes)
+        mask = ir.VectorType(ir.IntType(1), lanes)
+        lane_0 = ir.Constant(ir.IntType(32), 0)
+        all_lanes_0 = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+        zero = ir.Constant(vector, [0.0] * lanes)
+        blank = ir.Constant(vector, ir.Undefined)
+
+        sums = [cgutils.alloca_once(builder, vector) for _ in range(_GROUP)]
+        for total in sums:
+            builder.store(zero, total)
+        starts = [builder.add(first, builder.mul(step, ir.Constant(step.type, g))) for g in range(_GROUP)]
+        with cgutils.for_range(builder, n_taps) as loop:
+            tap = builder.load(builder.gep(taps_array.data, [loop.index]))
+            tap = builder.shuffle_vector(builder.insert_element(blank, tap, lane_0), blank, all_lanes_0)
+            ahead = builder.mul(loop.index, n_words)
+            for start, total in zip(starts, sums, strict=True):
+                word = builder.load(builder.gep(words_array.data, [builder.add(start, ahead)]))
+                chosen = builder.select(builder.bitcast(word, mask), tap, zero)
+                builder.store(builder.fadd(builder.load(total), chosen), total)
+        for g, total in enumerate(sums):
+            place = builder.mul(builder.add(row, ir.Constant(row.type, g)), ir.Constant(row.type, lanes))
+            target = builder.bitcast(builder.gep(tile_array.data, [place]), vector.as_pointer())
+            builder.store(builder.load(total), target).align = 4
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@njit(nogil=True, cache=True)
+def _tap_sum_at_edge(words, word, shift, taps, first):
+    """Sum of taps times ±1 for one output whose taps reach over an end of the record, where x is 0."""
+    total = np.float32(0)
+    for tap in range(max(0, -first), min(taps.size, words.shape[0] - first)):
+        bit = np.int64(words[first + tap, word] >> np.uint64(shift)) & 1
+        total += taps[tap] * np.float32(2 * bit - 1)
+    return total
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def demodulate_words(words, channels, taps, factor, first, n_outputs, out):
+    """See `DemodulateWords`."""
+    n_samples, n_words = words.shape
+    word_bits = words.itemsize * 8
+    half = taps.size // 2
+    tap_total = np.float32(0)
+    for tap in range(taps.size):
+        tap_total += taps[tap]
+    for block in prange((out.shape[1] + _TILE - 1) // _TILE):
+        tile = np.empty((_TILE, word_bits), np.float32)
+        begin = block * _TILE
+        end = min(begin + _TILE, out.shape[1])
+        filled = min(end, n_outputs)
+        start = (first + begin) * factor - half
+        inside = start >= 0 and start + (_TILE - 1) * factor + taps.size <= n_samples
+        for word in range(n_words):
+            if inside and begin < n_outputs:
+                for row in range(0, _TILE, _GROUP):
+                    at = (start + row * factor) * n_words + word
+                    _sum_masked_taps(words, at, factor * n_words, taps, tile, row)
+            for mic in range(channels.size):
+                if channels[mic] // word_bits == word:
+                    bit = channels[mic] % word_bits
+                    if inside:
+                        for n in range(begin, filled):
+                            out[mic, n] = np.float32(2) * tile[n - begin, bit] - tap_total
+                    else:
+                        for n in range(begin, filled):
+                            out[mic, n] = _tap_sum_at_edge(words, word, bit, taps, start + (n - begin) * factor)
+                    for n in range(max(begin, filled), end):
+                        out[mic, n] = np.float32(0)

@@ -1,0 +1,17 @@
+"""Multiply the spectrum of each microphone by a filter."""
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["multiply_spectra"]
+
+
+@njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "nsz"})
+def multiply_spectra(spectra, response, out):
+    """See `MultiplySpectra`."""
+    n_mics, n_bins = spectra.shape
+    for mic in prange(n_mics):
+        for b in range(n_bins):
+            # Written out because Numba's own complex product is never fused to multiply-adds.
+            x, h = spectra[mic, b], response[b]
+            out[mic, b] = np.complex64(complex(x.real * h.real - x.imag * h.imag, x.real * h.imag + x.imag * h.real))

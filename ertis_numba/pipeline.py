@@ -1,0 +1,120 @@
+"""From measurements to energyscapes."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import Grid, microphones
+from ertis_numba.settings import Settings
+from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.paper import PaperChain
+
+__all__ = ["Pipeline"]
+
+
+class Pipeline:
+    """The whole signal chain for one kind of measurement.
+
+    Tables and buffers are made here, once. A pipeline may be used by several threads at a time; make one
+    in each process.
+
+    Parameters
+    ----------
+    settings : Settings
+    device : {"auto", "cpu", "numpy"}
+        ``numpy`` runs the same algorithm without compiled kernels, for comparison.
+    threads : int, optional
+        Threads of one `process`; all cores by default. The result does not depend on it.
+
+    Attributes
+    ----------
+    settings : Settings
+    device : str
+        The device that was chosen.
+
+    Raises
+    ------
+    ArgumentError
+        The settings name a layout, grid or range that cannot be used, or the device is unknown.
+    DeviceError
+        The device cannot be used here.
+    """
+
+    def __init__(self, settings: Settings, device: str = "auto", threads: int | None = None) -> None:
+        kernel_set = kernels.load(device)
+        threads = kernel_set.max_threads if threads is None else threads
+        with kernel_set.threads(threads):  # refuses a number that cannot be had
+            pass
+        self.settings = settings
+        self.device = kernel_set.device
+        layout = microphones(settings.array)
+        self._words_shape = (settings.recording.n_samples, layout.n_words)
+        self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
+        self._chain: FastChain | PaperChain
+        if settings.processing.method == "paper":
+            self._chain = PaperChain(settings)
+        else:
+            self._chain = FastChain(settings, kernel_set, threads=threads)
+            # Kernels are loaded, or compiled where they never were, now rather than amid a stream.
+            self._chain.process(np.zeros(self._words_shape, self._words_dtype), self._new_energy())
+
+    def process(self, measurement: Measurement, out: NDArray[np.float32] | None = None) -> Energyscape:
+        """Return the energyscape of one measurement.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        out : (direction, range) float32, optional
+            Where the energy goes; a new array by default, which is the only large one made.
+
+        Raises
+        ------
+        DataError
+            The words are not those of the pipeline's settings.
+        ArgumentError
+            ``out`` has another shape or type.
+        """
+        words = self._checked_words(measurement.words)
+        energy = self._new_energy() if out is None else self._checked_out(out)
+        self._chain.process(words, energy)
+        return Energyscape(
+            energy=energy,
+            azimuth_rad=self.grid.azimuth_rad,
+            elevation_rad=self.grid.elevation_rad,
+            range_m=self.range_m,
+            settings=self.settings,
+            stamp=measurement.stamp,
+        )
+
+    @property
+    def grid(self) -> Grid:
+        """The direction axis of the images."""
+        return self._chain.grid
+
+    @property
+    def range_m(self) -> NDArray[np.float64]:
+        """The range axis of the images: (range,) float64."""
+        return self._chain.range_m
+
+    def _new_energy(self) -> NDArray[np.float32]:
+        return np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
+
+    def _checked_words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
+        n_samples, n_words = self._words_shape
+        wanted = self._words_shape if n_words > 1 else (n_samples,)
+        if words.dtype != self._words_dtype or words.shape not in {wanted, self._words_shape}:
+            raise DataError(
+                f"measurement holds {words.dtype} words of shape {words.shape}; the settings want "
+                f"{self._words_dtype} of shape {wanted}: make the pipeline from the recording's own settings"
+            )
+        return np.ascontiguousarray(words).reshape(self._words_shape)
+
+    def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
+        wanted = (len(self.grid), len(self.range_m))
+        if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
+            raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
+        return out

@@ -1,0 +1,1 @@
+"""The stages of the signal chain: each prepares its tables once and then only calls kernels."""

@@ -1,0 +1,44 @@
+"""From PDM words to signals: unpack, low-pass, decimate, group delay removed."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.geometry import Layout
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Settings
+from ertis_numba.stages.window import TimeWindow
+from ertis_numba.waveform import decimation_taps, matched_band_hz
+
+__all__ = ["Demodulate"]
+
+
+class Demodulate:
+    """Words to signals.
+
+    Attributes
+    ----------
+    taps : (tap,) float64
+        The decimation filter.
+    shape : (mic, sample)
+        Of the signals, zeros at the end included.
+    """
+
+    def __init__(self, settings: Settings, layout: Layout, window: TimeWindow, kernels: KernelSet) -> None:
+        self.taps = decimation_taps(
+            pdm_rate_hz=settings.recording.pdm_rate_hz,
+            decimation=settings.processing.decimation,
+            pass_hz=matched_band_hz(settings.call)[1],
+        )
+        self._kernel = kernels.demodulate_words
+        self._taps = self.taps.astype(np.float32)
+        self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
+        self._factor = settings.processing.decimation
+        self._window = window
+        self.shape = (len(self._channels), window.n_fft)
+
+    def __call__(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word)."""
+        window = self._window
+        self._kernel(words, self._channels, self._taps, self._factor, window.first_sample, window.n_samples, out)

@@ -1,0 +1,79 @@
+"""The fast chain: only the window of the record, and only the beams, that the image needs."""
+
+from queue import LifoQueue, Empty
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import fft
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import Grid, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Settings
+from ertis_numba.stages.beamform import Beamform
+from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.matched_filter import MatchedFilter
+from ertis_numba.stages.window import time_window
+
+__all__ = ["FastChain"]
+
+
+class _Buffers(NamedTuple):
+    signals: NDArray[np.float32]
+    analytic: NDArray[np.complex64]
+
+
+class FastChain:
+    """Demodulate, matched filter, beamform and envelope with tables made once.
+
+    Attributes
+    ----------
+    grid : Grid
+    range_m : (range,) float64
+    """
+
+    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int) -> None:
+        layout = microphones(settings.array)
+        self.grid: Grid = direction_grid(settings.processing)
+        delays_s = layout.delay_s[layout.enabled] + far_field_delays(
+            layout.enabled_positions_m,
+            unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
+            sound_speed_m_s=sound_speed_m_s(settings.air),
+        )
+        window = time_window(settings, largest_delay_s=float(np.max(np.abs(delays_s))))
+        self.range_m = window.range_m
+        self._kernels = kernels
+        self._threads = threads
+        self._demodulate = Demodulate(settings, layout, window, kernels)
+        self._matched_filter = MatchedFilter(
+            settings,
+            window,
+            kernels,
+            fft.load(kernels.device),
+            taps=self._demodulate.taps,
+            n_mics=delays_s.shape[1],
+        )
+        self._beamform = Beamform(
+            settings, layout, window, kernels, delays_s=delays_s, centre_hz=self._matched_filter.centre_hz
+        )
+        self._spare: LifoQueue[_Buffers] = LifoQueue()
+
+    def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
+        buffers = self._take_buffers()
+        with self._kernels.threads(self._threads):
+            self._demodulate(words, buffers.signals)
+            self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
+            self._beamform(buffers.analytic, out)
+        self._spare.put(buffers)
+
+    def _take_buffers(self) -> _Buffers:
+        """Return buffers that no other thread uses; there are as many as ever ran at once."""
+        try:
+            return self._spare.get_nowait()
+        except Empty:
+            return _Buffers(
+                np.zeros(self._demodulate.shape, dtype=np.float32),
+                np.zeros(self._matched_filter.shape, dtype=np.complex64),
+            )

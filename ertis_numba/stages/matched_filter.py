@@ -1,0 +1,63 @@
+"""From signals to analytic signals, compressed by the call's matched filter."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.fft import Transforms
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Settings
+from ertis_numba.stages.window import TimeWindow
+from ertis_numba.waveform import filter_response, matched_filter
+
+__all__ = ["MatchedFilter"]
+
+
+class MatchedFilter:
+    """Signals to analytic signals, sampled at the output rate in several phases.
+
+    A beam is wanted at the output ranges only, but with delays much finer than their spacing. So the
+    filtered spectrum is turned back once per phase: phase p holds the samples that lie ``p /
+    n_phases`` of a step after those of phase 0. The one-sided spectrum makes them analytic. The gain
+    of the decimation filter is divided out, since within the band it is known exactly.
+
+    Attributes
+    ----------
+    shape : (mic, phase, sample)
+        Of the analytic signals.
+    centre_hz : float
+        Carrier of the filtered call.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        window: TimeWindow,
+        kernels: KernelSet,
+        transforms: Transforms,
+        *,
+        taps: NDArray[np.float64],
+        n_mics: int,
+    ) -> None:
+        rate_hz = settings.signal_rate_hz
+        matched = matched_filter(settings.call, n_fft=window.n_fft, rate_hz=rate_hz)
+        n_phases = settings.processing.oversampling
+        frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
+        flat = matched.values / filter_response(taps, frequency_hz / settings.recording.pdm_rate_hz)
+        lag_s = window.start_s - window.first_sample / rate_hz
+        lag_s = lag_s + np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
+        # The inverse transform divides by its own length instead of the forward one's.
+        scale = window.n_outputs / window.n_fft
+        self._responses = (scale * flat * np.exp(2j * math.pi * frequency_hz * lag_s)).astype(np.complex64)
+        self._first_bin = matched.first_bin
+        self._kernel = kernels.multiply_and_fold
+        self._transforms = transforms
+        self.centre_hz = matched.centre_hz
+        self.shape = (n_mics, n_phases, window.n_outputs)
+
+    def __call__(self, signals: NDArray[np.float32], out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, sample) complex64, from ``signals``, (mic, sample) float32."""
+        spectra = self._transforms.forward(signals, threads=threads)
+        self._kernel(spectra, self._responses, self._first_bin, out)
+        self._transforms.inverse(out, threads=threads)

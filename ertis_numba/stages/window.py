@@ -1,0 +1,88 @@
+"""Which part of the record an image needs, and on which grid its ranges lie."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Settings
+from ertis_numba.waveform import matched_guard_s
+
+__all__ = ["TimeWindow", "time_window"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeWindow:
+    """The signals that an image is made from, and the samples it is read from.
+
+    Attributes
+    ----------
+    range_m : (range,) float64
+    first_sample, n_samples : int
+        Signal samples to demodulate.
+    n_fft : int
+        Length of the transform: ``output_decimation`` times ``n_outputs``.
+    n_outputs : int
+        Samples of each phase.
+    lead : int
+        Sample of phase 0 that lies at the first range.
+    start_s : float
+        Time of sample 0 of phase 0.
+    """
+
+    range_m: NDArray[np.float64]
+    first_sample: int
+    n_samples: int
+    n_fft: int
+    n_outputs: int
+    lead: int
+    start_s: float
+
+
+def time_window(settings: Settings, *, largest_delay_s: float) -> TimeWindow:
+    """Return the window for beams whose delays stay within ``± largest_delay_s``.
+
+    An echo at time t needs the samples from t on for as long as the call lasts, and the matched
+    filter's ringing on both sides. The transform is a little longer than that, so what wraps around in
+    it falls outside of the samples that are read: the convolution is linear.
+
+    Raises
+    ------
+    ArgumentError
+        The ranges lie outside the record.
+    """
+    speed_m_s = sound_speed_m_s(settings.air)
+    first_m, last_m = settings.processing.range_m
+    record_m = speed_m_s * settings.recording.duration_s / 2
+    if last_m > record_m:
+        raise ArgumentError(
+            f"processing.range_m ends at {last_m:g} m, but the record of "
+            f"{settings.recording.duration_s * 1e3:.4g} ms reaches {record_m:.4g} m; give a smaller range"
+        )
+    output_rate_hz = settings.output_rate_hz
+    step_m = speed_m_s / (2 * output_rate_hz)
+    n_ranges = math.floor((last_m - first_m) / step_m * (1 + 1e-12)) + 1
+    lead = math.ceil(largest_delay_s * output_rate_hz) + 1
+    guard_s = matched_guard_s(settings.call)
+    start_s = 2 * first_m / speed_m_s - lead / output_rate_hz
+    stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
+    spanned_s = stop_s - start_s + settings.call.duration_s + 2 * guard_s
+    n_outputs = scipy.fft.next_fast_len(math.ceil(spanned_s * output_rate_hz))
+    n_fft = n_outputs * settings.processing.output_decimation
+    rate_hz = settings.signal_rate_hz
+    first_sample = max(0, math.floor((start_s - guard_s) * rate_hz))
+    last_sample = math.ceil((stop_s + settings.call.duration_s + guard_s) * rate_hz)
+    in_record = settings.recording.n_samples // settings.processing.decimation
+    return TimeWindow(
+        range_m=first_m + step_m * np.arange(n_ranges),
+        first_sample=first_sample,
+        n_samples=max(0, min(last_sample, in_record) - first_sample),
+        n_fft=n_fft,
+        n_outputs=n_outputs,
+        lead=lead,
+        start_s=start_s,
+    )

@@ -1,0 +1,199 @@
+"""What the readers of both kinds of file share: opening, refusing, and taking rows one by one."""
+
+import hashlib
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import ClassVar, Generic, Self, TypeVar
+
+import h5py
+
+from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.settings import Settings
+from ertis_numba.storage._rows import RowReader
+from ertis_numba.storage.schema import FORMAT_VERSION, Variable
+
+__all__ = ["Reader", "file_kind"]
+
+Item = TypeVar("Item")
+_STORED_END = re.compile(r"stored_eof = (\d+)")
+_A = {"recording": "a recording", "energyscape": "an energyscape file"}
+
+
+def file_kind(path: str | Path) -> str:
+    """Return ``recording`` or ``energyscape``.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, or is neither.
+    """
+    with _open(Path(path)) as file:
+        return _kind(file, Path(path), "a recording or an energyscape file")
+
+
+class Reader(ABC, Generic[Item]):
+    """A file of one row per measurement, as a sequence that reads a row when asked for it.
+
+    Close it after use, or use it in a ``with`` statement.
+
+    Attributes
+    ----------
+    path : Path
+    sensor : str
+    settings : Settings
+        They depend on no other file.
+    attributes : dict
+        The attributes of the file: uuid, source, date_created and others.
+    """
+
+    _kind: ClassVar[str]
+    _data: ClassVar[str]
+    _table: ClassVar[tuple[Variable, ...]]
+
+    def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
+        self.path = Path(path)
+        self._file = _open(self.path)
+        try:
+            with self._reading():
+                self._require_kind()
+                self.sensor = self._choose(sensor)
+                self._group = self._file["sensors"][self.sensor]
+                self._require_variables()
+                self._rows = RowReader(self._group, self._data)
+                self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
+                self.settings = Settings.from_toml(self._group["settings"][()].decode(), f"{self.path}: settings")
+                self._require_shapes()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @abstractmethod
+    def _item(self, index: int) -> Item:
+        """Return one row as what flows."""
+
+    @abstractmethod
+    def _sizes(self) -> dict[str, int]:
+        """Return the length that the settings, or the axes in the file, give to each axis."""
+
+    @property
+    def uuid(self) -> str:
+        """Identity of the content: two files with the same one hold the same."""
+        return str(self.attributes.get("uuid", ""))
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file, in hexadecimal."""
+        with self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: int) -> Item:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.path} has no measurement {index}; it has {len(self)}, counted from 0")
+        with self._reading():
+            return self._item(index % len(self))
+
+    def __iter__(self) -> Iterator[Item]:
+        return (self[index] for index in range(len(self)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; closing twice does no harm."""
+        self._file.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Name the file in errors, and call what the library cannot read damaged."""
+        try:
+            yield
+        except DataError as error:
+            named = str(error) if str(error).startswith(str(self.path)) else f"{self.path}: {error}"
+            raise type(error)(named) from error
+        except ArgumentError as error:
+            raise DataError(str(error)) from error
+        except (OSError, RuntimeError, KeyError, AttributeError, UnicodeDecodeError, TypeError) as error:
+            if not self._file:
+                raise DataError(f"{self.path} is closed; open it again") from error
+            raise DataError(f"{self.path} is damaged or cut short ({_reason(error)}); copy it again") from error
+
+    def _require_kind(self) -> None:
+        kind = _kind(self._file, self.path, _A[self._kind])
+        if kind != self._kind:
+            remedy = "process it first" if kind == "recording" else "give the recording it was made from"
+            raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
+
+    def _choose(self, sensor: str | None) -> str:
+        names = list(self._file["sensors"])
+        if sensor is None and len(names) == 1:
+            return str(names[0])
+        if sensor not in names:
+            came = "no sensor is chosen" if sensor is None else f"there is no sensor {sensor!r}"
+            raise ArgumentError(f"{self.path}: {came}; choose one of {', '.join(names)}")
+        return sensor
+
+    def _require_variables(self) -> None:
+        missing = [variable.name for variable in self._table if variable.name not in self._group]
+        if missing:
+            raise DataError(f"{self.path} has no {missing[0]!r} for sensor {self.sensor}; copy it again")
+
+    def _require_shapes(self) -> None:
+        sizes = {"time": len(self._rows), **self._sizes()}
+        for variable in self._table:
+            wanted = tuple(sizes[dim] for dim in variable.dims if dim in sizes)
+            shape = self._group[variable.name].shape
+            if len(wanted) == len(shape) and shape != wanted:
+                raise DataError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
+
+
+def _open(path: Path) -> h5py.File:
+    if path.is_dir():
+        raise DataError(f"{path} is a folder; give a recording or an energyscape file")
+    try:
+        with path.open("rb") as file:
+            n_bytes = file.seek(0, 2)
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; give a recording or an energyscape file") from error
+    if n_bytes == 0:
+        raise DataError(f"{path} is empty; give a recording or an energyscape file")
+    if not h5py.is_hdf5(path):
+        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file (raw words: ertis import)")
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        wanted = _STORED_END.search(str(error))
+        amount = f" of {wanted[1]}" if wanted else ""
+        raise DataError(f"{path} is cut short or damaged, it has {n_bytes}{amount} bytes; copy it again") from error
+
+
+def _kind(file: h5py.File, path: Path, wanted: str) -> str:
+    kind = _plain(file.attrs.get("ertis_format", ""))
+    if kind not in _A:
+        raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
+    version = int(file.attrs.get("ertis_format_version", 0))
+    if version > FORMAT_VERSION:
+        raise FormatVersionError(
+            f"{path} has format version {version}, this package reads up to {FORMAT_VERSION}; update ertis-numba"
+        )
+    return str(kind)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if hasattr(value, "item") else value
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).strip("'\"").splitlines()[0] if str(error) else type(error).__name__

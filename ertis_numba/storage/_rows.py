@@ -1,0 +1,141 @@
+"""Rows along time: one array per measurement, and one number per measurement and column."""
+
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Stamp
+from ertis_numba.storage.schema import CHUNK_ROWS
+
+__all__ = ["RowReader", "RowWriter"]
+
+# HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
+# 914), so writing stops while there is still room for its tables.
+_FREE_BYTES_KEPT = 8 * 2**20
+_STAMP_COLUMNS = ("time", "time_uncertainty", "sequence", "sync_count", "epoch", "crc32")
+
+
+class RowWriter:
+    """Appends measurements to the variables of a sensor.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    data : str
+        Name of the variable with one array per measurement.
+    """
+
+    def __init__(self, group: h5py.Group, data: str) -> None:
+        self._group = group
+        self._data = group[data]
+        self._folder = Path(group.file.filename).parent
+        self._columns: dict[str, list[float]] = {}
+        self._n_stored = 0
+        self._n_rows = 0
+        self._last: Stamp | None = None
+        self._epoch = 0
+        self.gaps: list[tuple[int, int]] = []
+        self.check = 0
+        """CRC-32 over all rows, to compare with what can be read back."""
+
+    def append(self, row: NDArray[Any], stamp: Stamp, **columns: float) -> None:
+        """Append one measurement: its array as one chunk, and its number in every column."""
+        stored = np.ascontiguousarray(row, dtype=self._data.dtype)
+        checks.shape(f"measurement {self._n_rows}", stored.shape, self._data.shape[1:])
+        uncertainty_ns = checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1)
+        self._require_room(stored.nbytes)
+        self._data.resize(self._n_rows + 1, axis=0)
+        # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
+        self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
+        self._n_rows += 1
+        self._count(stamp)
+        self.check = zlib.crc32(stored, self.check)
+        values = (
+            stamp.timestamp_ns,
+            uncertainty_ns,
+            stamp.sequence,
+            stamp.sync_count,
+            self._epoch,
+            zlib.crc32(stored),
+        )
+        for name, value in {**dict(zip(_STAMP_COLUMNS, values, strict=True)), **columns}.items():
+            self._columns.setdefault(name, []).append(value)
+        if self._n_rows % CHUNK_ROWS == 0:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the columns gathered so far."""
+        for name, values in self._columns.items():
+            column = self._group[name]
+            column.resize((self._n_rows,))
+            column[self._n_stored :] = values
+            values.clear()
+        self._n_stored = self._n_rows
+
+    def __len__(self) -> int:
+        return self._n_rows
+
+    def _count(self, stamp: Stamp) -> None:
+        if self._last is not None:
+            if stamp.sync_count < self._last.sync_count:
+                self._epoch += 1
+            if stamp.sequence > self._last.sequence + 1:
+                self.gaps.append((self._last.sequence + 1, stamp.sequence - 1))
+        self._last = stamp
+
+    def _require_room(self, n_bytes: int) -> None:
+        free = shutil.disk_usage(self._folder).free
+        if free < n_bytes + _FREE_BYTES_KEPT:
+            raise DataError(
+                f"{self._folder} has {free / 1e6:.0f} MB free, too little for the next {n_bytes / 1e6:.1f} MB; "
+                "free some or write elsewhere"
+            )
+
+
+class RowReader:
+    """Reads measurements back and checks each against its CRC-32."""
+
+    def __init__(self, group: h5py.Group, data: str) -> None:
+        self._group = group
+        self._data = group[data]
+
+    def __len__(self) -> int:
+        return int(self._data.shape[0])
+
+    def row(self, index: int) -> NDArray[Any]:
+        """Return the array of one measurement.
+
+        Raises
+        ------
+        DataError
+            It is not what was written.
+        """
+        row = np.asarray(self._data[index])
+        wanted, got = int(self._group["crc32"][index]), zlib.crc32(row)
+        if got != wanted:
+            raise DataError(
+                f"measurement {index} has CRC-32 {got:08x}, its record says {wanted:08x}: the file is damaged; "
+                "copy it again"
+            )
+        return row
+
+    def stamp(self, index: int, sensor: str) -> Stamp:
+        """Return the stamp of one measurement."""
+        return Stamp(
+            sensor=sensor,
+            sequence=self.column("sequence", index),
+            sync_count=self.column("sync_count", index),
+            timestamp_ns=self.column("time", index),
+            timestamp_uncertainty_ns=self.column("time_uncertainty", index),
+        )
+
+    def column(self, name: str, index: int) -> Any:
+        """Return the number of one measurement in a column."""
+        return self._group[name][index].item()

@@ -1,0 +1,171 @@
+"""What the writers of both kinds of file share: a part file, rows, and reading back."""
+
+import hashlib
+import uuid
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import h5py
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
+from ertis_numba.storage._rows import RowReader, RowWriter
+from ertis_numba.storage.atomic import check_target, replacing
+from ertis_numba.storage.schema import (
+    CONVENTIONS,
+    FORMAT_VERSION,
+    date_created,
+    sensor_path,
+    software_versions,
+)
+
+__all__ = ["Writer"]
+
+Item = TypeVar("Item", Measurement, Energyscape)
+
+
+class Writer(ABC, Generic[Item]):
+    """Writes rows as they come; the file appears when the ``with`` block ends well, or not at all."""
+
+    _kind: ClassVar[str]
+    _data: ClassVar[str]
+
+    def __init__(self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str]) -> None:
+        self.path = Path(path)
+        self._overwrite = overwrite
+        self._attributes = attributes
+        self._file: h5py.File | None = None
+        self._rows: RowWriter | None = None
+        self._sensor = ""
+        self._content = hashlib.sha256()
+        check_target(self.path, overwrite=overwrite)
+
+    @abstractmethod
+    def _begin(self, group: h5py.Group, first: Item) -> None:
+        """Lay out the group of a sensor for items like ``first``."""
+
+    @abstractmethod
+    def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
+        """Return the array of an item and what it adds to the columns; refuse what does not fit."""
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._part = stack.enter_context(replacing(self.path, overwrite=self._overwrite))
+            self._file = stack.enter_context(self._open_part())
+            self._stack = stack.pop_all()
+        return self
+
+    def write(self, item: Item) -> None:
+        """Append one measurement.
+
+        Raises
+        ------
+        ArgumentError
+            It does not fit to the ones before it.
+        DataError
+            The disk is full or cannot be written.
+        """
+        if self._file is None:
+            raise ArgumentError(f"{self.path} is not open for writing; use the writer in a with statement")
+        with self._naming_file():
+            if self._rows is None:
+                self._sensor = item.stamp.sensor
+                group = self._file.create_group(sensor_path(self._sensor), track_order=True)
+                self._begin(group, item)
+                self._rows = RowWriter(group, self._data)
+            if item.stamp.sensor != self._sensor:
+                raise ArgumentError(
+                    f"measurement {len(self._rows)} is of sensor {item.stamp.sensor!r}, "
+                    f"the ones before it of {self._sensor!r}; write one file per sensor"
+                )
+            row, columns = self._row(item)
+            self._rows.append(row, item.stamp, **columns)
+            self._content.update(repr((item.stamp, self._rows.check, columns)).encode())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+        self._file = None
+
+    @contextmanager
+    def _open_part(self) -> Iterator[h5py.File]:
+        """Yield the part file; complete, close and compare it when the block ends well."""
+        with self._naming_file():
+            file = h5py.File(self._part, "w", track_order=True)
+        try:
+            yield file
+            with self._naming_file():
+                rows = self._finish(file)
+                file.close()
+                self._compare(rows)
+        except BaseException:
+            with suppress(OSError, RuntimeError):  # the first error is the one to tell
+                file.close()
+            raise
+
+    def _finish(self, file: h5py.File) -> RowWriter:
+        if self._rows is None:
+            raise ArgumentError(f"{self.path} would hold no measurement; give at least one")
+        self._rows.flush()
+        file.attrs.update(
+            {
+                "Conventions": CONVENTIONS,
+                "ertis_format": self._kind,
+                "ertis_format_version": FORMAT_VERSION,
+                "date_created": date_created(),
+                # Version 8: the content makes the identity, so the same content is recognised.
+                "uuid": str(uuid.UUID(bytes=_as_version_8(self._content.digest()[:16]))),
+                **self._attributes,
+                **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
+            }
+        )
+        return self._rows
+
+    def _compare(self, written: RowWriter) -> None:
+        """Read every row back from the closed file and compare it with what was given."""
+        with h5py.File(self._part, "r") as file:
+            rows = RowReader(file[sensor_path(self._sensor)], self._data)
+            check = 0
+            for index in range(len(rows)):
+                check = zlib.crc32(rows.row(index), check)
+        if (len(rows), check) != (len(written), written.check):
+            raise DataError(f"{self.path} reads back differently than it was written; check the disk")
+
+    @contextmanager
+    def _naming_file(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails
+            if isinstance(error, DataError | ArgumentError):
+                raise
+            reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+            raise DataError(f"{self.path} cannot be written ({reason}); free some space or write elsewhere") from error
+
+
+def self_contained(settings: Settings) -> Settings:
+    """Return settings whose microphones are written out, so that they depend on no layout file."""
+    if settings.array.positions_m is not None:
+        return settings
+    return settings.replace(array=microphones(settings.array).to_array())
+
+
+def stamp_text(stamp: Stamp) -> str:
+    """Return a stamp as text."""
+    return repr(stamp)
+
+
+def _as_version_8(digest: bytes) -> bytes:
+    """Set version and variant of a UUID whose other bits are free (RFC 9562, section 5.8)."""
+    made = bytearray(digest)
+    made[6] = made[6] & 0x0F | 0x80
+    made[8] = made[8] & 0x3F | 0x80
+    return bytes(made)

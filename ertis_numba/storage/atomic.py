@@ -1,0 +1,60 @@
+"""A file appears under its name complete, or not at all."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["check_target", "replacing"]
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Refuse a path where no file can be put.
+
+    Raises
+    ------
+    ArgumentError
+        The folder is missing, the path is a folder, or a file is there and may not be replaced.
+    """
+    if path.is_dir():
+        raise ArgumentError(f"output {path} is a folder; give the name of a file")
+    if not path.parent.is_dir():
+        raise ArgumentError(f"output {path}: there is no folder {path.parent}; make it or give another")
+    if path.exists() and not overwrite:
+        raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+
+
+@contextmanager
+def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """Yield the name to write to; when the block ends well, that file becomes ``path``.
+
+    The name ends in ``.part`` and holds the process number, so that two writers never share it. The
+    file reaches the disk before it takes its name. Whatever ends the block, no ``.part`` is left.
+
+    Raises
+    ------
+    ArgumentError
+        As `check_target`, before the block and again before the file takes its name.
+    """
+    check_target(path, overwrite=overwrite)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        _sync(part)
+        check_target(path, overwrite=overwrite)
+        part.replace(path)
+    except BaseException:  # Ctrl-C, too, must leave nothing behind
+        part.unlink(missing_ok=True)
+        raise
+    if os.name == "posix":  # elsewhere a folder cannot be opened
+        _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

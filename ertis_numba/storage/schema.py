@@ -1,0 +1,197 @@
+"""What the files hold: the table of each kind of file, and its version.
+
+Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so that xarray, h5dump
+and MATLAB show the same names. One group ``/sensors/<name>`` holds one sensor.
+"""
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Final
+
+import h5py
+import numpy as np
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = [
+    "CHUNK_ROWS",
+    "CONVENTIONS",
+    "ENERGYSCAPE",
+    "FORMAT_VERSION",
+    "RECORDING",
+    "STAMPS",
+    "TRUTH",
+    "Variable",
+    "date_created",
+    "lay_out",
+    "sensor_path",
+    "software_versions",
+]
+
+CONVENTIONS: Final = "CF-1.11 ertis-1.0"
+FORMAT_VERSION: Final = 1
+CHUNK_ROWS: Final = 4096  # of the columns that hold one number per measurement
+_UNLIMITED: Final = ("time", "gap")
+_SENSOR_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One array of a file.
+
+    Attributes
+    ----------
+    name : str
+    dims : tuple of str
+        Its axes. A variable named like its only axis is the coordinate of that axis.
+    dtype : str
+        NumPy type, ``str`` for text, or empty where the settings decide.
+    about : str
+    units : str
+        As UDUNITS writes it; empty for numbers without a unit.
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    about: str
+    units: str = ""
+
+
+STAMPS: Final = (
+    Variable("time", ("time",), "<i8", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
+    Variable("time_uncertainty", ("time",), "<u4", "uncertainty of time", "ns"),
+    Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
+    Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
+    Variable("epoch", ("time",), "<i4", "how often sync_count has started again in this file"),
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the measurement's row of pdm or energy, as its bytes lie in the file"),
+)
+
+_SETTINGS = Variable("settings", (), "str", "settings as TOML; they hold the array itself")
+
+RECORDING: Final = (
+    *STAMPS,
+    Variable("temperature", ("time",), "<f8", "air temperature", "degree_Celsius"),
+    Variable("humidity", ("time",), "<f8", "relative humidity", "percent"),
+    Variable("pressure", ("time",), "<f8", "air pressure", "Pa"),
+    Variable("pdm", ("time", "sample", "word"), "", "PDM words; bit m, least significant first, is channel m"),
+    _SETTINGS,
+    Variable("microphone", ("microphone",), "<i4", "channel"),
+    Variable("microphone_position", ("microphone", "axis"), "<f8", "x, y, z in the sensor frame", "m"),
+    Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone"),
+    Variable("calibration_gain", ("microphone",), "<f8", "amplitude to divide by; 1 in this version"),
+    Variable("calibration_delay", ("microphone",), "<f8", "delay to take off; 0 in this version", "s"),
+    Variable("call", ("call_sample",), "<f4", "emitted sweep, full scale 1"),
+    Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
+    Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
+    Variable("gap_reason", ("gap",), "str", "why they are missing"),
+)
+
+ENERGYSCAPE: Final = (
+    *STAMPS,
+    Variable("energy", ("time", "direction", "range"), "", "envelope; 1 is a full-scale echo in every microphone"),
+    Variable("azimuth", ("direction",), "<f8", "azimuth, from x forward towards y", "radian"),
+    Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
+    Variable("range", ("range",), "<f8", "half of the way of the sound", "m"),
+    _SETTINGS,
+)
+
+TRUTH: Final = (
+    Variable("scene", (), "str", "scene as TOML"),
+    Variable("azimuth", ("measurement", "target"), "<f8", "azimuth of the reflectors", "radian"),
+    Variable("elevation", ("measurement", "target"), "<f8", "elevation of the reflectors", "radian"),
+    Variable("range", ("measurement", "target"), "<f8", "distance of the reflectors from the sensor's origin", "m"),
+    Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest", "dB"),
+)
+
+
+def lay_out(
+    group: h5py.Group,
+    table: Iterable[Variable],
+    *,
+    sizes: Mapping[str, int],
+    dtypes: Mapping[str, str] | None = None,
+) -> None:
+    """Make the variables of ``table`` in ``group``, with a named scale for each of their axes.
+
+    An axis that ``sizes`` leaves out is left out of every variable, unless it grows with the file.
+    Rows along time are chunks of their own where a row is an array.
+    """
+    scales: dict[str, h5py.Dataset] = {}
+    variables = [(variable, _dims(variable, sizes)) for variable in table]
+    # Coordinates come first, so that the others find the scale of each axis.
+    for variable, dims in sorted(variables, key=lambda pair: pair[1] != (pair[0].name,)):
+        dtype = (dtypes or {}).get(variable.name, variable.dtype)
+        dataset = _dataset(group, variable.name, dims, sizes, dtype)
+        dataset.attrs["long_name"] = variable.about
+        if variable.units:
+            dataset.attrs["units"] = variable.units
+        if dims == (variable.name,):
+            dataset.make_scale(variable.name)
+            scales[variable.name] = dataset
+            continue
+        for axis, dim in enumerate(dims):
+            if dim not in scales:
+                scales[dim] = _scale_without_values(group, dim, sizes.get(dim, 0))
+            dataset.dims[axis].attach_scale(scales[dim])
+
+
+def _dims(variable: Variable, sizes: Mapping[str, int]) -> tuple[str, ...]:
+    return tuple(dim for dim in variable.dims if dim in sizes or dim in _UNLIMITED)
+
+
+def _dataset(
+    group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str
+) -> h5py.Dataset:
+    kind = h5py.string_dtype() if dtype == "str" else np.dtype(dtype)
+    if not dims:
+        return group.create_dataset(name, (), kind)
+    shape = tuple(sizes.get(dim, 0) for dim in dims)
+    if dims[0] not in _UNLIMITED:
+        return group.create_dataset(name, shape, kind)
+    chunks = (CHUNK_ROWS,) if len(dims) == 1 else (1, *shape[1:])
+    return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
+
+
+def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Dataset:
+    """Make the scale of an axis that only counts, in the way netCDF-4 does: it takes no room."""
+    shape, growing = ((0,), {"maxshape": (None,), "chunks": (CHUNK_ROWS,)}) if dim in _UNLIMITED else ((size,), {})
+    scale = group.create_dataset(dim, shape, np.dtype(">f4"), **growing)
+    scale.make_scale(f"This is a netCDF dimension but not a netCDF variable. {size:10d}")
+    return scale
+
+
+def sensor_path(name: str) -> str:
+    """Return the group of a sensor.
+
+    Raises
+    ------
+    ArgumentError
+        The name cannot be the name of a group.
+    """
+    if not _SENSOR_NAME.fullmatch(name):
+        raise ArgumentError(f"sensor name {name!r} cannot stand in a file; give letters, digits and _ . @ + -")
+    return f"/sensors/{name}"
+
+
+def date_created() -> str:
+    """Return the time as ISO 8601, or that of SOURCE_DATE_EPOCH, so that builds can be repeated."""
+    fixed = os.environ.get("SOURCE_DATE_EPOCH")
+    now = datetime.fromtimestamp(int(fixed), UTC) if fixed else datetime.now(UTC)
+    return now.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def software_versions() -> dict[str, str]:
+    """Return the versions of what computes a result."""
+    return {name: _version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")}
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "unknown"
