@@ -86,7 +86,7 @@ def matched_guard_s(call: Call) -> float:
 def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
     """Return the matched filter for spectra of ``n_fft`` points at ``rate_hz``.
 
-    ``H(f) = 2 g conj(S(f)) W(f)`` for positive frequencies, with S the spectrum of the call, W a
+    ``H(f) = g conj(S(f)) W(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
     window that is 1 over the call's band and falls to 0 outside it as a raised cosine, and g such
     that the call itself gives an analytic signal with an envelope of 1 at its peak.
     """

@@ -1,6 +1,6 @@
 """The fast chain: only the window of the record, and only the beams, that the image needs."""
 
-from queue import LifoQueue, Empty
+from queue import Empty, LifoQueue
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -11,7 +11,7 @@ from typing import ClassVar, Generic, Self, TypeVar
 
 import h5py
 
-from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.errors import ArgumentError, DataError, FormatVersionError, SettingsError
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.schema import FORMAT_VERSION, Variable
@@ -121,7 +121,7 @@ class Reader(ABC, Generic[Item]):
         except DataError as error:
             named = str(error) if str(error).startswith(str(self.path)) else f"{self.path}: {error}"
             raise type(error)(named) from error
-        except ArgumentError as error:
+        except SettingsError as error:
             raise DataError(str(error)) from error
         except (OSError, RuntimeError, KeyError, AttributeError, UnicodeDecodeError, TypeError) as error:
             if not self._file:

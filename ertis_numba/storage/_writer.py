@@ -14,7 +14,7 @@ import h5py
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader, RowWriter
@@ -27,7 +27,7 @@ from ertis_numba.storage.schema import (
     software_versions,
 )
 
-__all__ = ["Writer"]
+__all__ = ["Writer", "self_contained"]
 
 Item = TypeVar("Item", Measurement, Energyscape)
 
@@ -80,6 +80,7 @@ class Writer(ABC, Generic[Item]):
                 self._sensor = item.stamp.sensor
                 group = self._file.create_group(sensor_path(self._sensor), track_order=True)
                 self._begin(group, item)
+                self._content.update(group["settings"][()])
                 self._rows = RowWriter(group, self._data)
             if item.stamp.sensor != self._sensor:
                 raise ArgumentError(
@@ -145,8 +146,6 @@ class Writer(ABC, Generic[Item]):
         try:
             yield
         except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails
-            if isinstance(error, DataError | ArgumentError):
-                raise
             reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
             raise DataError(f"{self.path} cannot be written ({reason}); free some space or write elsewhere") from error
 
@@ -156,11 +155,6 @@ def self_contained(settings: Settings) -> Settings:
     if settings.array.positions_m is not None:
         return settings
     return settings.replace(array=microphones(settings.array).to_array())
-
-
-def stamp_text(stamp: Stamp) -> str:
-    """Return a stamp as text."""
-    return repr(stamp)
 
 
 def _as_version_8(digest: bytes) -> bytes:

@@ -4,7 +4,6 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 # libgomp's idle threads spin by default and take the cores from SciPy's transforms between two
 # kernels: 1.7 times slower on two cores. It reads this once, when Numba first loads it.
@@ -29,20 +28,29 @@ __all__ = ["KERNELS"]
 _ONE_AT_A_TIME = threading.RLock()
 
 
+def _layer_is_reentrant() -> bool:
+    """Whether two Python threads may run parallel kernels at a time; unknown counts as no."""
+    try:
+        return numba.threading_layer() != "workqueue"
+    except ValueError:  # no parallel kernel has run yet, so no layer is chosen
+        return False
+
+
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """See `Threads`."""
+    """See `Threads`.
+
+    Numba's workqueue layer, which it falls back to without OpenMP and TBB, aborts the process when two
+    threads meet in it. There, and until the layer is known, one thread runs at a time.
+    """
     checks.whole("threads", count, 1, numba.config.NUMBA_NUM_THREADS)
     before = numba.get_num_threads()
-    numba.set_num_threads(count)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
-
-
-def _guarded(kernel: Any) -> Any:
-    return kernel
+    with contextlib.nullcontext() if _layer_is_reentrant() else _ONE_AT_A_TIME:
+        numba.set_num_threads(count)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
 
 
 KERNELS = KernelSet(

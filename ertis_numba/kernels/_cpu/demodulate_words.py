@@ -75,35 +75,52 @@ def _tap_sum_at_edge(words, word, shift, taps, first):
     return total
 
 
+@njit(nogil=True, cache=True)
+def _turn_tile(tile, word, channels, tap_total, begin, end, out):
+    """Write the sums of one word's channels, from ``tile`` (sample, bit) to ``out`` (mic, sample)."""
+    word_bits = tile.shape[1]
+    for mic in range(channels.size):
+        if channels[mic] // word_bits == word:
+            bit = channels[mic] % word_bits
+            for n in range(begin, end):
+                out[mic, n] = np.float32(2) * tile[n - begin, bit] - tap_total
+
+
+@njit(nogil=True, cache=True)
+def _filter_at_edge(words, channels, taps, factor, first, begin, end, out):
+    """Fill samples ``begin … end`` of all microphones where taps reach over an end of the record, where x is 0."""
+    word_bits = words.itemsize * 8
+    for mic in range(channels.size):
+        word, bit = channels[mic] // word_bits, np.uint64(channels[mic] % word_bits)
+        for n in range(begin, end):
+            start = (first + n) * factor - taps.size // 2
+            total = np.float32(0)
+            for tap in range(max(0, -start), min(taps.size, words.shape[0] - start)):
+                sign = 2 * (np.int64(words[start + tap, word] >> bit) & 1) - 1
+                total += taps[tap] * np.float32(sign)
+            out[mic, n] = total
+
+
 @njit(parallel=True, nogil=True, cache=True)
 def demodulate_words(words, channels, taps, factor, first, n_outputs, out):
     """See `DemodulateWords`."""
     n_samples, n_words = words.shape
-    word_bits = words.itemsize * 8
-    half = taps.size // 2
     tap_total = np.float32(0)
     for tap in range(taps.size):
         tap_total += taps[tap]
     for block in prange((out.shape[1] + _TILE - 1) // _TILE):
-        tile = np.empty((_TILE, word_bits), np.float32)
         begin = block * _TILE
-        end = min(begin + _TILE, out.shape[1])
-        filled = min(end, n_outputs)
-        start = (first + begin) * factor - half
-        inside = start >= 0 and start + (_TILE - 1) * factor + taps.size <= n_samples
-        for word in range(n_words):
-            if inside and begin < n_outputs:
+        end = max(begin, min(begin + _TILE, n_outputs))
+        start = (first + begin) * factor - taps.size // 2
+        if begin == end:
+            pass
+        elif start < 0 or start + (_TILE - 1) * factor + taps.size > n_samples:
+            _filter_at_edge(words, channels, taps, factor, first, begin, end, out)
+        else:
+            tile = np.empty((_TILE, words.itemsize * 8), np.float32)
+            for word in range(n_words):
                 for row in range(0, _TILE, _GROUP):
                     at = (start + row * factor) * n_words + word
                     _sum_masked_taps(words, at, factor * n_words, taps, tile, row)
-            for mic in range(channels.size):
-                if channels[mic] // word_bits == word:
-                    bit = channels[mic] % word_bits
-                    if inside:
-                        for n in range(begin, filled):
-                            out[mic, n] = np.float32(2) * tile[n - begin, bit] - tap_total
-                    else:
-                        for n in range(begin, filled):
-                            out[mic, n] = _tap_sum_at_edge(words, word, bit, taps, start + (n - begin) * factor)
-                    for n in range(max(begin, filled), end):
-                        out[mic, n] = np.float32(0)
+                _turn_tile(tile, word, channels, tap_total, begin, end, out)
+        out[:, end : min(begin + _TILE, out.shape[1])] = np.float32(0)

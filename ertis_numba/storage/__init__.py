@@ -1,0 +1,34 @@
+"""Files: recordings and energyscapes. The only door to h5py."""
+
+from ertis_numba.storage._reader import file_kind
+from ertis_numba.storage.atomic import check_target, replacing
+from ertis_numba.storage.energyscape import (
+    EnergyscapeReader,
+    EnergyscapeWriter,
+    open_energyscapes,
+    write_energyscapes,
+)
+from ertis_numba.storage.recording import (
+    Gap,
+    RecordingReader,
+    RecordingWriter,
+    Truth,
+    open_recording,
+    write_recording,
+)
+
+__all__ = [
+    "EnergyscapeReader",
+    "EnergyscapeWriter",
+    "Gap",
+    "RecordingReader",
+    "RecordingWriter",
+    "Truth",
+    "check_target",
+    "file_kind",
+    "open_energyscapes",
+    "open_recording",
+    "replacing",
+    "write_energyscapes",
+    "write_recording",
+]

@@ -1,0 +1,289 @@
+"""Recordings: measurements as they came from the microphones, and what is needed to process them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Air, Settings
+from ertis_numba.storage._reader import Reader
+from ertis_numba.storage._rows import RowWriter
+from ertis_numba.storage._writer import Writer, self_contained
+from ertis_numba.storage.schema import RECORDING, TRUTH, Variable, lay_out
+from ertis_numba.waveform import call_samples
+
+__all__ = ["Gap", "RecordingReader", "RecordingWriter", "Truth", "open_recording", "write_recording"]
+
+_AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
+_TRUTH_ARRAYS = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m", "level": "level_db"}
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Sequence numbers that are missing, ``first`` and ``last`` included, and why."""
+
+    first: int
+    last: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Truth:
+    """What a simulated recording should show.
+
+    Attributes
+    ----------
+    scene : str
+        The scene as TOML.
+    seed : int
+    azimuth_rad, elevation_rad, range_m, level_db : (measurement, target) float64
+        The reflectors as the sensor sees them; levels below the strongest. NaN where a measurement
+        has fewer reflectors than others.
+    """
+
+    scene: str
+    seed: int
+    azimuth_rad: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    level_db: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.azimuth_rad.ndim != 2:
+            raise ArgumentError(f"azimuth_rad has shape {self.azimuth_rad.shape}; give (measurement, target)")
+        for name in _TRUTH_ARRAYS.values():
+            checks.shape(name, getattr(self, name).shape, self.azimuth_rad.shape)
+
+
+class RecordingWriter(Writer[Measurement]):
+    """Writes a recording measurement by measurement; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    path : str or Path
+    settings : Settings, optional
+        Those of the first measurement by default. Layout files are written out into the recording.
+    overwrite : bool
+        Replace a file of this name.
+    source : str
+        Where the measurements come from.
+    truth : Truth, optional
+        What a simulated recording should show.
+    """
+
+    _kind: ClassVar[str] = "recording"
+    _data: ClassVar[str] = "pdm"
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        settings: Settings | None = None,
+        overwrite: bool = False,
+        source: str = "",
+        truth: Truth | None = None,
+    ) -> None:
+        super().__init__(path, overwrite=overwrite, attributes={"source": source, "history": ""})
+        self._settings = settings
+        self._checked = settings
+        self._truth = truth
+
+    def _begin(self, group: h5py.Group, first: Measurement) -> None:
+        given = self._settings or first.settings
+        if given.processing.directions.lower().endswith(".csv"):
+            raise ArgumentError(
+                f"processing.directions is the file {given.processing.directions}, which a recording cannot hold; "
+                "name a grid, and give the file when processing"
+            )
+        self._settings = settings = self_contained(given)
+        layout = microphones(settings.array)
+        samples = call_samples(settings.call)
+        several = {"word": layout.n_words} if layout.n_words > 1 else {}
+        sizes = {
+            "sample": settings.recording.n_samples,
+            "microphone": len(layout.enabled),
+            "axis": 3,
+            "call_sample": len(samples),
+            **several,
+        }
+        lay_out(group, RECORDING, sizes=sizes, dtypes={"pdm": f"<u{layout.word_bits // 8}"})
+        group.attrs.update(_mounting(first.stamp.sensor, settings))
+        group["pdm"].attrs.update({"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
+        group["call"].attrs["sample_rate_hz"] = settings.call.sample_rate_hz
+        group["settings"][()] = settings.to_toml()
+        group["microphone"][:] = np.arange(len(layout.enabled))
+        group["microphone_position"][:] = layout.positions_m
+        group["microphone_enabled"][:] = layout.enabled
+        group["calibration_gain"][:] = 1.0
+        group["call"][:] = samples
+        if self._truth is not None:
+            _write_truth(group.file, self._truth)
+
+    def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
+        self._require_same(item.settings)
+        air = item.settings.air
+        return item.words, {name: getattr(air, field) for name, field in _AIR.items()}
+
+    def _require_same(self, settings: Settings) -> None:
+        """Refuse what one set of settings cannot describe: all but the air must be equal."""
+        if settings is self._checked or self._settings is None:
+            return
+        came = self_contained(settings)
+        for name in ("array", "call", "recording"):
+            if getattr(came, name) != getattr(self._settings, name):
+                raise ArgumentError(f"a measurement has other {name} settings than the recording; write it to its own")
+        self._checked = settings
+
+    def _finish(self, file: h5py.File) -> RowWriter:
+        rows = super()._finish(file)
+        group = file["sensors"][self._sensor]
+        values = {
+            "gap": np.zeros(len(rows.gaps)),
+            "gap_first": [first for first, _ in rows.gaps],
+            "gap_last": [last for _, last in rows.gaps],
+            "gap_reason": ["not among the measurements given"] * len(rows.gaps),
+        }
+        for name, column in values.items():
+            group[name].resize((len(rows.gaps),))
+            if len(column):
+                group[name][:] = column
+        return rows
+
+
+def _mounting(sensor: str, settings: Settings) -> dict[str, Any]:
+    """Return who the sensor is and how it is mounted: at the origin, as long as nobody says more."""
+    return {
+        "serial_number": sensor,
+        "model": settings.array.layout,
+        "firmware": "",
+        "frame_id": sensor,
+        "translation_m": np.zeros(3),
+        "rotation_xyzw": np.array([0.0, 0.0, 0.0, 1.0]),
+    }
+
+
+def _write_truth(file: h5py.File, truth: Truth) -> None:
+    n_measurements, n_targets = truth.azimuth_rad.shape
+    group = file.create_group("truth", track_order=True)
+    lay_out(group, TRUTH, sizes={"measurement": n_measurements, "target": n_targets})
+    group.attrs["seed"] = truth.seed
+    group["scene"][()] = truth.scene
+    for name, field in _TRUTH_ARRAYS.items():
+        group[name][:] = getattr(truth, field)
+
+
+class RecordingReader(Reader[Measurement]):
+    """A recording as a sequence of measurements, read one at a time.
+
+    Attributes
+    ----------
+    gaps : tuple of Gap
+    truth : Truth or None
+        What a simulated recording should show.
+    """
+
+    _kind: ClassVar[str] = "recording"
+    _data: ClassVar[str] = "pdm"
+    _table: ClassVar[tuple[Variable, ...]] = RECORDING
+
+    def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
+        super().__init__(path, sensor=sensor)
+        try:
+            with self._reading():
+                self._require_neutral_calibration()
+                self.gaps = tuple(
+                    Gap(int(first), int(last), reason.decode())
+                    for first, last, reason in zip(
+                        *(self._group[f"gap_{name}"][:] for name in ("first", "last", "reason")), strict=True
+                    )
+                )
+                self.truth = _read_truth(self._file)
+        except BaseException:
+            self.close()
+            raise
+
+    def _item(self, index: int) -> Measurement:
+        air = Air(**{field: self._rows.column(name, index) for name, field in _AIR.items()})
+        settings = self.settings if air == self.settings.air else self.settings.replace(air=air)
+        return Measurement(self._rows.row(index), settings, self._rows.stamp(index, self.sensor))
+
+    def _sizes(self) -> dict[str, int]:
+        layout = microphones(self.settings.array)
+        several = {"word": layout.n_words} if layout.n_words > 1 else {}
+        return {
+            "sample": self.settings.recording.n_samples,
+            "microphone": len(layout.enabled),
+            "axis": 3,
+            **several,
+        }
+
+    def _require_neutral_calibration(self) -> None:
+        for name, neutral in (("calibration_gain", 1.0), ("calibration_delay", 0.0)):
+            values = self._group[name][:]
+            wrong = np.flatnonzero(values != neutral)  # NaN, too
+            if wrong.size:
+                raise DataError(
+                    f"{self.path}: {name} of channel {wrong[0]} is {values[wrong[0]]:g}; this version applies no "
+                    f"calibration and takes {neutral:g} only"
+                )
+
+
+def _read_truth(file: h5py.File) -> Truth | None:
+    if "truth" not in file:
+        return None
+    group = file["truth"]
+    arrays = {field: np.asarray(group[name][:]) for name, field in _TRUTH_ARRAYS.items()}
+    return Truth(scene=group["scene"][()].decode(), seed=int(group.attrs["seed"]), **arrays)
+
+
+def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingReader:
+    """Open a recording for reading.
+
+    Parameters
+    ----------
+    path : str or Path
+    sensor : str, optional
+        Which one, where a file holds several.
+
+    Raises
+    ------
+    DataError
+        The file is not a recording, is damaged or cut short.
+    FormatVersionError
+        A newer version wrote it.
+    ArgumentError
+        There is no such sensor, or there are several and none is chosen.
+    """
+    return RecordingReader(path, sensor=sensor)
+
+
+def write_recording(
+    path: str | Path,
+    measurements: Iterable[Measurement],
+    *,
+    settings: Settings | None = None,
+    overwrite: bool = False,
+    source: str = "",
+    truth: Truth | None = None,
+) -> Path:
+    """Write measurements as they come and return the path; the arguments are those of `RecordingWriter`.
+
+    Raises
+    ------
+    ArgumentError
+        There is no measurement, one does not fit to the others, or the file exists.
+    DataError
+        The disk is full or cannot be written.
+    """
+    with RecordingWriter(path, settings=settings, overwrite=overwrite, source=source, truth=truth) as writer:
+        for measurement in measurements:
+            writer.write(measurement)
+    return writer.path
