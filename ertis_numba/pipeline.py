@@ -1,6 +1,6 @@
 """From measurements to energyscapes."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,9 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.fast import FastChain
-from ertis_numba.stages.paper import PaperChain
+
+if TYPE_CHECKING:
+    from ertis_numba.stages.paper import PaperChain
 
 __all__ = ["Pipeline"]
 
@@ -56,6 +58,9 @@ class Pipeline:
         self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
         self._chain: FastChain | PaperChain
         if settings.processing.method == "paper":
+            # Imported here because scipy.signal takes longer to import than the fast chain to run.
+            from ertis_numba.stages.paper import PaperChain  # noqa: PLC0415
+
             self._chain = PaperChain(settings)
         else:
             self._chain = FastChain(settings, kernel_set, threads=threads)

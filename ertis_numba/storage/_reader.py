@@ -135,13 +135,12 @@ class Reader(ABC, Generic[Item]):
             raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
 
     def _choose(self, sensor: str | None) -> str:
-        names = list(self._file["sensors"])
-        if sensor is None and len(names) == 1:
-            return str(names[0])
-        if sensor not in names:
-            came = "no sensor is chosen" if sensor is None else f"there is no sensor {sensor!r}"
-            raise ArgumentError(f"{self.path}: {came}; choose one of {', '.join(names)}")
-        return sensor
+        names = [str(name) for name in self._file["sensors"]]
+        if sensor is None and len(names) != 1:
+            raise ArgumentError(f"{self.path} holds {len(names)} sensors; choose one of {', '.join(names)}")
+        if sensor is not None and sensor not in names:
+            raise ArgumentError(f"{self.path} has no sensor {sensor!r}; choose one of {', '.join(names)}")
+        return sensor or names[0]
 
     def _require_variables(self) -> None:
         missing = [variable.name for variable in self._table if variable.name not in self._group]
@@ -168,7 +167,7 @@ def _open(path: Path) -> h5py.File:
     if n_bytes == 0:
         raise DataError(f"{path} is empty; give a recording or an energyscape file")
     if not h5py.is_hdf5(path):
-        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file (raw words: ertis import)")
+        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file")
     try:
         return h5py.File(path, "r")
     except OSError as error:

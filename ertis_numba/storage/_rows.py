@@ -56,14 +56,14 @@ class RowWriter:
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
         self._count(stamp)
-        self.check = zlib.crc32(stored, self.check)
+        self.check = zlib.crc32(stored.data, self.check)
         values = (
             stamp.timestamp_ns,
             uncertainty_ns,
             stamp.sequence,
             stamp.sync_count,
             self._epoch,
-            zlib.crc32(stored),
+            zlib.crc32(stored.data),
         )
         for name, value in {**dict(zip(_STAMP_COLUMNS, values, strict=True)), **columns}.items():
             self._columns.setdefault(name, []).append(value)
@@ -118,7 +118,7 @@ class RowReader:
             It is not what was written.
         """
         row = np.asarray(self._data[index])
-        wanted, got = int(self._group["crc32"][index]), zlib.crc32(row)
+        wanted, got = int(self._group["crc32"][index]), zlib.crc32(row.data)
         if got != wanted:
             raise DataError(
                 f"measurement {index} has CRC-32 {got:08x}, its record says {wanted:08x}: the file is damaged; "

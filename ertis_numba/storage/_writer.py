@@ -42,6 +42,7 @@ class Writer(ABC, Generic[Item]):
         self.path = Path(path)
         self._overwrite = overwrite
         self._attributes = attributes
+        self._part: Path
         self._file: h5py.File | None = None
         self._rows: RowWriter | None = None
         self._sensor = ""
@@ -137,7 +138,7 @@ class Writer(ABC, Generic[Item]):
             rows = RowReader(file[sensor_path(self._sensor)], self._data)
             check = 0
             for index in range(len(rows)):
-                check = zlib.crc32(rows.row(index), check)
+                check = zlib.crc32(rows.row(index).data, check)
         if (len(rows), check) != (len(written), written.check):
             raise DataError(f"{self.path} reads back differently than it was written; check the disk")
 

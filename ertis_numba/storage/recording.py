@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import Layout, microphones
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowWriter
@@ -120,10 +120,9 @@ class RecordingWriter(Writer[Measurement]):
         group["call"].attrs["sample_rate_hz"] = settings.call.sample_rate_hz
         group["settings"][()] = settings.to_toml()
         group["microphone"][:] = np.arange(len(layout.enabled))
-        group["microphone_position"][:] = layout.positions_m
-        group["microphone_enabled"][:] = layout.enabled
-        group["calibration_gain"][:] = 1.0
         group["call"][:] = samples
+        for name, values in _copies(layout).items():
+            group[name][:] = values
         if self._truth is not None:
             _write_truth(group.file, self._truth)
 
@@ -145,8 +144,8 @@ class RecordingWriter(Writer[Measurement]):
     def _finish(self, file: h5py.File) -> RowWriter:
         rows = super()._finish(file)
         group = file["sensors"][self._sensor]
-        values = {
-            "gap": np.zeros(len(rows.gaps)),
+        values: dict[str, list[Any]] = {
+            "gap": [0.0] * len(rows.gaps),
             "gap_first": [first for first, _ in rows.gaps],
             "gap_last": [last for _, last in rows.gaps],
             "gap_reason": ["not among the measurements given"] * len(rows.gaps),
@@ -156,6 +155,16 @@ class RecordingWriter(Writer[Measurement]):
             if len(column):
                 group[name][:] = column
         return rows
+
+
+def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
+    """Return the arrays that repeat the settings for programs that read no TOML."""
+    return {
+        "microphone_position": layout.positions_m,
+        "microphone_enabled": layout.enabled.astype(np.int8),
+        "calibration_gain": layout.gain,
+        "calibration_delay": layout.delay_s,
+    }
 
 
 def _mounting(sensor: str, settings: Settings) -> dict[str, Any]:
@@ -198,7 +207,7 @@ class RecordingReader(Reader[Measurement]):
         super().__init__(path, sensor=sensor)
         try:
             with self._reading():
-                self._require_neutral_calibration()
+                self._require_agreement()
                 self.gaps = tuple(
                     Gap(int(first), int(last), reason.decode())
                     for first, last, reason in zip(
@@ -225,14 +234,16 @@ class RecordingReader(Reader[Measurement]):
             **several,
         }
 
-    def _require_neutral_calibration(self) -> None:
-        for name, neutral in (("calibration_gain", 1.0), ("calibration_delay", 0.0)):
+    def _require_agreement(self) -> None:
+        """Refuse a file whose arrays say something else than its settings, which are what is used."""
+        for name, wanted in _copies(microphones(self.settings.array)).items():
             values = self._group[name][:]
-            wrong = np.flatnonzero(values != neutral)  # NaN, too
+            wrong = np.argwhere(values != wanted)  # NaN, too
             if wrong.size:
+                place = tuple(wrong[0])
                 raise DataError(
-                    f"{self.path}: {name} of channel {wrong[0]} is {values[wrong[0]]:g}; this version applies no "
-                    f"calibration and takes {neutral:g} only"
+                    f"{self.path}: {name} of channel {place[0]} is {values[place]:g}, the settings in the file say "
+                    f"{wanted[place]:g}; change the settings with it"
                 )
 
 

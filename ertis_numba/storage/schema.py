@@ -68,7 +68,7 @@ STAMPS: Final = (
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
     Variable("epoch", ("time",), "<i4", "how often sync_count has started again in this file"),
-    Variable("crc32", ("time",), "<u4", "CRC-32 of the measurement's row of pdm or energy, as its bytes lie in the file"),
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm or energy, as its bytes lie in the file"),
 )
 
 _SETTINGS = Variable("settings", (), "str", "settings as TOML; they hold the array itself")
@@ -83,8 +83,8 @@ RECORDING: Final = (
     Variable("microphone", ("microphone",), "<i4", "channel"),
     Variable("microphone_position", ("microphone", "axis"), "<f8", "x, y, z in the sensor frame", "m"),
     Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone"),
-    Variable("calibration_gain", ("microphone",), "<f8", "amplitude to divide by; 1 in this version"),
-    Variable("calibration_delay", ("microphone",), "<f8", "delay to take off; 0 in this version", "s"),
+    Variable("calibration_gain", ("microphone",), "<f8", "sensitivity; signals are divided by it"),
+    Variable("calibration_delay", ("microphone",), "<f8", "lateness; it is taken out", "s"),
     Variable("call", ("call_sample",), "<f4", "emitted sweep, full scale 1"),
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
@@ -144,9 +144,7 @@ def _dims(variable: Variable, sizes: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(dim for dim in variable.dims if dim in sizes or dim in _UNLIMITED)
 
 
-def _dataset(
-    group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str
-) -> h5py.Dataset:
+def _dataset(group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str) -> h5py.Dataset:
     kind = h5py.string_dtype() if dtype == "str" else np.dtype(dtype)
     if not dims:
         return group.create_dataset(name, (), kind)

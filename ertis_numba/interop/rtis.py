@@ -1,0 +1,105 @@
+"""Raw eRTIS files: nothing but PDM words, little-endian, without a header."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import PRESETS, Settings
+
+__all__ = ["RawReader", "open_raw"]
+
+
+class RawReader:
+    """The measurements of raw files, one after the other.
+
+    Time and SYNC count are not in such files: they are 0 and the place in the order of the files.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Each holds one measurement or more.
+    settings : Settings
+        What the files do not say: array, call and length of a measurement.
+    sensor : str
+    """
+
+    def __init__(self, paths: Sequence[Path], settings: Settings, *, sensor: str = "sensor") -> None:
+        layout = microphones(settings.array)
+        self.settings = settings
+        self._sensor = sensor
+        self._dtype = np.dtype(f"<u{layout.word_bits // 8}")
+        n_samples = settings.recording.n_samples
+        self._shape = (n_samples,) if layout.n_words == 1 else (n_samples, layout.n_words)
+        self._n_bytes = n_samples * layout.n_words * self._dtype.itemsize
+        self._files = [(path, self._count(path)) for path in paths]
+        if not self._files:
+            raise ArgumentError("no raw file is given; give at least one")
+
+    def __len__(self) -> int:
+        return sum(count for _, count in self._files)
+
+    def __iter__(self) -> Iterator[Measurement]:
+        sequence = 0
+        for path, count in self._files:
+            with path.open("rb") as file:
+                for _ in range(count):
+                    block = file.read(self._n_bytes)
+                    if len(block) != self._n_bytes:
+                        raise DataError(f"{path} became shorter while it was read; copy it again")
+                    words = np.frombuffer(block, self._dtype).reshape(self._shape)
+                    stamp = Stamp(sensor=self._sensor, sequence=sequence, sync_count=sequence)
+                    yield Measurement(words, self.settings, stamp)
+                    sequence += 1
+
+    def _count(self, path: Path) -> int:
+        """Return how many measurements a file holds; refuse one that does not hold whole ones."""
+        if path.is_dir():
+            raise DataError(f"{path} is a folder; give a file of raw words")
+        try:
+            with path.open("rb") as file:  # stat would not tell whether it may be read
+                n_bytes = file.seek(0, 2)
+        except OSError as error:
+            raise DataError(f"{path}: {error.strerror}; give a file of raw words") from error
+        count, rest = divmod(n_bytes, self._n_bytes)
+        if count and not rest:
+            return count
+        wanted = f"wanted a multiple of {self._n_bytes} ({self._words()})"
+        if not n_bytes:
+            raise DataError(f"{path} is empty, {wanted}; record it again")
+        if n_bytes % self._dtype.itemsize:
+            raise DataError(f"{path} has {n_bytes} bytes, which are no whole words, {wanted}; copy it again")
+        raise DataError(f"{path} has {n_bytes} bytes, {wanted}; {_remedy(n_bytes)}")
+
+    def _words(self) -> str:
+        return f"{self._n_bytes // self._dtype.itemsize} words of {self._dtype.itemsize} bytes"
+
+
+def _remedy(n_bytes: int) -> str:
+    """Return what to do about a file of another length: another preset, where one fits."""
+    lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}
+    fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (4 * n_samples) == 0]
+    return f"its length fits the presets {', '.join(fitting)}" if fitting else "it is cut short: copy it again"
+
+
+def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, sensor: str = "sensor") -> RawReader:
+    """Open raw files of whole measurements.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+    settings : Settings
+        Array, call and length of a measurement, such as ``Settings.from_preset("default_25_50")``.
+    sensor : str
+        Name to give to the sensor.
+
+    Raises
+    ------
+    DataError
+        A file is missing, empty, or holds no whole measurements.
+    """
+    several = [paths] if isinstance(paths, str | Path) else paths
+    return RawReader([Path(path) for path in several], settings, sensor=sensor)

@@ -1,0 +1,122 @@
+"""The sigma-delta modulators in the microphones, from signals to bits."""
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.kernels._cpu.modulate import modulate_pdm
+
+__all__ = ["Modulator", "loop_gains", "noise_transfer"]
+
+MAX_ORDER = 4
+_OUT_OF_BAND_GAIN = 1.5  # Lee's rule: a one-bit loop with no more gain than this is stable
+_LIMIT = 2.0  # twice what the integrators reach at half scale; with 4 the loop no longer recovers
+_GAIN_STEP = 2.0**-20  # gains as short numbers: no processor's last digit can change a bit
+
+
+class Modulator:
+    """One modulator per microphone, its state kept from block to block.
+
+    Parameters
+    ----------
+    keys : (mic,) uint64
+        Seed of each microphone's dither.
+    order : int
+        1 to 4.
+    dither : float
+        Width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones; beyond a
+        half it costs range.
+    band : float
+        Upper edge of the band where noise is to be low, in cycles per sample.
+    """
+
+    def __init__(self, keys: NDArray[np.uint64], *, order: int, dither: float, band: float) -> None:
+        self._keys = keys
+        self._gains = np.asarray(loop_gains(order, band))
+        self._states = np.zeros((len(keys), MAX_ORDER))
+        self._dither = dither
+        self._first = 0
+
+    def process(self, signals: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the bits of the next block: (mic, sample) uint8, 0 or 1.
+
+        Parameters
+        ----------
+        signals : (mic, sample) float64
+            Full scale 1. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
+        """
+        bits = np.empty(signals.shape, dtype=np.uint8)
+        modulate_pdm(signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits)
+        self._first += signals.shape[1]
+        return bits
+
+
+def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return numerator and denominator of the noise transfer function, in powers of 1/z.
+
+    The poles are those of a Butterworth high pass whose gain at half of the rate is 1.5 when all
+    zeros lie at 0 Hz. The zeros then move to the roots of the Legendre polynomial on the band, which
+    makes the noise in it least (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters,
+    IEEE Press 2005, chapter 4).
+    """
+    checks.whole("order", order, 1, MAX_ORDER)
+    checks.between("band", band, 0.0, 0.25)
+    angle = math.pi * (2 * np.arange(order) + order + 1) / (2 * order)
+    low, high = 0.0, 2.0
+    for _ in range(60):  # bisection: the gain rises with the poles' radius
+        radius = (low + high) / 2
+        poles = (1 + radius / 2 * np.exp(1j * angle)) / (1 - radius / 2 * np.exp(1j * angle))
+        too_high = 2**order / abs(np.prod(1 + poles)) > _OUT_OF_BAND_GAIN
+        low, high = (low, radius) if too_high else (radius, high)
+    zeros = np.exp(2j * math.pi * band * _legendre_roots(order))
+    return np.real(np.poly(zeros)), np.real(np.poly(poles))
+
+
+@functools.cache
+def loop_gains(order: int, band: float) -> tuple[float, float, float, float, float, float]:
+    """Return the gains c1 to c4, r1 and r2 of `modulate_pdm` for a noise transfer function.
+
+    Integrators in cascade with local resonators (r) and all outputs fed forward to the quantiser,
+    together with the input: the signal passes unchanged, without gain or delay, and the integrators
+    carry shaped noise only (J. Silva, U. Moon, J. Steensgaard, G. C. Temes, Wideband low-distortion
+    delta-sigma ADC topology, Electronics Letters 37, 2001). The feed-forward weights follow from the
+    first samples of the loop filter's impulse response, ``1/NTF − 1``. Integrators are scaled by
+    their weights, so that the quantiser takes their plain sum.
+    """
+    zeros, poles = noise_transfer(order, band)
+    loop = np.zeros(order + 1)  # impulse response of poles / zeros
+    for n in range(order + 1):
+        loop[n] = poles[n] - sum(zeros[k] * loop[n - k] for k in range(1, n + 1))
+    turn = np.zeros(2)  # one resonator per pair of zeros, and none for a zero at 0 Hz
+    turn[: (order + 1) // 2] = 2 * math.pi * band * _legendre_roots(order)[: (order + 1) // 2]
+    resonances = 2 - 2 * np.cos(turn)
+    weights = np.zeros(MAX_ORDER)
+    weights[:order] = np.linalg.solve(_integrators(order, resonances), loop[1:])
+    ratio = [after / before if before else 0.0 for before, after in zip(weights[:-1], weights[1:], strict=True)]
+    back = [g / forward if forward else 0.0 for g, forward in zip(resonances, ratio[::2], strict=True)]
+    c1, c2, c3, c4, r1, r2 = (round(gain / _GAIN_STEP) * _GAIN_STEP for gain in (weights[0], *ratio, *back))
+    return c1, c2, c3, c4, r1, r2
+
+
+def _legendre_roots(order: int) -> NDArray[np.float64]:
+    """Return the roots of the Legendre polynomial, ascending from −1 to 1."""
+    roots, _ = np.polynomial.legendre.leggauss(order)
+    return np.asarray(roots, dtype=np.float64)
+
+
+def _integrators(order: int, resonances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the response of unscaled integrators to a unit error: (sample, integrator) float64."""
+    state = np.zeros(MAX_ORDER)
+    response = np.empty((order, order))
+    error = 1.0
+    for n in range(order):
+        state[0] += error - resonances[0] * state[1]
+        state[1] += state[0]
+        state[2] += state[1] - resonances[1] * state[3]
+        state[3] += state[2]
+        response[n] = state[:order]
+        error = 0.0
+    return response

@@ -1,0 +1,173 @@
+"""What is simulated, as frozen structures with TOML in and out.
+
+Strengths and levels are relative to full scale: an amplitude of 1, or 0 dB, is a signal that would
+keep all PDM bits at one value.
+"""
+
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import tomli_w
+
+from ertis_numba import checks
+from ertis_numba.errors import SettingsError
+from ertis_numba.settings import Settings
+
+__all__ = ["DirectSound", "Electronics", "Point", "Scene", "load_scene"]
+
+_HIGHEST_STRENGTH_DB = 120.0  # far beyond any overload; the bound catches amplitudes given for levels
+
+
+class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of a scene file."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked again."""
+        unknown = set(changes) - set(self.__struct_fields__)
+        if unknown:
+            checks.choice(f"{type(self).__name__} field", min(unknown), self.__struct_fields__)
+        return msgspec.structs.replace(self, **changes)
+
+
+class Point(_Part, frozen=True, kw_only=True):
+    """A reflector so small that it sends the call back alike in all directions.
+
+    Attributes
+    ----------
+    azimuth_deg, elevation_deg : float
+        In the sensor frame.
+    range_m : float
+        From the sensor's origin, where the emitter is.
+    strength_db : float
+        Level of the echo if reflector, emitter and microphone were 1 m apart. The amplitude of an
+        echo is ``10 ** (strength_db / 20) / (r_tx r_rx)``, distances in metres.
+    """
+
+    azimuth_deg: float = 0.0
+    elevation_deg: float = 0.0
+    range_m: float
+    strength_db: float = -20.0
+
+    def __post_init__(self) -> None:
+        checks.between("point.azimuth_deg", self.azimuth_deg, -180.0, 180.0)
+        checks.between("point.elevation_deg", self.elevation_deg, -90.0, 90.0)
+        checks.between("point.range_m", self.range_m, 1e-3, 1000.0)
+        checks.between("point.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
+
+
+class DirectSound(_Part, frozen=True, kw_only=True):
+    """What the microphones hear of the emitter beside them.
+
+    Attributes
+    ----------
+    strength_db : float
+        Level 1 m from the emitter; the amplitude is ``10 ** (strength_db / 20) / r``.
+    """
+
+    strength_db: float = -40.0
+
+    def __post_init__(self) -> None:
+        checks.between("direct_sound.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
+
+
+class Electronics(_Part, frozen=True, kw_only=True):
+    """What the microphones add.
+
+    Attributes
+    ----------
+    noise_dbfs : float, optional
+        Root mean square of each microphone's white noise, over the whole band up to half of the PDM
+        rate; none by default. In a band B it is lower by ``10 log10(pdm_rate / 2 B)`` decibels.
+    modulator_order : int
+        Order of the sigma-delta modulators, 1 to 4.
+    dither : float
+        Width of the uniform dither at the quantiser, full scale 1.
+    """
+
+    noise_dbfs: float | None = None
+    modulator_order: int = 4
+    dither: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.noise_dbfs is not None:
+            checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
+        checks.whole("electronics.modulator_order", self.modulator_order, 1, 4)
+        checks.between("electronics.dither", self.dither, 0.0, 2.0)
+
+
+class Scene(_Part, frozen=True, kw_only=True):
+    """A sensor and what it hears: the whole content of a scene file.
+
+    Attributes
+    ----------
+    seed : int
+        Decides noise and dither. Measurements of one scene differ by their index alone.
+    rate_hz : float
+        Measurements per second.
+    sensor : Settings
+    electronics : Electronics
+    direct_sound : DirectSound, optional
+        None is heard by default.
+    points : tuple of Point
+    """
+
+    seed: int = 0
+    rate_hz: float = 20.0
+    sensor: Settings = Settings()
+    electronics: Electronics = Electronics()
+    direct_sound: DirectSound | None = None
+    points: tuple[Point, ...] = ()
+
+    def __post_init__(self) -> None:
+        checks.whole("seed", self.seed, 0)
+        checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "scene") -> Self:
+        """Read a scene from TOML; ``source`` names it in errors.
+
+        Raises
+        ------
+        SettingsError
+            The text is not TOML, has unknown keys, or a value cannot be used.
+        """
+        try:
+            return msgspec.toml.decode(text, type=cls)
+        except msgspec.DecodeError as error:  # ValidationError is one, too
+            reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
+            raise SettingsError(f"{source}: {reason}; correct it or take it out") from error
+
+    def to_toml(self) -> str:
+        """Return the scene as TOML text that `from_toml` reads back to an equal structure."""
+        return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene file. A layout file that it names is looked for beside it.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read or used.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: {error}; give a readable scene file") from error
+    scene = Scene.from_toml(text, str(path))
+    array = scene.sensor.array
+    if array.positions_m is None and Path(array.layout).suffix.lower() in {".toml", ".csv"}:
+        array = array.replace(layout=str(path.parent / array.layout))
+        scene = scene.replace(sensor=scene.sensor.replace(array=array))
+    return scene
+
+
+def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no null: what is not given is left out."""
+    return {
+        key: _without_none(value) if isinstance(value, dict) else value
+        for key, value in table.items()
+        if value is not None
+    }

@@ -1,0 +1,102 @@
+"""Reflectors found in images whose content is known by formula."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.stages.detect import find_peaks
+from ertis_numba.waveform import matched_filter
+
+
+def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0):
+    """The image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude)."""
+    settings = Settings(processing=Processing(directions=directions, range_m=range_m))
+    grid = direction_grid(settings.processing)
+    looks = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    positions_m = microphones(settings.array).enabled_positions_m
+    speed_m_s = sound_speed_m_s(settings.air)
+    ranges_m = np.arange(*range_m, speed_m_s / 90_000)
+    matched = matched_filter(settings.call, n_fft=2048, rate_hz=450_000)
+    wave_1_m = 2 * np.pi * (matched.first_bin + np.arange(len(matched.values))) * 450_000 / 2048 / speed_m_s
+    power = np.abs(matched.values) ** 2 / np.sum(np.abs(matched.values) ** 2)
+    beams = np.zeros((len(grid), len(ranges_m)), dtype=complex)
+    for azimuth_deg, elevation_deg, reflector_m, amplitude in reflectors:
+        source = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))
+        paths_m = (looks - source) @ positions_m.T  # (direction, mic)
+        pattern = np.stack([np.exp(-1j * k * paths_m).mean(axis=1) for k in wave_1_m], axis=1)
+        shape = np.exp(2j * wave_1_m[:, None] * (ranges_m - reflector_m)) * power[:, None]
+        beams += amplitude * pattern @ shape
+    energy = np.abs(beams + noise * np.random.default_rng(1).standard_normal(beams.shape))
+    return Energyscape(energy.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
+
+
+def test_one_entry_for_one_reflector():
+    (peak,) = find_peaks(image_of([(12.34, 0, 1.2345, 1.0)]))
+    assert peak.azimuth_deg == pytest.approx(12.34, abs=0.05)
+    assert peak.elevation_deg == pytest.approx(0, abs=1e-6)
+    assert peak.range_m == pytest.approx(1.2345, abs=2e-4)
+    assert peak.level_db == 0
+
+
+def test_every_reflector_strongest_first():
+    reflectors = [(-40, 0, 0.95, 0.5), (3.3, 0, 1.3, 1.0), (55.5, 0, 1.45, 0.6), (3.3, 0, 1.1, 0.25)]
+    peaks = find_peaks(image_of(reflectors, noise=0.002), min_level_db=-20)
+    expected = sorted(reflectors, key=lambda reflector: -reflector[3])
+    assert len(peaks) == len(expected)
+    for peak, (azimuth_deg, _, range_m, amplitude) in zip(peaks, expected, strict=True):
+        assert peak.azimuth_deg == pytest.approx(azimuth_deg, abs=0.7)
+        assert peak.range_m == pytest.approx(range_m, abs=2e-3)
+        assert peak.level_db == pytest.approx(20 * np.log10(amplitude), abs=0.7)
+
+
+def test_solid_angle_is_interpolated_in_both_angles():
+    reflectors = [(-21.7, 13.2, 1.0, 1.0), (30.1, -41.0, 1.3, 0.5)]
+    peaks = find_peaks(image_of(reflectors, directions="3000", range_m=(0.9, 1.4)), min_level_db=-12)
+    assert len(peaks) == 2
+    for peak, (azimuth_deg, elevation_deg, range_m, _) in zip(peaks, reflectors, strict=True):
+        assert peak.azimuth_deg == pytest.approx(azimuth_deg, abs=0.5)
+        assert peak.elevation_deg == pytest.approx(elevation_deg, abs=0.5)
+        assert peak.range_m == pytest.approx(range_m, abs=1e-3)
+
+
+def test_two_reflectors_a_beam_width_and_a_half_apart_are_two():
+    peaks = find_peaks(image_of([(0, 0, 1.2, 1.0), (12, 0, 1.2, 0.9)]), min_level_db=-6)
+    # Each pulls at the other's main lobe with its first side lobe.
+    assert [peak.azimuth_deg for peak in peaks] == pytest.approx([0, 12], abs=1.5)
+
+
+def test_top_and_level_limit_the_list():
+    image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
+    assert len(find_peaks(image, top=2)) == 2
+    assert len(find_peaks(image, min_level_db=-10)) == 2
+    assert len(find_peaks(image, top=None, min_level_db=-16)) == 3
+
+
+@pytest.mark.parametrize("shape", [(181, 210), (1, 1), (1, 5), (2, 2), (3, 1)])
+def test_silence_and_small_images_are_fine(shape):
+    image = image_of([])
+    small = image.replace(
+        energy=np.zeros(shape, np.float32),
+        azimuth_rad=image.azimuth_rad[: shape[0]],
+        elevation_rad=image.elevation_rad[: shape[0]],
+        range_m=image.range_m[: shape[1]],
+    )
+    assert find_peaks(small) == []
+    energy = small.energy.copy()
+    energy[0, shape[1] // 2] = 1
+    found = find_peaks(small.replace(energy=energy))
+    assert len(found) == (1 if shape[1] != 2 else len(found))
+    assert all(np.isfinite([peak.azimuth_deg, peak.range_m, peak.level_db]).all() for peak in found)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
+)
+def test_refuses(arguments, match):
+    with pytest.raises(ArgumentError, match=match):
+        find_peaks(image_of([]), **arguments)

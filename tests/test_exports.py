@@ -1,0 +1,30 @@
+"""What modules say they export is what they hold; ruff keeps the lists in order."""
+
+import importlib
+import pkgutil
+
+import pytest
+
+import ertis_numba
+
+MODULES = sorted(
+    module.name
+    for module in pkgutil.walk_packages(ertis_numba.__path__, "ertis_numba.")
+    if not module.name.startswith("ertis_numba.layouts")
+)
+
+
+@pytest.mark.parametrize("name", ["ertis_numba", *MODULES])
+def test_exports_are_what_is_public(name):
+    module = importlib.import_module(name)
+    exported = getattr(module, "__all__", [])
+    assert len(exported) == len(set(exported))
+    for item in exported:
+        assert getattr(module, item) is not None
+    defined = {
+        item
+        for item, value in vars(module).items()
+        if not item.startswith("_") and getattr(value, "__module__", None) == name and callable(value)
+    }
+    private = any(part.startswith("_") for part in name.split(".")[1:])
+    assert private or defined <= set(exported), f"public but not exported: {sorted(defined - set(exported))}"

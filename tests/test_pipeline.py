@@ -1,0 +1,222 @@
+"""The whole chain against the exact image, on words that are plain noise.
+
+The chain is linear up to the magnitude, so noise tells everything that echoes would, at all ranges and
+directions at once, and needs no renderer.
+"""
+
+import concurrent.futures
+import importlib.metadata
+import multiprocessing
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from tests import reference
+
+DEVICES = ("cpu", "numpy")
+LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
+SHORT = Settings(
+    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9), oversampling=32)
+)
+CASES = {
+    "default": SHORT,
+    "wide band": SHORT.replace(call=Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0)),
+    "upward sweep": SHORT.replace(call=Call(start_frequency_hz=25_000.0, stop_frequency_hz=50_000.0)),
+    "one direction": SHORT.replace(processing=SHORT.processing.replace(directions="2d:1")),
+    "one range": SHORT.replace(processing=SHORT.processing.replace(range_m=(0.7, 0.7))),
+    "first sample": SHORT.replace(processing=SHORT.processing.replace(range_m=(0.0, 0.4))),
+    "last sample": SHORT.replace(processing=SHORT.processing.replace(range_m=(1.2, 1.55))),
+    "prime record": SHORT.replace(recording=Recording(n_samples=40_961)),
+    "solid angle": SHORT.replace(processing=SHORT.processing.replace(directions="3d:11")),
+    "cold": SHORT.replace(air=Air(temperature_c=-40.0, humidity_percent=0.0)),
+    "one microphone": SHORT.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)),
+    "line of 8": SHORT.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8)),
+    "16 bits, disabled": SHORT.replace(
+        array=Array(layout="line", positions_m=LINE_8, enabled=(True, False) * 4, word_bits=16)
+    ),
+    "64 bits, two words": SHORT.replace(
+        array=Array(layout="long", positions_m=tuple((0.0, 0.001 * m, 0.0) for m in range(70)), word_bits=64)
+    ),
+    "calibrated": SHORT.replace(
+        array=Array(
+            layout="line", positions_m=LINE_8, gain=(2.0,) * 8, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
+        )
+    ),
+    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15)),
+    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(output_decimation=3, oversampling=10)),
+}
+
+
+def noise(settings: Settings, seed: int = 1) -> Measurement:
+    array = settings.array
+    n_words = -(-len(array.positions_m or range(32)) // array.word_bits)
+    shape = (settings.recording.n_samples, n_words) if n_words > 1 else (settings.recording.n_samples,)
+    random = np.random.default_rng(seed)
+    dtype = np.dtype(f"u{array.word_bits // 8}")
+    return Measurement(random.integers(0, 2**array.word_bits, shape, dtype=dtype), settings, Stamp(sequence=5))
+
+
+def exact(pipeline: Pipeline, measurement: Measurement):
+    directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
+    return reference.exact(measurement.words, pipeline.settings, directions, pipeline.range_m)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CASES)
+def test_image_is_the_exact_one(name, device):
+    pipeline = Pipeline(CASES[name], device=device)
+    measurement = noise(CASES[name])
+    image = pipeline.process(measurement)
+    assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
+    assert np.isfinite(image.energy).all()
+    # 32 phases leave -45 dB for 25 kHz of bandwidth and -36 dB for 60 kHz.
+    bound_db = -34 if name == "wide band" else -42
+    assert reference.error_db(image.energy, exact(pipeline, measurement)) < bound_db
+
+
+def test_error_falls_by_6_db_when_the_phases_double():
+    measurement = noise(SHORT)
+    errors_db = []
+    for oversampling in (8, 16, 32):
+        pipeline = Pipeline(SHORT.replace(processing=SHORT.processing.replace(oversampling=oversampling)))
+        errors_db.append(reference.error_db(pipeline.process(measurement).energy, exact(pipeline, measurement)))
+    assert np.diff(errors_db) == pytest.approx([-6, -6], abs=1)
+
+
+@pytest.mark.parametrize("method", ["fast", "paper"])
+def test_direct_sound_does_not_wrap_to_far_ranges(method):
+    """Full-scale noise as long as the call at the start, then an idle pattern far out of band."""
+    settings = Settings.from_preset("short_25_50").replace(
+        processing=Processing(directions="2d:5", range_m=(0.0, 2.0), method=method)
+    )
+    words = np.where(np.arange(65_536) % 2, 0xFFFFFFFF, 0).astype(np.uint32)
+    words[: int(2.5e-3 * 4.5e6)] = noise(settings).words[: int(2.5e-3 * 4.5e6)]
+    image = Pipeline(settings).process(Measurement(words, settings))
+    near = image.energy[:, image.range_m < 0.43].max()
+    far_db = 20 * np.log10(image.energy[:, image.range_m > 0.6].max(axis=0) / near)
+    # What is left is the ringing of the band edges, and it dies out instead of coming back.
+    assert far_db.max() < -60
+    assert far_db[-100:].max() < -80
+
+
+def test_window_leaves_out_what_the_image_does_not_need():
+    whole = Pipeline(SHORT.replace(processing=SHORT.processing.replace(range_m=(0.0, 1.5))))
+    part = Pipeline(SHORT)
+    measurement = noise(SHORT)
+    expected = exact(part, measurement)
+    assert len(part.range_m) < len(whole.range_m) / 2
+    assert reference.error_db(part.process(measurement).energy, expected) < -42
+
+
+@pytest.mark.parametrize("method", ["fast", "paper"])
+def test_axes_belong_to_the_result(method):
+    settings = SHORT.replace(processing=SHORT.processing.replace(method=method))
+    image = Pipeline(settings).process(noise(settings))
+    step_m = sound_speed_m_s(settings.air) / (2 * 45_000)
+    assert np.diff(image.range_m) == pytest.approx(step_m)
+    assert image.range_m[0] == pytest.approx(0.4, abs=step_m)
+    assert 0.9 - step_m < image.range_m[-1] <= 0.9
+    assert np.degrees(image.azimuth_rad) == pytest.approx(np.linspace(-90, 90, 7))
+    assert image.stamp.sequence == 5
+
+
+def test_default_image_has_the_range_axis_of_the_paper():
+    pipeline = Pipeline(Settings())
+    assert pipeline.range_m[0] == 0.5
+    assert len(pipeline.range_m) == 1178  # 4.5 m at 3.82 mm: 343.87 m/s at 20 °C and 50 %
+
+
+def test_same_bits_for_any_number_of_threads():
+    settings = Settings.from_preset("short_25_50").replace(processing=Processing(directions="3d:301", range_m=(0.5, 1.5)))
+    measurement = noise(settings)
+    images = [Pipeline(settings, threads=n).process(measurement).energy for n in (1, 2)]
+    assert images[0].tobytes() == images[1].tobytes()
+
+
+def test_one_pipeline_serves_several_threads_at_a_time():
+    pipeline = Pipeline(SHORT)
+    measurements = [noise(SHORT, seed) for seed in range(16)]
+    alone = [pipeline.process(measurement).energy.copy() for measurement in measurements]
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(pipeline.process, measurements))
+    for one, other in zip(alone, together, strict=True):
+        assert one.tobytes() == other.energy.tobytes()
+
+
+def process_noise(seed: int) -> bytes:
+    return Pipeline(SHORT).process(noise(SHORT, seed)).energy.tobytes()
+
+
+def test_spawned_processes_give_the_same_bits():
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        assert pool.map(process_noise, [3, 4]) == [process_noise(3), process_noise(4)]
+
+
+def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
+    settings = Settings(processing=Processing(directions="3000"))
+    pipeline = Pipeline(settings)
+    measurement = noise(settings)
+    out = np.empty((3000, len(pipeline.range_m)), dtype=np.float32)
+    first = pipeline.process(measurement)
+    tracemalloc.start()
+    image = pipeline.process(measurement, out=out)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert image.energy is out
+    assert image.energy.tobytes() == first.energy.tobytes()
+    assert peak < out.nbytes / 4  # the spectra, which SciPy returns in a new array
+
+
+@pytest.mark.parametrize(
+    ("settings", "device", "threads", "error", "match"),
+    [
+        (SHORT, "gpu", None, ArgumentError, "device 'gpu' is unknown"),
+        (SHORT, "cuda", None, DeviceError, "device 'cuda' has no kernels in this version"),
+        (SHORT, "cpu", 0, ArgumentError, "threads is 0; give a whole number from 1"),
+        (SHORT, "cpu", 4096, ArgumentError, "threads is 4096; give a whole number from 1"),
+        (
+            SHORT.replace(processing=Processing(range_m=(0.5, 5.0))),
+            "cpu",
+            None,
+            ArgumentError,
+            "processing.range_m ends at 5 m, but the record of 9.102 ms reaches 1.565 m",
+        ),
+        (
+            SHORT.replace(processing=Processing(range_m=(0.5, 1.0), directions="2d:0")),
+            "cpu",
+            None,
+            ArgumentError,
+            "count of directions '2d:0' is 0",
+        ),
+        (SHORT.replace(array=Array(layout="eRTIS_v9")), "cpu", None, ArgumentError, "layout 'eRTIS_v9' is unknown"),
+    ],
+)
+def test_refuses(settings, device, threads, error, match):
+    with pytest.raises(error, match=match):
+        Pipeline(settings, device=device, threads=threads)
+
+
+@pytest.mark.parametrize(
+    "words", [np.zeros(10, np.uint32), np.zeros(40_960, np.uint16), np.zeros((40_960, 2), np.uint32)]
+)
+def test_refuses_words_of_other_settings(words):
+    with pytest.raises(DataError, match=r"words of shape .* the settings want uint32 of shape \(40960,\)"):
+        Pipeline(SHORT).process(Measurement(words, SHORT))
+
+
+@pytest.mark.parametrize("out", [np.zeros((7, 3), np.float32), np.zeros((7, 131)), np.zeros((131, 7), np.float32).T])
+def test_refuses_out_of_another_shape(out):
+    with pytest.raises(ArgumentError, match=r"give contiguous float32 of shape \(7, 131\)"):
+        Pipeline(SHORT).process(noise(SHORT), out=out)
+
+
+def test_the_tests_are_these():
+    """Rtisdev's wheel brings a top-level package of the same name."""
+    assert reference.__file__.startswith(str(importlib.resources.files("tests")))
