@@ -26,6 +26,7 @@ def sound_speed_m_s(air: Air) -> float:
     kelvin = _ZERO_C_K + air.temperature_c
     saturation = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)
     vapour = air.humidity_percent / 100 * saturation * _REFERENCE_PRESSURE_PA / air.pressure_pa
+    vapour = min(vapour, 1.0)  # hot and thin air is all steam, never more
     molar_mass = (1 - vapour) * _DRY_AIR_KG_MOL + vapour * _WATER_KG_MOL
     # 1 / (γ − 1) is the heat capacity over R, which adds up over the parts of the mixture.
     capacity = (1 - vapour) / (_DRY_HEAT_RATIO - 1) + vapour / (_VAPOUR_HEAT_RATIO - 1)

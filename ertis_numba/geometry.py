@@ -4,19 +4,18 @@ The sensor frame: x forward (boresight), y to azimuth +90°, z up (elevation +90
 taken from the centroid of the enabled microphones.
 """
 
+import itertools
 import math
-import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Array, Processing
 
@@ -33,14 +32,22 @@ __all__ = [
     "unit_vectors",
 ]
 
-_LAYOUT_KEYS = {"name", "source", "word_bits", "disabled", "positions_mm"}
-
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
     "1850": ("3d:1850", (-45.0, 45.0), (-45.0, 45.0)),
     "3000": ("3d:3000", (-90.0, 90.0), (-90.0, 90.0)),
 }
 """The three grids of the paper: kind, azimuth limits and elevation limits in degrees."""
+
+
+class _LayoutFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a layout file may hold."""
+
+    positions_mm: list[list[float]]
+    name: str = ""
+    source: str = ""
+    word_bits: int = 32
+    disabled: list[int] = []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,35 +135,38 @@ def load_layout(name: str | Path) -> Layout:
     if path.suffix.lower() not in {".toml", ".csv"}:
         checks.choice("layout", name, layout_names())
         text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
-        return _layout(str(name), tomllib.loads(text))
+        return _layout(str(name), text)
     try:
         text = path.read_text("utf-8")
-        if path.suffix.lower() == ".csv":
-            return _layout(str(name), {"name": path.stem, "positions_mm": _csv_rows(text)})
-        return _layout(str(name), tomllib.loads(text))
     except (OSError, UnicodeDecodeError) as error:
         raise ArgumentError(
             f"layout {name}: {error}; give a readable file or one of {', '.join(layout_names())}"
         ) from error
-    except tomllib.TOMLDecodeError as error:
-        raise ArgumentError(f"layout {name}: {error}; give a TOML file") from error
+    if path.suffix.lower() == ".csv":
+        return _placed(str(name), _LayoutFile(name=path.stem, positions_mm=_csv_rows(f"layout {name}", text)))
+    return _layout(str(name), text)
 
 
-def _csv_rows(text: str) -> list[list[float]]:
+def _csv_rows(source: str, text: str) -> list[list[float]]:
     rows = (line.split("#", 1)[0].strip() for line in text.splitlines())
     try:
         return [[float(cell) for cell in row.split(",")] for row in rows if row]
     except ValueError as error:
-        raise ArgumentError(f"CSV: {error}; give rows of numbers parted by commas, comments after #") from error
-
-
-def _layout(source: str, table: dict[str, Any]) -> Layout:
-    unknown = set(table) - _LAYOUT_KEYS
-    if unknown:
         raise ArgumentError(
-            f"layout {source}: unknown key {min(unknown)!r}; known are {', '.join(sorted(_LAYOUT_KEYS))}"
-        )
-    rows = table.get("positions_mm", [])
+            f"{source}: {error}; give rows of numbers parted by commas, and comments after #"
+        ) from error
+
+
+def _layout(source: str, text: str) -> Layout:
+    try:
+        return _placed(source, msgspec.toml.decode(text, type=_LayoutFile))
+    except msgspec.DecodeError as error:  # ValidationError is one, too
+        reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
+        raise ArgumentError(f"layout {source}: {reason}; correct it or take it out") from error
+
+
+def _placed(source: str, file: _LayoutFile) -> Layout:
+    rows = file.positions_mm
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(
             f"layout {source}: positions_mm is not rows of 2 or 3 numbers; give y, z or x, y, z of each channel"
@@ -164,15 +174,18 @@ def _layout(source: str, table: dict[str, Any]) -> Layout:
     positions_m = np.zeros((len(rows), 3))
     positions_m[:, 3 - len(rows[0]) :] = np.asarray(rows, dtype=np.float64) / 1000
     enabled = np.ones(len(rows), dtype=np.bool_)
-    for channel in table.get("disabled", []):
+    for channel in file.disabled:
         enabled[checks.whole(f"layout {source}: a disabled channel", channel, 0, len(rows) - 1)] = False
-    checks.finite_array(f"layout {source}: positions_mm", positions_m[enabled])
-    made = Array(
-        layout=str(table.get("name", source)),
-        positions_m=tuple(tuple(row) for row in np.where(enabled[:, None], positions_m, 0.0).tolist()),
-        enabled=tuple(enabled.tolist()),
-        word_bits=table.get("word_bits", 32),
-    )
+    checks.finite_array(f"layout {source}: positions_mm", np.where(enabled[:, None], positions_m, 0.0))
+    try:
+        made = Array(
+            layout=file.name or source,
+            positions_m=tuple(tuple(row) for row in np.where(enabled[:, None], positions_m, 0.0).tolist()),
+            enabled=tuple(enabled.tolist()),
+            word_bits=file.word_bits,
+        )
+    except ArgumentError as error:
+        raise ArgumentError(f"layout {source}: {error}") from error
     return microphones(made)
 
 
@@ -244,12 +257,12 @@ def _equal_area_grid(
     low, high = np.sin(np.radians(elevation_limits_deg))
     side_rad = math.sqrt((east - west) * (high - low) / n_directions) or 1.0
     span_rad = math.radians(elevation_limits_deg[1] - elevation_limits_deg[0])
-    n_rows = min(n_directions, max(1, round(span_rad / side_rad)))
-    ideal = np.sin(np.linspace(*np.radians(elevation_limits_deg), n_rows + 1))
+    n_rows = min(n_directions, max(1, round(span_rad / side_rad))) if east > west else n_directions
+    ideal = np.sin(np.radians(np.linspace(*elevation_limits_deg, n_rows + 1)))
     share = (ideal - low) / (high - low) if high > low else np.linspace(0.0, 1.0, n_rows + 1)
     edges = np.rint(share * n_directions).astype(int)  # whole cells below each row's edge
     azimuth_rad, elevation_rad = [], []
-    for below, above in zip(edges[:-1], edges[1:], strict=True):
+    for below, above in itertools.pairwise(edges):
         in_row = above - below
         if not in_row:
             continue
@@ -263,15 +276,19 @@ def _csv_grid(path: str) -> Grid:
     if Path(path).suffix.lower() != ".csv":
         raise ArgumentError(f"directions {path!r} is no grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file")
     try:
-        rows = _csv_rows(Path(path).read_text("utf-8"))
+        text = Path(path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ArgumentError(
             f"directions {path}: {error}; give a readable CSV of azimuth, elevation in degrees"
         ) from error
+    rows = _csv_rows(f"directions {path}", text)
     if not rows or any(len(row) != 2 for row in rows):
         raise ArgumentError(f"directions {path} has not two numbers in every row; give azimuth, elevation in degrees")
     angles_rad = np.radians(np.asarray(rows))
     checks.finite_array(f"directions {path}", angles_rad)
+    for row, (azimuth_deg, elevation_deg) in enumerate(rows):
+        checks.between(f"directions {path}: azimuth in row {row}", azimuth_deg, -360.0, 360.0)
+        checks.between(f"directions {path}: elevation in row {row}", elevation_deg, -90.0, 90.0)
     return Grid(angles_rad[:, 0].copy(), angles_rad[:, 1].copy())
 
 
@@ -313,4 +330,4 @@ def spherical_delays(
     As `far_field_delays`, for a point at ``range_m``: ``(‖r u − p‖ − r) / c`` in seconds.
     """
     points_m = range_m * directions[:, None, :] - positions_m[None, :, :]
-    return (np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s
+    return np.asarray((np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s)

@@ -1,6 +1,6 @@
 """From measurements to energyscapes."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,8 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import Settings
+from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
-
-if TYPE_CHECKING:
-    from ertis_numba.stages.paper import PaperChain
 
 __all__ = ["Pipeline"]
 
@@ -56,14 +54,8 @@ class Pipeline:
         layout = microphones(settings.array)
         self._words_shape = (settings.recording.n_samples, layout.n_words)
         self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
-        self._chain: FastChain | PaperChain
-        if settings.processing.method == "paper":
-            # Imported here because scipy.signal takes longer to import than the fast chain to run.
-            from ertis_numba.stages.paper import PaperChain  # noqa: PLC0415
-
-            self._chain = PaperChain(settings)
-        else:
-            self._chain = FastChain(settings, kernel_set, threads=threads)
+        self._chain = _chain(settings, kernel_set, threads)
+        if settings.processing.method == "fast":
             # Kernels are loaded, or compiled where they never were, now rather than amid a stream.
             self._chain.process(np.zeros(self._words_shape, self._words_dtype), self._new_energy())
 
@@ -123,3 +115,12 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
         return out
+
+
+def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int) -> Chain:
+    if settings.processing.method == "fast":
+        return FastChain(settings, kernel_set, threads=threads)
+    # Imported here because scipy.signal takes longer to import than the fast chain takes to start.
+    from ertis_numba.stages.paper import PaperChain  # noqa: PLC0415
+
+    return PaperChain(settings)

@@ -21,6 +21,7 @@ __all__ = [
 ]
 
 _TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
+_LEAST_TRANSITION = 0.02  # of the decimated rate; the filter's length grows with the inverse
 _STOP_BAND_DB = 60.0  # image noise of a 4th order modulator stays below the float32 image's needs
 
 
@@ -118,7 +119,7 @@ def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> N
     """
     rate_hz = pdm_rate_hz / decimation
     transition_hz = rate_hz - 2 * pass_hz
-    if transition_hz <= 0:
+    if transition_hz < _LEAST_TRANSITION * rate_hz:
         raise ArgumentError(
             f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
         )

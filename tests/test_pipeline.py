@@ -134,7 +134,9 @@ def test_default_image_has_the_range_axis_of_the_paper():
 
 
 def test_same_bits_for_any_number_of_threads():
-    settings = Settings.from_preset("short_25_50").replace(processing=Processing(directions="3d:301", range_m=(0.5, 1.5)))
+    settings = Settings.from_preset("short_25_50").replace(
+        processing=Processing(directions="3d:301", range_m=(0.5, 1.5))
+    )
     measurement = noise(settings)
     images = [Pipeline(settings, threads=n).process(measurement).energy for n in (1, 2)]
     assert images[0].tobytes() == images[1].tobytes()

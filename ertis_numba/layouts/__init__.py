@@ -1,0 +1,1 @@
+"""Positions of the microphones of known arrays, as data files."""

@@ -91,7 +91,7 @@ def _amplitude(point: Point, back_m: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.sqrt(np.sum(vectors**2, axis=-1))
+    return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
 
 
 def _linear(level_db: float) -> float:

@@ -1,6 +1,7 @@
 """The sigma-delta modulators in the microphones, from signals to bits."""
 
 import functools
+import itertools
 import math
 
 import numpy as np
@@ -95,7 +96,7 @@ def loop_gains(order: int, band: float) -> tuple[float, float, float, float, flo
     resonances = 2 - 2 * np.cos(turn)
     weights = np.zeros(MAX_ORDER)
     weights[:order] = np.linalg.solve(_integrators(order, resonances), loop[1:])
-    ratio = [after / before if before else 0.0 for before, after in zip(weights[:-1], weights[1:], strict=True)]
+    ratio = [after / before if before else 0.0 for before, after in itertools.pairwise(weights)]
     back = [g / forward if forward else 0.0 for g, forward in zip(resonances, ratio[::2], strict=True)]
     c1, c2, c3, c4, r1, r2 = (round(gain / _GAIN_STEP) * _GAIN_STEP for gain in (weights[0], *ratio, *back))
     return c1, c2, c3, c4, r1, r2

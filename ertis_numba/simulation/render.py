@@ -51,8 +51,8 @@ def received(scene: Scene, ways: Arrivals, first: int, stop: int) -> NDArray[np.
     """Return what the microphones hear in PDM samples ``first`` to ``stop``: (mic, sample) float64.
 
     The call is evaluated in closed form at ``n / pdm_rate − delay``: delays are exact, nothing is
-    interpolated. At the PDM rate a call of 80 kHz is so far below half of the rate that no alias of
-    its ramps reaches −120 dB.
+    interpolated. Half of the PDM rate is so far above a call of 80 kHz that what aliases of it stays
+    190 dB below its spectrum's top.
     """
     call, rate_hz = scene.sensor.call, scene.sensor.recording.pdm_rate_hz
     signals = np.zeros((ways.delay_s.shape[1], stop - first))

@@ -45,8 +45,8 @@ class MatchedFilter:
         n_phases = settings.processing.oversampling
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
         flat = matched.values / filter_response(taps, frequency_hz / settings.recording.pdm_rate_hz)
-        lag_s = window.start_s - window.first_sample / rate_hz
-        lag_s = lag_s + np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
+        phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
+        lag_s = window.start_s - window.first_sample / rate_hz + phase_s
         # The inverse transform divides by its own length instead of the forward one's.
         scale = window.n_outputs / window.n_fft
         self._responses = (scale * flat * np.exp(2j * math.pi * frequency_hz * lag_s)).astype(np.complex64)

@@ -78,7 +78,7 @@ def time_window(settings: Settings, *, largest_delay_s: float) -> TimeWindow:
     last_sample = math.ceil((stop_s + settings.call.duration_s + guard_s) * rate_hz)
     in_record = settings.recording.n_samples // settings.processing.decimation
     return TimeWindow(
-        range_m=first_m + step_m * np.arange(n_ranges),
+        range_m=first_m + step_m * np.arange(n_ranges, dtype=np.float64),
         first_sample=first_sample,
         n_samples=max(0, min(last_sample, in_record) - first_sample),
         n_fft=n_fft,

@@ -25,13 +25,14 @@ from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
 
 __all__ = ["KERNELS"]
 
+_MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
 _ONE_AT_A_TIME = threading.RLock()
 
 
 def _layer_is_reentrant() -> bool:
     """Whether two Python threads may run parallel kernels at a time; unknown counts as no."""
     try:
-        return numba.threading_layer() != "workqueue"
+        return bool(numba.threading_layer() != "workqueue")
     except ValueError:  # no parallel kernel has run yet, so no layer is chosen
         return False
 
@@ -43,7 +44,7 @@ def threads(count: int) -> Iterator[None]:
     Numba's workqueue layer, which it falls back to without OpenMP and TBB, aborts the process when two
     threads meet in it. There, and until the layer is known, one thread runs at a time.
     """
-    checks.whole("threads", count, 1, numba.config.NUMBA_NUM_THREADS)
+    checks.whole("threads", count, 1, _MAX_THREADS)
     before = numba.get_num_threads()
     with contextlib.nullcontext() if _layer_is_reentrant() else _ONE_AT_A_TIME:
         numba.set_num_threads(count)
@@ -55,7 +56,7 @@ def threads(count: int) -> Iterator[None]:
 
 KERNELS = KernelSet(
     device="cpu",
-    max_threads=numba.config.NUMBA_NUM_THREADS,
+    max_threads=_MAX_THREADS,
     threads=threads,
     unpack_bits=unpack_bits,
     decimate=decimate,

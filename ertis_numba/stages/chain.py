@@ -1,0 +1,28 @@
+"""What every method of making an image offers to the pipeline."""
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.geometry import Grid
+
+__all__ = ["Chain"]
+
+
+class Chain(Protocol):
+    """A signal chain with tables made once, which several threads may use at a time."""
+
+    @property
+    def grid(self) -> Grid:
+        """The direction axis of the image."""
+        ...
+
+    @property
+    def range_m(self) -> NDArray[np.float64]:
+        """The range axis of the image: (range,) float64."""
+        ...
+
+    def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
+        ...

@@ -1,0 +1,401 @@
+"""Rendered scenes against closed forms: arrival times, spreading, noise, and what the modulators keep of them."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.signal import lfilter
+
+from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.geometry import load_layout, microphones
+from ertis_numba.kernels._cpu.modulate import modulate_pdm
+from ertis_numba.settings import Array, Call, Processing, Recording, Settings
+from ertis_numba.simulation import DirectSound, Electronics, Point, Scene, arrivals, load_scene, true_peaks
+from ertis_numba.simulation.modulator import Modulator, loop_gains, noise_transfer
+from ertis_numba.simulation.render import received, render
+from ertis_numba.waveform import call_at
+
+RATE_HZ = 4_500_000.0
+BAND = 80_000 / RATE_HZ
+MASK = 2**64 - 1
+SHORT = Settings(
+    array=Array(layout="three", positions_m=((0.0, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, -0.03)), word_bits=8),
+    recording=Recording(n_samples=40_000),
+    processing=Processing(range_m=(0.3, 0.9)),
+)
+SCENE = Scene(seed=7, sensor=SHORT, points=(Point(azimuth_deg=25, elevation_deg=-10, range_m=0.7, strength_db=-15),))
+
+
+def signals_of(measurement):
+    """Return the bits of every channel as (channel, sample) of +1 and −1."""
+    words = measurement.words.reshape(len(measurement.words), -1)
+    octets = words.astype(words.dtype.newbyteorder("<")).view(np.uint8)
+    return 2.0 * np.unpackbits(octets, axis=1, bitorder="little").T - 1.0
+
+
+def arrival_s(signal, call, rate_hz, near_s):
+    """Find the call in a signal: the peak of the correlation with itself, to a small part of a sample."""
+    n = 2 * len(signal)
+    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+    inside = (frequency_hz > call.low_frequency_hz) & (frequency_hz < call.high_frequency_hz)
+    replica = np.fft.rfft(call_at(call, np.arange(len(signal)) / rate_hz), n)
+    product = np.where(inside, np.fft.rfft(signal, n) * np.conj(replica), 0)
+    for _ in range(4):  # Newton's steps to the maximum of the exact correlation
+        turn = 2j * np.pi * frequency_hz
+        turned = product * np.exp(turn * near_s)
+        near_s -= np.sum(turned * turn).real / np.sum(turned * turn**2).real
+    return near_s
+
+
+def modulate_plainly(signal, key, gains, dither, limit):
+    """Step through `modulate_pdm` for one microphone with Python's own numbers; return bits and what was quantised."""
+    c1, c2, c3, c4, r1, r2 = gains
+    s1 = s2 = s3 = s4 = 0.0
+    bits, quantised = [], []
+    for sample, u in enumerate(signal.tolist()):
+        z = (key + sample * 0x9E3779B97F4A7C15) & MASK
+        z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & MASK
+        z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & MASK
+        noise = ((z ^ (z >> 31)) >> 11) / 2**53 - 0.5
+        bit = (u + dither * noise) + ((s1 + s2) + (s3 + s4)) >= 0
+        bits.append(int(bit))
+        quantised.append(u + ((s1 + s2) + (s3 + s4)))
+        d = u - (1 if bit else -1)
+        s1 = min(max(s1 + (c1 * d - r1 * s2), -limit), limit)
+        s2 = min(max(s2 + c2 * s1, -limit), limit)
+        s3 = min(max(s3 + (c3 * s2 - r2 * s4), -limit), limit)
+        s4 = min(max(s4 + c4 * s3, -limit), limit)
+    return bits, np.array(quantised)
+
+
+def modulated(signals, order=4, dither=0.5, band=BAND):
+    keys = np.random.default_rng(3).integers(0, 2**64, len(signals), dtype=np.uint64)
+    return Modulator(keys, order=order, dither=dither, band=band).process(signals)
+
+
+def tone(amplitude, n_samples=131_072, frequency_hz=41_234.5):
+    return amplitude * np.sin(2 * np.pi * frequency_hz / RATE_HZ * np.arange(n_samples))
+
+
+def in_band_snr_db(bits, signal, low_hz=20_000, high_hz=80_000):
+    window = np.hanning(len(signal))
+    frequency_hz = np.fft.rfftfreq(len(signal), 1 / RATE_HZ)
+    inside = (frequency_hz >= low_hz) & (frequency_hz <= high_hz)
+    power = np.abs(np.fft.rfft(signal * window)[inside]) ** 2
+    error = np.abs(np.fft.rfft((2.0 * bits - 1 - signal) * window)[inside]) ** 2
+    return 10 * np.log10(power.sum() / error.sum())
+
+
+# ---- the modulator ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_modulator_does_what_its_equations_say(order):
+    signals = np.stack([tone(0.4, 3000), np.zeros(3000), np.full(3000, 0.3)])
+    signals[0, 1000:1200] = 5.0  # overload, to reach the limits
+    keys = np.array([0, 1, 2**64 - 1], dtype=np.uint64)
+    gains = loop_gains(order, BAND)
+    bits = np.empty(signals.shape, dtype=np.uint8)
+    modulate_pdm(signals, keys, np.zeros((3, 4)), np.asarray(gains), 0, 0.5, 2.0, bits)
+    for mic in range(3):
+        assert bits[mic].tolist() == modulate_plainly(signals[mic], int(keys[mic]), gains, 0.5, 2.0)[0]
+
+
+@pytest.mark.parametrize(("order", "least_db"), [(1, 28), (2, 49), (3, 54), (4, 62)])
+def test_modulator_keeps_the_band(order, least_db):
+    signal = tone(0.5)
+    assert in_band_snr_db(modulated(signal[None], order)[0], signal) > least_db
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_noise_is_shaped_as_designed(order):
+    """Bits less signal are the quantiser's error, filtered by the noise transfer function: no other filter is left."""
+    signal = tone(0.4, 3000)
+    bits, quantised = modulate_plainly(signal, 1, loop_gains(order, BAND), 0.5, np.inf)
+    error = 2.0 * np.array(bits) - 1 - quantised
+    shaped = lfilter(*noise_transfer(order, BAND), error)
+    assert_allclose(2.0 * np.array(bits) - 1 - signal, shaped, atol=1e-3)  # gains are rounded to 20 bits
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_zeros_lie_on_the_unit_circle_and_poles_within(order):
+    zeros, poles = noise_transfer(order, BAND)
+    assert_allclose(np.abs(np.roots(zeros)), 1, atol=1e-6)
+    assert np.all(np.abs(np.roots(poles)) < 0.9)
+    assert zeros[0] == poles[0] == 1  # a delay of at least one sample around the loop
+    assert np.max(np.abs(np.angle(np.roots(zeros)))) < 2 * np.pi * BAND
+    gain = abs(np.polyval(zeros, -1) / np.polyval(poles, -1))
+    assert gain == pytest.approx(1.5, rel=0.01)
+
+
+def test_dither_leaves_no_idle_tones():
+    """A small constant makes a modulator without dither sing; with it no line stands out by 80 dB below full scale."""
+    bits = modulated(np.full((1, 131_072), 1 / 256))[0]
+    spectrum = np.abs(np.fft.rfft((2.0 * bits - 1) * np.hanning(bits.size))) / (bits.size / 4)
+    assert 20 * np.log10(spectrum[int(BAND * bits.size / 4) : int(BAND * bits.size)].max()) < -80
+
+
+@pytest.mark.parametrize("overload", [1.0, 3.0, 1000.0])
+def test_modulator_recovers_from_overload(overload):
+    signal = tone(0.3)
+    signal[1000:20_000] *= overload / 0.3
+    bits = modulated(signal[None])[0]
+    assert in_band_snr_db(bits[21_000:], signal[21_000:]) > 58
+
+
+def test_modulator_is_the_same_for_any_threads_and_blocks():
+    signals = np.stack([tone(0.5, 5000, 30_000 + 1000 * mic) for mic in range(5)])
+    keys = np.arange(5, dtype=np.uint64)
+    whole = Modulator(keys, order=4, dither=0.5, band=BAND).process(signals)
+    for count in (1, kernels.load("cpu").max_threads):
+        with kernels.load("cpu").threads(count):
+            modulator = Modulator(keys, order=4, dither=0.5, band=BAND)
+            parts = [modulator.process(part) for part in np.split(signals, [1, 777, 778, 4000], axis=1)]
+        assert_array_equal(np.concatenate(parts, axis=1), whole)
+
+
+def test_modulator_refuses_other_orders():
+    with pytest.raises(ArgumentError, match="order is 5; give a whole number from 1 to 4"):
+        noise_transfer(5, BAND)
+    with pytest.raises(ArgumentError, match=r"band is 0\.3; give a number from 0 to 0\.25"):
+        noise_transfer(4, 0.3)
+
+
+# ---- arrivals --------------------------------------------------------------------------------------
+
+
+def test_arrivals_follow_the_ways_of_the_sound():
+    scene = SCENE.replace(direct_sound=DirectSound(strength_db=-40))
+    ways = arrivals(scene)
+    positions_m = microphones(SHORT.array).positions_m
+    azimuth, elevation = np.radians(25), np.radians(-10)
+    point_m = 0.7 * np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    back_m = np.linalg.norm(point_m - positions_m, axis=1)
+    direct_m = np.linalg.norm(positions_m, axis=1)
+    c = sound_speed_m_s(SHORT.air)
+    assert_allclose(ways.delay_s, np.stack([direct_m, 0.7 + back_m]) / c, atol=1e-12)
+    assert_allclose(ways.amplitude, np.stack([0.01 / direct_m, 10 ** (-15 / 20) / (0.7 * back_m)]), rtol=1e-12)
+
+
+def test_arrivals_carry_the_spread_of_the_microphones():
+    spread = SHORT.array.replace(gain=(1.0, 0.5, 2.0), delay_s=(0.0, 1e-5, -1e-6))
+    plain, spread = arrivals(SCENE), arrivals(SCENE.replace(sensor=SHORT.replace(array=spread)))
+    assert_allclose(spread.delay_s - plain.delay_s, [[0.0, 1e-5, -1e-6]], atol=1e-12)
+    assert_allclose(spread.amplitude / plain.amplitude, [[1.0, 0.5, 2.0]])
+
+
+@settings(max_examples=30, deadline=None)
+@given(azimuth_deg=st.floats(-180, 180), elevation_deg=st.floats(-90, 90), range_m=st.floats(1e-3, 1000))
+def test_arrivals_are_finite_everywhere(azimuth_deg, elevation_deg, range_m):
+    point = Point(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=range_m, strength_db=0)
+    array = Array(positions_m=((0.0, 0.0, 0.0),))  # the one microphone sits upon the emitter
+    ways = arrivals(Scene(sensor=Settings(array=array), points=(point,), direct_sound=DirectSound()))
+    assert np.all(np.isfinite(ways.amplitude))
+    assert np.all(ways.amplitude <= 1e4)
+    assert np.all(ways.delay_s >= 0)
+
+
+@pytest.mark.parametrize("range_m", [0.3, 0.5123, 0.7])
+def test_received_calls_arrive_on_time(range_m):
+    scene = SCENE.replace(points=(Point(azimuth_deg=40, range_m=range_m, strength_db=-20),))
+    ways = arrivals(scene)
+    for mic, signal in enumerate(received(scene, ways, 0, 40_000)):
+        wanted_s = ways.delay_s[0, mic]
+        assert abs(arrival_s(signal, SHORT.call, RATE_HZ, wanted_s + 3e-7) - wanted_s) * 450e3 < 1e-5
+
+
+def test_bits_hold_the_arrival_and_the_amplitude():
+    """Through 4th order bits with dither, an arrival moves by less than 0.002 of a sample at 450 kHz."""
+    scene = SCENE.replace(points=(Point(azimuth_deg=-40, range_m=0.6, strength_db=-15),))
+    ways = arrivals(scene)
+    bits = signals_of(render(scene))
+    clean = received(scene, ways, 0, 40_000)
+    for mic in range(3):
+        wanted_s = ways.delay_s[0, mic]
+        error = (arrival_s(bits[mic], SHORT.call, RATE_HZ, wanted_s + 3e-7) - wanted_s) * 450e3
+        assert abs(error) < 0.002
+        assert bits[mic] @ clean[mic] / (clean[mic] @ clean[mic]) == pytest.approx(1, abs=0.01)
+
+
+def test_spreading_falls_by_12_db_when_the_distance_doubles():
+    near, far = (
+        arrivals(SCENE.replace(points=(Point(range_m=range_m, strength_db=0),))).amplitude for range_m in (10, 20)
+    )
+    assert_allclose(20 * np.log10(near / far), 12.04, atol=0.01)
+
+
+def test_true_peaks_are_the_points_strongest_first():
+    points = (
+        Point(azimuth_deg=10, range_m=1.0, strength_db=-20),
+        Point(azimuth_deg=-20, elevation_deg=5, range_m=2.0, strength_db=0),
+    )
+    strong, weak = true_peaks(SCENE.replace(points=points))
+    assert (strong.azimuth_deg, strong.elevation_deg, strong.range_m, strong.level_db) == (-20, 5, 2.0, 0)
+    assert weak.level_db == pytest.approx(-20 + 2 * 20 * np.log10(2), abs=0.02)
+    assert true_peaks(SCENE.replace(points=())) == []
+
+
+# ---- rendering -------------------------------------------------------------------------------------
+
+
+def test_seed_and_index_decide_every_bit():
+    noisy = SCENE.replace(electronics=Electronics(noise_dbfs=-60))
+    first = render(noisy)
+    assert_array_equal(first.words, render(noisy).words)
+    others = [render(noisy, 1), render(noisy.replace(seed=8)), render(SCENE)]
+    for other in others:
+        assert np.mean(other.words != first.words) > 0.1
+    assert (others[0].stamp.sequence, others[0].stamp.sync_count, others[0].stamp.timestamp_ns) == (1, 1, 50_000_000)
+
+
+def test_blocks_do_not_show(monkeypatch):
+    scene = SCENE.replace(electronics=Electronics(noise_dbfs=-60), direct_sound=DirectSound())
+    whole = render(scene).words
+    monkeypatch.setattr("ertis_numba.simulation.render._BLOCK", 1237)
+    assert_array_equal(render(scene).words, whole)
+
+
+def test_words_are_those_of_an_earlier_version():
+    """A change of these bits changes every shipped recording: then rebuild data/synthetic, and say so."""
+    words = render(SCENE.replace(electronics=Electronics(noise_dbfs=-60))).words
+    assert hashlib.sha256(words.tobytes()).hexdigest()[:16] == "2e3d9c39f62416ca"
+
+
+def test_noise_has_its_level():
+    sensor = SHORT.replace(recording=Recording(n_samples=200_000))
+    scene = Scene(sensor=sensor, electronics=Electronics(noise_dbfs=-20, dither=0))
+    bits = signals_of(render(scene))[:3]
+    spectrum = np.abs(np.fft.rfft(bits)) ** 2 / bits.shape[1]  # white noise of level σ: σ² in every bin
+    low = spectrum[:, int(0.002 * bits.shape[1]) : int(0.01 * bits.shape[1])]
+    assert_allclose(10 * np.log10(low.mean(axis=1)), -20, atol=0.3)
+    assert abs(np.corrcoef(bits)[0, 1]) < 0.02  # each microphone has its own
+
+
+@pytest.mark.parametrize(("word_bits", "n_channels"), [(8, 1), (8, 8), (16, 17), (32, 33), (64, 64), (64, 1024)])
+def test_channels_lie_in_their_bits(word_bits, n_channels):
+    positions_m = tuple((0.0, 1e-3 * channel, 0.0) for channel in range(n_channels))
+    array = Array(layout="line", positions_m=positions_m, word_bits=word_bits)
+    sensor = SHORT.replace(array=array, recording=Recording(n_samples=601))
+    measurement = render(Scene(sensor=sensor, points=(Point(range_m=0.02, strength_db=-80),)))
+    n_words = -(-n_channels // word_bits)
+    assert measurement.words.shape == ((601, n_words) if n_words > 1 else (601,))
+    assert measurement.words.dtype == f"u{word_bits // 8}"
+    bits = signals_of(measurement)
+    assert np.all(bits[n_channels:] == -1)
+    assert np.all(np.abs(bits[:n_channels].mean(axis=1)) < 0.2)
+
+
+def test_disabled_channels_hold_zeros():
+    layout = load_layout("uRTIS_v1")
+    sensor = Settings(array=Array(layout="uRTIS_v1"), recording=Recording(n_samples=500))
+    bits = signals_of(render(Scene(sensor=sensor)))
+    assert np.all(bits[~layout.enabled] == -1)
+    assert np.all(bits[layout.enabled].max(axis=1) == 1)
+
+
+@pytest.mark.parametrize("n_samples", [1, 7, 4099])
+def test_odd_records_render(n_samples):
+    scene = Scene(sensor=SHORT.replace(recording=Recording(n_samples=n_samples)), points=(Point(range_m=0.05),))
+    assert render(scene).words.shape == (n_samples,)
+
+
+def test_an_echo_past_the_record_is_not_heard():
+    ways = arrivals(SCENE.replace(points=(Point(range_m=900),)))
+    assert not received(SCENE, ways, 0, 40_000).any()
+
+
+def test_index_is_checked():
+    with pytest.raises(ArgumentError, match="index is -1; give a whole number of at least 0"):
+        render(SCENE, -1)
+
+
+# ---- scenes ----------------------------------------------------------------------------------------
+
+points = st.builds(
+    Point,
+    azimuth_deg=st.floats(-180, 180),
+    elevation_deg=st.floats(-90, 90),
+    range_m=st.floats(1e-3, 1000),
+    strength_db=st.floats(-300, 120),
+)
+scenes = st.builds(
+    Scene,
+    seed=st.integers(0, 2**63 - 1),
+    rate_hz=st.floats(0.01, 1000),
+    sensor=st.sampled_from([Settings(), SHORT, Settings.from_preset("short_20_80")]),
+    electronics=st.builds(
+        Electronics,
+        noise_dbfs=st.none() | st.floats(-300, 0),
+        modulator_order=st.integers(1, 4),
+        dither=st.floats(0, 2),
+    ),
+    direct_sound=st.none() | st.builds(DirectSound, strength_db=st.floats(-300, 120)),
+    points=st.lists(points, max_size=4).map(tuple),
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(scenes)
+def test_scenes_survive_toml(scene):
+    assert Scene.from_toml(scene.to_toml()) == scene
+
+
+def test_scene_file(tmp_path):
+    (tmp_path / "line.csv").write_text("0, 0\n5, 0\n10, 0\n")
+    (tmp_path / "scene.toml").write_text('[sensor.array]\nlayout = "line.csv"\n[[points]]\nrange_m = 1\n')
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.points == (Point(range_m=1.0),)
+    assert len(microphones(scene.sensor.array).enabled) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed = ", "scene: .*; correct it or take it out"),
+        ("sede = 1", "scene: unknown key `sede`; correct it"),
+        ("[[points]]\nazimuth_deg = 1", "scene: Object missing required field `range_m`.*points"),
+        ("[[points]]\nrange_m = 1\nradius_m = 1", "unknown key `radius_m`.*points"),
+        ("[[points]]\nrange_m = 0", r"point\.range_m is 0; give a number from 0\.001 to 1000"),
+        ("[[points]]\nrange_m = nan", r"point\.range_m is nan; give a finite number"),
+        ("[[points]]\nrange_m = 1\nazimuth_deg = 181", r"point\.azimuth_deg is 181; give a number from -180 to 180"),
+        ("[[points]]\nrange_m = 1\nelevation_deg = 91", r"point\.elevation_deg is 91; give a number from -90 to 90"),
+        ("[[points]]\nrange_m = 1\nstrength_db = 121", r"point\.strength_db is 121; give a number from -300 to 120"),
+        ("[direct_sound]\nstrength_db = 121", r"direct_sound\.strength_db is 121; give a number from -300 to 120"),
+        ("[electronics]\nnoise_dbfs = 1", r"electronics\.noise_dbfs is 1; give a number from -300 to 0"),
+        ("[electronics]\nmodulator_order = 5", r"electronics\.modulator_order is 5; give a whole number from 1 to 4"),
+        ("[electronics]\ndither = 3", r"electronics\.dither is 3; give a number from 0 to 2"),
+        ("seed = -1", "seed is -1; give a whole number of at least 0"),
+        ("rate_hz = 0", "rate_hz is 0; give a number from 1e-06 to 1e\\+06"),
+        ("[sensor.recording]\nn_samples = 0", r"recording\.n_samples is 0; give a whole number of at least 1"),
+    ],
+)
+def test_bad_scenes_are_refused(text, message):
+    with pytest.raises(SettingsError, match=message):
+        Scene.from_toml(text)
+
+
+def test_missing_scene_file(tmp_path):
+    with pytest.raises(SettingsError, match=r"none\.toml: .*; give a readable scene file"):
+        load_scene(tmp_path / "none.toml")
+
+
+def test_replace_refuses_unknown_fields():
+    with pytest.raises(ArgumentError, match=r"Point field 'range' is unknown .did you mean 'range_m'"):
+        SCENE.points[0].replace(range=1.0)
+    assert SCENE.points[0].replace(range_m=2.0).range_m == 2.0
+
+
+def test_call_is_far_below_half_the_pdm_rate():
+    """What justifies evaluating the call at the PDM rate: nothing of it is left where it would alias."""
+    call = Call(start_frequency_hz=80_000, stop_frequency_hz=20_000)
+    fine = np.fft.rfft(call_at(call, np.arange(400_000) / (8 * RATE_HZ)))
+    frequency_hz = np.fft.rfftfreq(400_000, 1 / (8 * RATE_HZ))
+    beyond = np.abs(fine[frequency_hz > RATE_HZ / 2]).max()
+    assert 20 * np.log10(beyond / np.abs(fine).max()) < -190
