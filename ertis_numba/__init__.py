@@ -1,0 +1,104 @@
+"""Imaging sonar in air: from the one-bit words of a microphone array to energyscapes and reflectors.
+
+::
+
+    import ertis_numba as ertis
+
+    recording = ertis.open_recording("data/synthetic/reflectors.h5")
+    pipeline = ertis.Pipeline(recording.settings)
+    image = pipeline.process(recording[0])
+    peaks = ertis.find_peaks(image, top=5)
+    ertis.plot(image, peaks=peaks).savefig("image.png")
+
+Names are loaded when they are first used: importing the package loads neither Numba nor SciPy.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ertis_numba.errors import (
+        ArgumentError,
+        DataError,
+        DeviceError,
+        ErtisError,
+        FormatVersionError,
+        SettingsError,
+    )
+    from ertis_numba.figures import plot
+    from ertis_numba.frames import Energyscape, Measurement, Peak, Stamp
+    from ertis_numba.geometry import load_layout
+    from ertis_numba.interop import open_raw
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
+    from ertis_numba.simulation.render import render
+    from ertis_numba.simulation.scene import load_scene
+    from ertis_numba.stages.detect import find_peaks
+    from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
+
+    __version__: str
+
+__all__ = [
+    "ArgumentError",
+    "DataError",
+    "DeviceError",
+    "Energyscape",
+    "ErtisError",
+    "FormatVersionError",
+    "Measurement",
+    "Peak",
+    "Pipeline",
+    "Settings",
+    "SettingsError",
+    "Stamp",
+    "find_peaks",
+    "load_layout",
+    "load_scene",
+    "open_energyscapes",
+    "open_raw",
+    "open_recording",
+    "plot",
+    "render",
+    "write_energyscapes",
+    "write_recording",
+]
+
+_HOMES = {
+    "errors": ("ArgumentError", "DataError", "DeviceError", "ErtisError", "FormatVersionError", "SettingsError"),
+    "figures": ("plot",),
+    "frames": ("Energyscape", "Measurement", "Peak", "Stamp"),
+    "geometry": ("load_layout",),
+    "interop": ("open_raw",),
+    "pipeline": ("Pipeline",),
+    "settings": ("Settings",),
+    "simulation.render": ("render",),
+    "simulation.scene": ("load_scene",),
+    "stages.detect": ("find_peaks",),
+    "storage": ("open_energyscapes", "open_recording", "write_energyscapes", "write_recording"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first asked for (PEP 562)."""
+    if name == "__version__":
+        value: Any = _version()
+    elif name in _HOME_OF:
+        value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})
+
+
+def _version() -> str:
+    from importlib import metadata  # noqa: PLC0415  takes longer than all the rest of this file
+
+    try:
+        return metadata.version("ertis-numba")
+    except metadata.PackageNotFoundError:  # run from its source, not installed
+        return "unknown"

@@ -16,9 +16,13 @@ def finite(name: str, value: float) -> float:
     """Return ``value`` as a float; refuse NaN, infinities and what is no number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(f"{name} is {value!r}; give a number")
-    if not math.isfinite(value):
-        raise ArgumentError(f"{name} is {value}; give a finite number")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise ArgumentError(f"{name} is {number}; give a finite number")
+    return number
 
 
 def positive(name: str, value: float) -> float:

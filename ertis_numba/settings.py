@@ -86,14 +86,16 @@ class Array(_Section, frozen=True):
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
                 raise ArgumentError("array.enabled is false for every channel; enable at least one")
-        if self.gain is not None:
-            checks.shape("array.gain", (len(self.gain),), (n_channels,))
-            for channel, gain in enumerate(self.gain):
-                checks.between(f"array.gain[{channel}]", gain, 1e-3, 1e3)
-        if self.delay_s is not None:
-            checks.shape("array.delay_s", (len(self.delay_s),), (n_channels,))
-            for channel, delay_s in enumerate(self.delay_s):
-                checks.between(f"array.delay_s[{channel}]", delay_s, -1e-3, 1e-3)
+        self._check_each("gain", 1e-3, 1e3)
+        self._check_each("delay_s", -1e-3, 1e-3)
+
+    def _check_each(self, name: str, low: float, high: float) -> None:
+        """Refuse a list that has not one number in ``[low, high]`` for each channel."""
+        values = getattr(self, name)
+        if values is not None:
+            checks.shape(f"array.{name}", (len(values),), (len(self.positions_m or ()),))
+            for channel, value in enumerate(values):
+                checks.between(f"array.{name}[{channel}]", value, low, high)
 
 
 class Call(_Section, frozen=True):

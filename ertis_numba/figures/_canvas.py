@@ -1,5 +1,6 @@
 """What all pictures share: colours, levels, the words around the image and the marks in it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape, Peak
 
-__all__ = ["THEMES", "Canvas", "Theme"]
+__all__ = ["THEMES", "Canvas", "Theme", "angle"]
 
 _DPI = 160
 
@@ -82,8 +83,12 @@ class Canvas:
         for spine in axes.spines.values():
             spine.set_color(self.theme.faint)
 
-    def mark(self, axes: Axes, number: int, x: float, y: float) -> None:
-        """Ring a reflector and number it, legible on any colour of the map."""
+    def mark_peaks(self, axes: Axes, place: Callable[[Peak], tuple[float, float]]) -> None:
+        """Ring and number the reflectors where ``place`` says, the strongest on top."""
+        for number, peak in reversed(list(enumerate(self.peaks, 1))):
+            self._mark(axes, number, *place(peak))
+
+    def _mark(self, axes: Axes, number: int, x: float, y: float) -> None:
         outline = [withStroke(linewidth=2.5, foreground=self.theme.page)]
         (ring,) = axes.plot(x, y, "o", markersize=10, markerfacecolor="none", markeredgecolor=self.theme.mark)
         ring.set_path_effects([withStroke(linewidth=2.0, foreground=self.theme.page)])
@@ -105,11 +110,15 @@ class Canvas:
         self.style(axes)
         figure.colorbar(shown, cax=axes)
         axes.set_ylabel("dB below the strongest", color=self.theme.faint, fontsize=8.5)
-        rows = [_row(number, peak) for number, peak in enumerate(self.peaks[:_rows_that_fit(figure)], 1)]
+        if not self.peaks:
+            return
+        spatial = any(abs(peak.elevation_deg) >= 0.05 for peak in self.peaks)
+        rows = [_row(number, peak, spatial=spatial) for number, peak in enumerate(self.peaks, 1)]
+        heading = f" #  azimuth {'elevat. ' if spatial else ''}  range    dB"
         figure.text(
             left,
             bottom - 0.06,
-            "\n".join(rows),
+            "\n".join([heading, *rows][: _rows_that_fit(figure)]),
             color=self.theme.ink,
             fontsize=7.5,
             family="monospace",
@@ -120,11 +129,16 @@ class Canvas:
 
 def _settings_line(image: Energyscape) -> str:
     settings = image.settings
+    directions = f"{len(image.azimuth_rad)} directions"
+    if len(image.azimuth_rad) == 1:
+        azimuth_deg, elevation_deg = np.degrees([image.azimuth_rad[0], image.elevation_rad[0]])
+        directions = f"azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
     return "  ·  ".join(
         (
             settings.array.layout,
             f"call {settings.call.low_frequency_hz / 1e3:g}–{settings.call.high_frequency_hz / 1e3:g} kHz",
-            f"{len(image.azimuth_rad)} directions × {len(image.range_m)} ranges",
+            directions,
+            f"{len(image.range_m)} ranges",
             f"method {settings.processing.method}",
             f"{settings.air.temperature_c:g} °C",
         )
@@ -135,6 +149,13 @@ def _rows_that_fit(figure: Figure) -> int:
     return int(0.42 * figure.get_figheight() * 72 / (7.5 * 1.6))
 
 
-def _row(number: int, peak: Peak) -> str:
-    elevation = f" {peak.elevation_deg:+5.1f}°" if abs(peak.elevation_deg) >= 0.05 else ""
-    return f"{number:>2} {peak.azimuth_deg:+6.1f}°{elevation} {peak.range_m:5.2f} m {peak.level_db:6.1f}"
+def _row(number: int, peak: Peak, *, spatial: bool) -> str:
+    elevation = f" {peak.elevation_deg:+6.1f}°" if spatial else ""
+    row = f"{number:>2}  {peak.azimuth_deg:+6.1f}°{elevation}  {peak.range_m:5.2f} m {peak.level_db:5.1f}"
+    return row.replace("-", "−")
+
+
+def angle(degrees: float) -> str:
+    """Return an angle with its sign, as the axes write it."""
+    text = f"{degrees:+.1f}".removesuffix(".0").replace("-", "−")
+    return "0°" if text in {"+0", "−0"} else f"{text}°"

@@ -19,7 +19,5 @@ def draw(canvas: Canvas, image: Energyscape) -> Figure:
     axes.set_xlabel("range (m)")
     axes.set_ylabel("dB below the strongest")
     axes.grid(color=canvas.theme.faint, alpha=0.3, linewidth=0.6)
-    for number, peak in enumerate(canvas.peaks, 1):
-        if peak.level_db >= -canvas.dynamic_range_db:
-            canvas.mark(axes, number, peak.range_m, peak.level_db)
+    canvas.mark_peaks(axes, lambda peak: (peak.range_m, peak.level_db))
     return figure

@@ -9,19 +9,19 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._canvas import Canvas, angle
 from ertis_numba.figures._sampling import PIXELS, join_ranges, polar_raster
 from ertis_numba.frames import Energyscape
 
 __all__ = ["draw", "draw_into"]
 
-_LINE = {"alpha": 0.35, "linewidth": 0.7}
-
 
 def draw(canvas: Canvas, image: Energyscape) -> Figure:
     """Draw a planar image."""
-    figure = canvas.figure(image, width_in=10.0, height_in=6.0)
-    axes = figure.add_axes((0.02, 0.02, 0.74, 0.84))
+    left, right, bottom, top = _extent(np.sort(image.azimuth_rad), image.range_m)
+    height_in = 1.7 + 6.2 * min(0.9, max(0.3, (top - bottom) / (right - left or 1.0)))
+    figure = canvas.figure(image, width_in=10.0, height_in=height_in)
+    axes = figure.add_axes((0.02, 0.02, 0.74, 1 - 0.85 / height_in))
     shown = draw_into(canvas, axes, image.azimuth_rad, image.range_m, canvas.level_db(image.energy))
     canvas.side(figure, shown, left=0.775)
     return figure
@@ -52,8 +52,7 @@ def draw_into(
     _rings(canvas, axes, azimuth_rad, range_m)
     _rays(canvas, axes, azimuth_rad, range_m)
     axes.plot(0, 0, marker="^", markersize=8, color=canvas.theme.ink)
-    for number, peak in enumerate(canvas.peaks, 1):
-        canvas.mark(axes, number, *_place(math.radians(peak.azimuth_deg), peak.range_m))
+    canvas.mark_peaks(axes, lambda peak: _place(math.radians(peak.azimuth_deg), peak.range_m))
     margin_m = 0.08 * range_m[-1]
     axes.set_xlim(left - margin_m, right + margin_m)
     axes.set_ylim(bottom - margin_m, top + margin_m)
@@ -88,7 +87,7 @@ def _rings(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m
         if not 0 < ring_m <= last_m * (1 + 1e-9):
             continue
         if ring_m >= range_m[0]:
-            axes.plot(-ring_m * np.sin(arc), ring_m * np.cos(arc), color=canvas.theme.faint, **_LINE)
+            _line(canvas, axes, -ring_m * np.sin(arc), ring_m * np.cos(arc))
         _name(canvas, axes, azimuth_rad[0], ring_m, f"{ring_m:g} m", offset=offset, align=align)
 
 
@@ -99,9 +98,13 @@ def _rays(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m:
         if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6:
             continue
         ray = math.radians(ray_deg)
-        (near_x, near_y), (far_x, far_y) = _place(ray, range_m[0]), _place(ray, range_m[-1])
-        axes.plot([near_x, far_x], [near_y, far_y], color=canvas.theme.faint, **_LINE)
-        _name(canvas, axes, ray, range_m[-1] * 1.045, f"{ray_deg:+d}°" if ray_deg else "0°")
+        ends_m = range_m[[0, -1]]
+        _line(canvas, axes, -ends_m * math.sin(ray), ends_m * math.cos(ray))
+        _name(canvas, axes, ray, range_m[-1] * 1.045, angle(ray_deg))
+
+
+def _line(canvas: Canvas, axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    axes.plot(x, y, color=canvas.theme.faint, alpha=0.35, linewidth=0.7)
 
 
 def _name(

@@ -54,5 +54,6 @@ def _map(canvas: Canvas, axes: Axes, image: Energyscape, level_db: NDArray[np.fl
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(spacing_deg))
     axes.grid(color=canvas.theme.faint, alpha=0.3, linewidth=0.6)
-    for number, peak in enumerate(canvas.peaks, 1):
-        canvas.mark(axes, number, peak.azimuth_deg, peak.elevation_deg)
+    canvas.mark_peaks(axes, lambda peak: (peak.azimuth_deg, peak.elevation_deg))
+    axes.set_xlim(west, east)
+    axes.set_ylim(low, high)

@@ -22,7 +22,7 @@ def threads(count: int) -> Iterator[None]:
 
 def unpack_bits(words: Words, channels: Index, out: Real) -> None:
     """See `UnpackBits`."""
-    octets = words.view(np.uint8).reshape(len(words), -1)
+    octets = words.view(np.uint8).reshape(len(words), words.shape[1] * words.itemsize)
     out[:] = np.unpackbits(octets, axis=1, bitorder="little")[:, channels].T
     out *= np.float32(2)
     out -= np.float32(1)

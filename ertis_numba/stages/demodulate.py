@@ -9,7 +9,6 @@ from ertis_numba.geometry import Layout
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
-from ertis_numba.waveform import decimation_taps, matched_band_hz
 
 __all__ = ["Demodulate"]
 
@@ -19,20 +18,21 @@ class Demodulate:
 
     Attributes
     ----------
-    taps : (tap,) float64
-        The decimation filter.
     shape : (mic, sample)
         Of the signals, zeros at the end included.
     """
 
-    def __init__(self, settings: Settings, layout: Layout, window: TimeWindow, kernels: KernelSet) -> None:
-        self.taps = decimation_taps(
-            pdm_rate_hz=settings.recording.pdm_rate_hz,
-            decimation=settings.processing.decimation,
-            pass_hz=matched_band_hz(settings.call)[1],
-        )
+    def __init__(
+        self,
+        settings: Settings,
+        layout: Layout,
+        window: TimeWindow,
+        kernels: KernelSet,
+        *,
+        taps: NDArray[np.float64],
+    ) -> None:
         self._kernel = kernels.demodulate_words
-        self._taps = self.taps.astype(np.float32)
+        self._taps = taps.astype(np.float32)
         self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
         self._factor = settings.processing.decimation
         self._window = window

@@ -15,6 +15,7 @@ from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.demodulate import Demodulate
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.window import time_window
+from ertis_numba.waveform import decimation_taps, matched_band_hz
 
 __all__ = ["FastChain"]
 
@@ -41,18 +42,18 @@ class FastChain:
             unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
             sound_speed_m_s=sound_speed_m_s(settings.air),
         )
-        window = time_window(settings, largest_delay_s=float(np.max(np.abs(delays_s))))
+        taps = decimation_taps(
+            pdm_rate_hz=settings.recording.pdm_rate_hz,
+            decimation=settings.processing.decimation,
+            pass_hz=matched_band_hz(settings.call)[1],
+        )
+        window = time_window(settings, largest_delay_s=float(np.max(np.abs(delays_s))), n_taps=len(taps))
         self.range_m = window.range_m
         self._kernels = kernels
         self._threads = threads
-        self._demodulate = Demodulate(settings, layout, window, kernels)
+        self._demodulate = Demodulate(settings, layout, window, kernels, taps=taps)
         self._matched_filter = MatchedFilter(
-            settings,
-            window,
-            kernels,
-            fft.load(kernels.device),
-            taps=self._demodulate.taps,
-            n_mics=delays_s.shape[1],
+            settings, window, kernels, fft.load(kernels.device), taps=taps, n_mics=delays_s.shape[1]
         )
         self._beamform = Beamform(
             settings, layout, window, kernels, delays_s=delays_s, centre_hz=self._matched_filter.centre_hz

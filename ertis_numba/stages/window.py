@@ -43,8 +43,10 @@ class TimeWindow:
     start_s: float
 
 
-def time_window(settings: Settings, *, largest_delay_s: float) -> TimeWindow:
+def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int) -> TimeWindow:
     """Return the window for beams whose delays stay within ``± largest_delay_s``.
+
+    ``n_taps`` is the length of the decimation filter, which lets the record reach over its ends.
 
     An echo at time t needs the samples from t on for as long as the call lasts, and the matched
     filter's ringing on both sides. The transform is a little longer than that, so what wraps around in
@@ -74,13 +76,15 @@ def time_window(settings: Settings, *, largest_delay_s: float) -> TimeWindow:
     n_outputs = scipy.fft.next_fast_len(math.ceil(spanned_s * output_rate_hz))
     n_fft = n_outputs * settings.processing.output_decimation
     rate_hz = settings.signal_rate_hz
-    first_sample = max(0, math.floor((start_s - guard_s) * rate_hz))
-    last_sample = math.ceil((stop_s + settings.call.duration_s + guard_s) * rate_hz)
-    in_record = settings.recording.n_samples // settings.processing.decimation
+    decimation = settings.processing.decimation
+    before = n_taps // 2 // decimation
+    after = (settings.recording.n_samples - 1 + n_taps // 2) // decimation
+    first_sample = max(-before, math.floor((start_s - guard_s) * rate_hz))
+    last_sample = min(after, math.ceil((stop_s + settings.call.duration_s + guard_s) * rate_hz))
     return TimeWindow(
         range_m=first_m + step_m * np.arange(n_ranges, dtype=np.float64),
         first_sample=first_sample,
-        n_samples=max(0, min(last_sample, in_record) - first_sample),
+        n_samples=min(max(0, last_sample - first_sample + 1), n_fft),
         n_fft=n_fft,
         n_outputs=n_outputs,
         lead=lead,

@@ -1,6 +1,8 @@
 """What the writers of both kinds of file share: a part file, rows, and reading back."""
 
 import hashlib
+import os
+import re
 import uuid
 import zlib
 from abc import ABC, abstractmethod
@@ -110,7 +112,10 @@ class Writer(ABC, Generic[Item]):
                 file.close()
                 self._compare(rows)
         except BaseException:
+            # Closing writes what is still in memory, and HDF5 that cannot do so takes the process with
+            # it (h5py issue 914). An emptied file gives back the room for it on a full disk.
             with suppress(OSError, RuntimeError):  # the first error is the one to tell
+                os.truncate(self._part, 0)
                 file.close()
             raise
 
@@ -147,8 +152,9 @@ class Writer(ABC, Generic[Item]):
         try:
             yield
         except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails
-            reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
-            raise DataError(f"{self.path} cannot be written ({reason}); free some space or write elsewhere") from error
+            raise DataError(
+                f"{self.path} cannot be written ({_reason(error)}); free some space or write elsewhere"
+            ) from error
 
 
 def self_contained(settings: Settings) -> Settings:
@@ -156,6 +162,12 @@ def self_contained(settings: Settings) -> Settings:
     if settings.array.positions_m is not None:
         return settings
     return settings.replace(array=microphones(settings.array).to_array())
+
+
+def _reason(error: Exception) -> str:
+    """Return the system's words, which HDF5 hides in the middle of its own."""
+    inner = re.search(r"error message = '(.*?)'", str(error))
+    return inner[1] if inner else str(error).partition("\n")[0]
 
 
 def _as_version_8(digest: bytes) -> bytes:

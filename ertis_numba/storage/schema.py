@@ -34,7 +34,8 @@ __all__ = [
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
 FORMAT_VERSION: Final = 1
-CHUNK_ROWS: Final = 4096  # of the columns that hold one number per measurement
+CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
+_TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
 _UNLIMITED: Final = ("time", "gap")
 _SENSOR_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
 
@@ -151,7 +152,8 @@ def _dataset(group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping
     shape = tuple(sizes.get(dim, 0) for dim in dims)
     if dims[0] not in _UNLIMITED:
         return group.create_dataset(name, shape, kind)
-    chunks = (CHUNK_ROWS,) if len(dims) == 1 else (1, *shape[1:])
+    rows = _TIME_CHUNK_ROWS if name == "time" else CHUNK_ROWS
+    chunks = (rows,) if len(dims) == 1 else (1, *shape[1:])
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
 
 

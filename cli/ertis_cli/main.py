@@ -1,0 +1,103 @@
+"""The ``ertis`` command: finds its commands by name, and turns errors into one line and an exit code."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import click
+
+# libgomp reads this when Numba loads it: its idle threads otherwise spin on the cores that the
+# transforms between two kernels need.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+__all__ = ["COMMANDS", "cli", "main"]
+
+COMMANDS = {
+    "bench": ("ertis_cli.bench:bench", "Measure this machine."),
+    "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
+    "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
+    "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
+    "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
+    "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),
+    "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
+}
+"""Where each command is, and what its help says first: commands are imported when they are run."""
+
+_FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
+
+
+class _Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, COMMANDS[name][1]) for name in sorted(COMMANDS)])
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:
+        """Run, and leave with an exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
+        extra["standalone_mode"] = False
+        try:
+            code = super().main(args, prog_name or "ertis", **extra)
+        except click.UsageError as error:
+            path = error.ctx.command_path if error.ctx else "ertis"
+            _leave(_USAGE, f"{error.format_message().rstrip('.')}; see '{path} --help'")
+        except click.ClickException as error:
+            _leave(_FAILED, error.format_message())
+        except click.Abort:
+            _leave(_INTERRUPTED, "interrupted")
+        except Exception as error:
+            if not _is_expected(error):
+                raise
+            _leave(_FAILED, str(error))
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _is_expected(error: Exception) -> bool:
+    """Whether an error is one to tell in a line, rather than a mistake in the program."""
+    from ertis_numba.errors import ErtisError
+
+    return isinstance(error, ErtisError | OSError | MemoryError)
+
+
+def _leave(code: int, message: str) -> NoReturn:
+    click.echo(f"ertis: error: {' '.join(message.split())}", err=True)
+    sys.exit(code)
+
+
+def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click calls it
+    if wanted:
+        import ertis_numba
+
+        click.echo(f"ertis {ertis_numba.__version__}")
+        ctx.exit()
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the version."
+)
+def cli() -> None:
+    """Imaging sonar in air: from one-bit microphones to energyscapes.
+
+    Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage,
+    130 interrupted.
+    """
+
+
+def main() -> NoReturn:
+    """Run the command line."""
+    cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""Options and reports that several commands share."""
+
+import json
+import sys
+import threading
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Measurement
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
+
+__all__ = [
+    "INTERVAL",
+    "as_json",
+    "device",
+    "force",
+    "input_file",
+    "measurement",
+    "note_when_slow",
+    "output",
+    "pipeline",
+    "place",
+    "print_json",
+    "progress",
+    "quiet",
+    "require_same_air",
+    "say",
+    "settings_with",
+    "threads",
+]
+
+Item = TypeVar("Item")
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+_SLOW_S = 1.0
+
+
+class _Interval(click.ParamType):
+    name = "A:B"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        first, colon, last = str(value).partition(":")
+        if colon:
+            with suppress(ValueError):
+                return float(first), float(last)
+        return self.fail(f"{value!r} is no interval, give two numbers as in 0.5:5", param, ctx)
+
+
+INTERVAL = _Interval()
+_FILE = click.Path(path_type=Path)
+
+as_json: Decorator = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+device: Decorator = click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "numpy"]),
+    default="auto",
+    show_default=True,
+    help="What computes; numpy runs without compiled kernels.",
+)
+force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
+quiet: Decorator = click.option("--quiet", "-q", is_flag=True, help="No progress, no summary; errors only.")
+threads: Decorator = click.option("--threads", type=int, metavar="N", help="Threads; all cores by default.")
+
+
+def input_file(metavar: str) -> Decorator:
+    """Return the argument that names the file to read."""
+    return click.argument("path", metavar=metavar, type=_FILE)
+
+
+def output(text: str) -> Decorator:
+    """Return the option that names the file to write."""
+    return click.option("--output", "-o", "target", type=_FILE, metavar="FILE", help=text)
+
+
+def measurement(text: str) -> Decorator:
+    """Return the option that chooses one measurement."""
+    return click.option("--measurement", "-m", type=int, metavar="I", help=text)
+
+
+def place(index: int, count: int) -> int:
+    """Return the place of a measurement in a file of ``count``, or refuse it."""
+    from ertis_numba import checks
+
+    return checks.whole("--measurement", index, 0, count - 1)
+
+
+def settings_with(recorded: "Settings", *, settings_file: Path | None = None, **options: Any) -> "Settings":
+    """Return the settings of a recording, changed by a settings file and then by options.
+
+    A settings file changes the keys that it holds; an array is replaced as a whole. Options are named
+    like the fields of `Processing`; those that are None change nothing.
+    """
+    from ertis_numba.geometry import PAPER_GRIDS
+
+    settings = recorded if settings_file is None else _changed_by_file(recorded, settings_file)
+    given = {name: value for name, value in options.items() if value is not None}
+    directions = given.get("directions", settings.processing.directions)
+    if directions in PAPER_GRIDS and {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys():
+        raise click.UsageError(
+            f"directions {directions} have limits of their own; give 2d:N or 3d:N with limits",
+            ctx=click.get_current_context(),
+        )
+    return settings.replace(processing=settings.processing.replace(**given))
+
+
+def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
+    import tomli_w
+
+    from ertis_numba.errors import SettingsError
+    from ertis_numba.settings import Settings
+
+    try:
+        changes = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{path}: {error}; give a readable settings file") from error
+    tables = tomllib.loads(recorded.to_toml())
+    for name, table in changes.items():
+        whole = name == "array" or not isinstance(table, dict)
+        tables[name] = table if whole else {**tables.get(name, {}), **table}
+    return Settings.from_toml(tomli_w.dumps(tables), str(path))
+
+
+def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
+    """Return a pipeline, and tell who waits for it why."""
+    with note_when_slow("compiling kernels (first run only) ...", quiet=quiet):
+        from ertis_numba.pipeline import Pipeline
+
+        return Pipeline(settings, device=device, threads=threads)
+
+
+def say(text: str, *, quiet: bool) -> None:
+    """Print a line for the user, who may not want it."""
+    if not quiet:
+        click.echo(text, err=True)
+
+
+def print_json(report: dict[str, Any]) -> None:
+    """Print one object on stdout."""
+    click.echo(json.dumps(report, indent=None, allow_nan=False))
+
+
+def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> AbstractContextManager[Iterable[Item]]:
+    """Return ``items`` under a progress bar on stderr, which is hidden where nobody looks."""
+    hidden = quiet or not sys.stderr.isatty()
+    return click.progressbar(items, length=length, label=label, file=sys.stderr, hidden=hidden)
+
+
+def require_same_air(measurement: "Measurement", settings: "Settings") -> None:
+    """Refuse a measurement in other air, whose ranges would not be those of the axis."""
+    from ertis_numba.errors import DataError
+
+    came, wanted = measurement.settings.air, settings.air
+    if came != wanted:
+        raise DataError(
+            f"measurement {measurement.stamp.sequence} was taken at {came.temperature_c:g} °C, "
+            f"{came.humidity_percent:g} %, {came.pressure_pa:g} Pa, others at {wanted.temperature_c:g} °C, "
+            f"{wanted.humidity_percent:g} %, {wanted.pressure_pa:g} Pa; give one air for all with --settings"
+        )
+
+
+@contextmanager
+def note_when_slow(text: str, *, quiet: bool) -> Iterator[None]:
+    """Print ``text`` if the block takes more than a second."""
+    timer = threading.Timer(_SLOW_S, say, args=(text,), kwargs={"quiet": quiet})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -1,0 +1,102 @@
+"""The referees: slow, obvious, float64, and independent of kernels and stages.
+
+`exact` is the image that the fast chain approximates. It never decimates: the spectrum of the bits themselves is
+matched, delayed by exact phase shifts and evaluated at the asked ranges. The plain functions below it say
+what each kernel should do.
+"""
+
+import numpy as np
+import scipy.fft
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
+from ertis_numba.waveform import call_at
+
+
+def error_db(image, exact) -> float:
+    """Difference of two images in dB of the exact one's norm."""
+    return float(20 * np.log10(np.linalg.norm(image - exact) / np.linalg.norm(exact)))
+
+
+def exact(words, settings: Settings, directions, range_m, *, spherical=False):
+    """The exact image: (direction, range) float64.
+
+    Parameters
+    ----------
+    words : (sample,) or (sample, word) unsigned
+    directions : (direction, axis) unit vectors
+    range_m : (range,)
+    spherical : bool
+        Delays of points at their ranges instead of plane waves.
+    """
+    layout = microphones(settings.array)
+    speed_m_s = sound_speed_m_s(settings.air)
+    rate_hz = settings.recording.pdm_rate_hz
+    signals = unpack_bits(words, np.flatnonzero(layout.enabled))
+    spectra, frequency_hz = _matched_spectra(signals, settings, rate_hz)
+    spectra = spectra * np.exp(2j * np.pi * frequency_hz * layout.delay_s[layout.enabled][:, None])
+    spectra /= layout.gain[layout.enabled][:, None] * len(spectra)
+    positions_m = layout.enabled_positions_m
+    at_range = np.exp(2j * np.pi * frequency_hz * (2 * np.asarray(range_m) / speed_m_s)[:, None])  # (range, bin)
+    image = np.empty((len(directions), len(range_m)))
+    for index, direction in enumerate(directions):
+        if spherical:
+            points_m = np.asarray(range_m)[:, None, None] * direction - positions_m
+            delay_s = (np.linalg.norm(points_m, axis=-1) - np.asarray(range_m)[:, None]) / speed_m_s
+            beam = sum(
+                (at_range * np.exp(2j * np.pi * frequency_hz * delay_s[:, mic, None])) @ spectra[mic]
+                for mic in range(len(spectra))
+            )
+        else:
+            delay_s = -(positions_m @ direction) / speed_m_s
+            beam = at_range @ (spectra * np.exp(2j * np.pi * frequency_hz * delay_s[:, None])).sum(axis=0)
+        image[index] = np.abs(beam)
+    return image
+
+
+def _matched_spectra(signals, settings, rate_hz):
+    """One-sided spectra of the signals after the matched filter, and their frequencies.
+
+    ``y(t) = Σ_f Y(f) exp(2πjft)`` is analytic, with an envelope of 1 where the signal is the call itself.
+    """
+    call = settings.call
+    n_fft = scipy.fft.next_fast_len(2 * signals.shape[1] + int(0.02 * rate_hz))  # nothing wraps around
+    frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
+    width_hz = min(5_000.0, call.low_frequency_hz / 2)
+    outside_hz = np.maximum(call.low_frequency_hz - frequency_hz, frequency_hz - call.high_frequency_hz)
+    inside = outside_hz < width_hz
+    frequency_hz, outside_hz = frequency_hz[inside], outside_hz[inside]
+    window = np.where(outside_hz > 0, 0.5 + 0.5 * np.cos(np.pi * outside_hz / width_hz), 1.0)
+    emitted = call_at(call, np.arange(int(call.duration_s * rate_hz) + 2) / rate_hz)
+    response = np.conj(scipy.fft.rfft(emitted, n_fft)[inside]) * window
+    response /= np.sum(np.abs(response) ** 2 / np.where(window > 0, window, 1.0))
+    return scipy.fft.rfft(signals, n_fft)[:, inside] * response, frequency_hz
+
+
+def unpack_bits(words, channels):
+    """The signals of +1 and -1: (mic, sample) float64."""
+    words = words.reshape(len(words), -1)
+    word_bits = words.dtype.itemsize * 8
+    return np.stack(
+        [
+            ((words[:, channel // word_bits] >> words.dtype.type(channel % word_bits)) & words.dtype.type(1)) * 2.0 - 1.0
+            for channel in channels
+        ]
+    )
+
+
+def decimate(signals, taps, factor):
+    """Every factor-th sample of the filtered signals, late by the filter's group delay."""
+    filtered = [np.convolve(signal.astype(float), taps.astype(float))[: len(signal)] for signal in signals]
+    return np.stack(filtered)[:, ::factor]
+
+
+def delay_and_sum(signals, offsets, weights, n_ranges):
+    """The complex beams: (direction, range) complex128."""
+    flat = signals.reshape(-1).astype(complex)
+    beams = np.zeros((len(offsets), n_ranges), dtype=complex)
+    for direction, (starts, factors) in enumerate(zip(offsets, weights.astype(complex), strict=True)):
+        for start, factor in zip(starts, factors, strict=True):
+            beams[direction] += factor * flat[start : start + n_ranges]
+    return beams

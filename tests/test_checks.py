@@ -1,0 +1,65 @@
+"""Argument errors name what came, what was wanted and the remedy, in one line."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ertis_numba import checks, errors
+from ertis_numba.errors import ArgumentError
+
+REFUSED = [
+    (checks.finite, ("x", math.nan), "x is nan; give a finite number"),
+    (checks.finite, ("x", -math.inf), "x is -inf; give a finite number"),
+    (checks.finite, ("x", "3"), "x is '3'; give a number"),
+    (checks.finite, ("x", True), "x is True; give a number"),
+    (checks.finite, ("x", None), "x is None; give a number"),
+    (checks.finite, ("x", 10**400), "x is inf; give a finite number"),
+    (checks.positive, ("x", 0), "x is 0; give a number above 0"),
+    (checks.positive, ("x", -1.5), "x is -1.5; give a number above 0"),
+    (checks.between, ("x", 3, 0, 2), "x is 3; give a number from 0 to 2"),
+    (checks.between, ("x", -0.1, 0, 2), "x is -0.1; give a number from 0 to 2"),
+    (checks.between, ("x", math.nan, 0, 2), "x is nan; give a finite number"),
+    (checks.interval, ("x", (2.0, 1.0), 0, 5), "x runs from 2 to 1; give the smaller number first"),
+    (checks.interval, ("x", (0.0, 6.0), 0, 5), "x is 6; give a number from 0 to 5"),
+    (checks.whole, ("x", 1.0, 0), "x is 1.0; give a whole number"),
+    (checks.whole, ("x", True, 0), "x is True; give a whole number"),
+    (checks.whole, ("x", -1, 0), "x is -1; give a whole number of at least 0"),
+    (checks.whole, ("x", 9, 0, 8), "x is 9; give a whole number from 0 to 8"),
+    (checks.choice, ("layout", "eRTIS_v3D", ["eRTIS_v2", "eRTIS_v3D1"]), "did you mean 'eRTIS_v3D1'"),
+    (checks.choice, ("device", "abacus", ["cpu"]), "device 'abacus' is unknown; known are cpu"),
+    (checks.finite_array, ("x", np.array([[0.0, 1.0], [np.nan, 2.0]])), "x holds nan at [1, 0]; give finite numbers"),
+    (checks.finite_array, ("x", np.array([np.inf])), "x holds inf at [0]; give finite numbers"),
+    (checks.shape, ("x", (2,), (3, 4)), "x has shape (2,); give shape (3, 4)"),
+]
+
+
+@pytest.mark.parametrize(("check", "arguments", "message"), REFUSED)
+def test_refused(check, arguments, message):
+    with pytest.raises(ArgumentError) as caught:
+        check(*arguments)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_fits_is_returned():
+    assert checks.finite("x", 2) == 2.0
+    assert isinstance(checks.finite("x", np.float32(2)), float)
+    assert checks.positive("x", 1e-300) == 1e-300
+    assert checks.between("x", 2, 0, 2) == 2.0
+    assert checks.whole("x", np.int64(7), 0) == 7
+    assert isinstance(checks.whole("x", np.int64(7), 0), int)
+    checks.interval("x", (1.0, 1.0), 0, 5)
+    checks.choice("x", 32, (8, 32))
+    checks.finite_array("x", np.zeros(0))
+    checks.shape("x", (2, 3), (2, 3))
+
+
+def test_each_error_is_also_what_a_caller_would_catch():
+    assert issubclass(errors.ArgumentError, ValueError)
+    assert issubclass(errors.SettingsError, errors.ArgumentError)
+    assert issubclass(errors.FormatVersionError, errors.DataError)
+    assert issubclass(errors.DataError, ValueError)
+    assert issubclass(errors.DeviceError, RuntimeError)
+    for name in errors.__all__:
+        assert issubclass(getattr(errors, name), errors.ErtisError)

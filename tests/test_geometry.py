@@ -1,0 +1,292 @@
+"""Layouts against the device's own files, grids against areas, delays against each other."""
+
+import importlib.metadata
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.io import loadmat
+from scipy.spatial import cKDTree
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import (
+    PAPER_GRIDS,
+    direction_grid,
+    far_field_delays,
+    layout_names,
+    load_layout,
+    microphones,
+    spherical_delays,
+    unit_vectors,
+)
+from ertis_numba.settings import Array, Processing
+
+NAMES = ("eRTIS_v2", "eRTIS_v2REC", "eRTIS_v3D1", "eRTIS_v3D1REC", "uRTIS_v1", "xRTIS_v1")
+
+# ---- layouts ---------------------------------------------------------------------------------------
+
+
+def test_the_six_rtis_layouts_are_shipped():
+    assert layout_names() == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_layouts_are_those_of_the_device(name):
+    """The package of the device's makers is read as data; it is never imported."""
+    files = importlib.metadata.distribution("rtisdev")
+    path = files.locate_file(f"rtisdev/config/microphoneLayouts/{name}/mic_coordinates.mat")
+    their_m = np.asarray(loadmat(path)["mic_pos_final_pos"], dtype=np.float64)[:, :2] / 1000
+    layout = load_layout(name)
+    present = np.isfinite(their_m).all(axis=1)
+    assert_array_equal(layout.enabled, present)
+    centred_m = their_m[present] - their_m[present].mean(axis=0)
+    assert_allclose(layout.enabled_positions_m[:, 1:], centred_m, atol=6e-8)  # four decimals of a millimetre
+    assert_array_equal(layout.positions_m[:, 0], 0)
+    assert (layout.n_words, layout.word_bits) == (1, 32)
+
+
+def test_two_layouts_have_two_channels_without_a_microphone():
+    disabled = {name: int(np.sum(~load_layout(name).enabled)) for name in NAMES}
+    assert {name for name, count in disabled.items() if count} == {"uRTIS_v1", "eRTIS_v3D1REC"}
+    assert disabled["uRTIS_v1"] == disabled["eRTIS_v3D1REC"] == 2
+
+
+def test_v2_is_v3d1_with_its_channels_in_another_order():
+    order = [*range(0, 32, 2), *range(1, 32, 2)]
+    v2, v3d1 = load_layout("eRTIS_v2").positions_m, load_layout("eRTIS_v3D1").positions_m
+    assert_allclose(v2[order], v3d1, atol=1e-12)
+    assert np.abs(v2 - v3d1).max() > 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_layouts_depend_on_no_file_once_written_out(name):
+    layout = load_layout(name)
+    again = microphones(layout.to_array())
+    assert_allclose(again.positions_m, layout.positions_m, atol=1e-15)
+    assert_array_equal(again.enabled, layout.enabled)
+    assert_array_equal(again.gain, layout.gain)
+    assert_array_equal(again.delay_s, layout.delay_s)
+
+
+def test_positions_are_taken_from_the_centroid_of_the_enabled():
+    array = Array(positions_m=((0.1, 0.2, 0.3), (0.1, 0.4, 0.3), (9.0, 9.0, 9.0)), enabled=(True, True, False))
+    layout = microphones(array)
+    assert_allclose(layout.enabled_positions_m, [[0, -0.1, 0], [0, 0.1, 0]], atol=1e-15)
+    assert_array_equal(layout.positions_m[2], 0)
+
+
+@pytest.mark.parametrize(
+    ("count", "word_bits", "n_words"), [(1, 8, 1), (8, 8, 1), (9, 8, 2), (33, 32, 2), (1024, 64, 16)]
+)
+def test_words_per_sample(count, word_bits, n_words):
+    positions_m = tuple((0.0, 0.0, 1e-3 * channel) for channel in range(count))
+    assert microphones(Array(positions_m=positions_m, word_bits=word_bits)).n_words == n_words
+
+
+def test_layout_files(tmp_path):
+    text = 'source = "drawing"\nword_bits = 16\ndisabled = [1]\npositions_mm = [[0, 0], [nan, nan], [4, 2]]\n'
+    (tmp_path / "mine.toml").write_text(text)
+    layout = load_layout(tmp_path / "mine.toml")
+    assert (layout.name, layout.word_bits) == (str(tmp_path / "mine.toml"), 16)
+    assert_allclose(layout.enabled_positions_m, [[0, -0.002, -0.001], [0, 0.002, 0.001]])
+    (tmp_path / "mine.csv").write_text("# x, y, z in millimetres\n1, 0, 0\n\n1, 4, 2  # the last\n")
+    flat = load_layout(tmp_path / "mine.csv")
+    assert flat.name == "mine"
+    assert_allclose(flat.positions_m, [[0, -0.002, -0.001], [0, 0.002, 0.001]])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("eRTIS_v3D", None, r"layout 'eRTIS_v3D' is unknown .did you mean 'eRTIS_v3D1'.*known are eRTIS_v2, "),
+        ("none.toml", None, r"layout .*none\.toml: .*; give a readable file or one of eRTIS_v2, "),
+        ("bytes.csv", b"\xff", r"layout .*bytes\.csv: .*; give a readable file or one of"),
+        ("l.toml", b"positions_mm = [", r"layout .*l\.toml: .*; correct it or take it out"),
+        ("l.toml", b"", r"layout .*l\.toml: Object missing required field `positions_mm`; correct it"),
+        ("l.toml", b"positions_mm = 3", r"layout .*l\.toml: Expected `array`, got `int` - at `positions_mm`"),
+        ("l.toml", b"positions_mm = [['a', 'b']]", r"layout .*l\.toml: Expected `float`, got `str`"),
+        ("l.toml", b"positions_mm = []", r"layout .*l\.toml: positions_mm is not rows of 2 or 3 numbers; give y, z"),
+        ("l.toml", b"positions_mm = [[1, 2], [1, 2, 3]]", r"layout .*l\.toml: positions_mm is not rows of 2 or 3"),
+        ("l.toml", b"positions_mm = [[1]]", r"layout .*l\.toml: positions_mm is not rows of 2 or 3 numbers"),
+        ("l.toml", b"positions_mm = [[1, nan]]", r"layout .*l\.toml: positions_mm holds nan at \[0, 2\]; give finite"),
+        ("l.toml", b"colour = 1\npositions_mm = [[1, 2]]", r"layout .*l\.toml: unknown key `colour`; correct it"),
+        ("l.toml", b"word_bits = 9\npositions_mm = [[1, 2]]", r"layout .*l\.toml: array\.word_bits '9' is unknown"),
+        ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; give a whole .* 0"),
+        ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for every channel"),
+        ("l.csv", b"1, 2\n3, x\n", r"layout .*l\.csv: could not convert .*x'; give rows of numbers parted by commas"),
+        ("l.csv", b"# nothing\n", r"layout .*l\.csv: positions_mm is not rows of 2 or 3 numbers"),
+        ("l.csv", b"1, nan\n", r"layout .*l\.csv: positions_mm holds nan at \[0, 2\]"),
+        ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
+    ],
+)
+def test_bad_layouts_are_refused(tmp_path, name, text, message):
+    path = tmp_path / name if "." in name else name
+    if text is not None:
+        path.write_bytes(text)
+    with pytest.raises(ArgumentError, match=message):
+        load_layout(path)
+
+
+# ---- grids -----------------------------------------------------------------------------------------
+
+
+def limits(low, high):
+    return st.tuples(st.floats(low, high), st.floats(low, high)).map(lambda pair: (min(pair), max(pair)))
+
+
+@pytest.mark.parametrize("name", PAPER_GRIDS)
+def test_paper_grids_have_their_count_within_their_limits(name):
+    grid = direction_grid(Processing(directions=name, azimuth_limits_deg=(-1.0, 1.0)))  # its own limits count
+    _, azimuth_deg, elevation_deg = PAPER_GRIDS[name]
+    assert len(grid) == int(name)
+    assert azimuth_deg[0] <= np.degrees(grid.azimuth_rad).min() <= azimuth_deg[0] + 4
+    assert azimuth_deg[1] >= np.degrees(grid.azimuth_rad).max() >= azimuth_deg[1] - 4
+    assert elevation_deg[0] <= np.degrees(grid.elevation_rad).min() <= elevation_deg[0] + 4
+    assert elevation_deg[1] >= np.degrees(grid.elevation_rad).max() >= elevation_deg[1] - 4
+
+
+def test_planar_grids_include_both_limits():
+    grid = direction_grid(Processing(directions="2d:181"))
+    assert_allclose(np.degrees(grid.azimuth_rad), np.arange(-90, 91), atol=1e-12)
+    assert not grid.elevation_rad.any()
+    single = direction_grid(Processing(directions="2d:1", azimuth_limits_deg=(10.0, 30.0)))
+    assert_allclose(np.degrees(single.azimuth_rad), [20])
+
+
+@settings(max_examples=200, deadline=None)
+@given(count=st.integers(1, 4000), azimuth_deg=limits(-180, 180), elevation_deg=limits(-90, 90))
+def test_solid_grids_meet_count_and_limits(count, azimuth_deg, elevation_deg):
+    processing = Processing(
+        directions=f"3d:{count}", azimuth_limits_deg=azimuth_deg, elevation_limits_deg=elevation_deg
+    )
+    grid = direction_grid(processing)
+    assert len(grid) == len(grid.elevation_rad) == count
+    slack = 1e-6  # an arc sine near 90° has half of the digits
+    assert np.all(np.degrees(grid.azimuth_rad) >= azimuth_deg[0] - slack)
+    assert np.all(np.degrees(grid.azimuth_rad) <= azimuth_deg[1] + slack)
+    assert np.all(np.degrees(grid.elevation_rad) >= elevation_deg[0] - slack)
+    assert np.all(np.degrees(grid.elevation_rad) <= elevation_deg[1] + slack)
+
+
+@pytest.mark.parametrize(
+    ("count", "azimuth_deg", "elevation_deg"),
+    [(1850, (-45, 45), (-45, 45)), (3000, (-90, 90), (-90, 90)), (997, (-180, 180), (-90, 90)), (50, (0, 90), (60, 90))],
+)
+def test_solid_cells_have_equal_area(count, azimuth_deg, elevation_deg):
+    """Zones follow from the rows' counts; each row's centre halves its zone's area."""
+    grid = direction_grid(
+        Processing(directions=f"3d:{count}", azimuth_limits_deg=azimuth_deg, elevation_limits_deg=elevation_deg)
+    )
+    low, high = np.sin(np.radians(elevation_deg))
+    centres, starts, in_row = np.unique(grid.elevation_rad, return_index=True, return_counts=True)
+    edges = low + (high - low) * np.concatenate([[0], np.cumsum(in_row)]) / count
+    assert_allclose(np.sin(centres), (edges[:-1] + edges[1:]) / 2, atol=1e-12)
+    width_rad = np.radians(azimuth_deg[1] - azimuth_deg[0]) / in_row
+    assert_allclose(np.diff(edges) * width_rad, (high - low) * np.radians(np.ptp(azimuth_deg)) / count, rtol=1e-9)
+    for start, cells, width in zip(starts, in_row, width_rad, strict=True):
+        row = grid.azimuth_rad[start : start + cells]
+        assert_allclose(row, np.radians(azimuth_deg[0]) + width * (np.arange(cells) + 0.5), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["1850", "3000"])
+def test_solid_grids_cover_evenly(name):
+    """No direction within the limits is further from the grid than the corner of a square cell, by a little."""
+    grid = direction_grid(Processing(directions=name))
+    _, azimuth_deg, elevation_deg = PAPER_GRIDS[name]
+    random = np.random.default_rng(1)
+    azimuth_rad = np.radians(random.uniform(*azimuth_deg, 20_000))
+    elevation_rad = np.arcsin(random.uniform(*np.sin(np.radians(elevation_deg)), 20_000))
+    points = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    distance, nearest = cKDTree(points).query(unit_vectors(azimuth_rad, elevation_rad))
+    area = np.radians(np.ptp(azimuth_deg)) * np.ptp(np.sin(np.radians(elevation_deg))) / len(grid)
+    assert distance.max() < 1.5 * np.sqrt(area / 2)
+    hits = np.bincount(nearest, minlength=len(grid))
+    assert 0.7 < np.var(hits) / np.mean(hits) < 1.5  # as random hits on equal areas scatter: Poisson
+
+
+def test_grid_of_one_azimuth_repeats_no_direction():
+    grid = direction_grid(
+        Processing(directions="3d:10", azimuth_limits_deg=(0.0, 0.0), elevation_limits_deg=(-45.0, 45.0))
+    )
+    assert len(np.unique(grid.elevation_rad)) == 10
+
+
+def test_grid_from_csv(tmp_path):
+    path = tmp_path / "grid.csv"
+    path.write_text("# azimuth, elevation\n-30, 0\n0, 45.5\n")
+    grid = direction_grid(Processing(directions=str(path)))
+    assert_allclose(np.degrees(grid.azimuth_rad), [-30, 0])
+    assert_allclose(np.degrees(grid.elevation_rad), [0, 45.5])
+
+
+@pytest.mark.parametrize(
+    ("directions", "text", "message"),
+    [
+        ("91", None, r"directions '91' is no grid; give 90, 1850, 3000, 2d:N, 3d:N or a \.csv file"),
+        ("4d:90", None, r"directions '4d:90' is no grid"),
+        ("2d:", None, r"directions '2d:' has no count; give for instance 2d:181"),
+        ("3d:-1", None, r"directions '3d:-1' has no count; give for instance 3d:181"),
+        ("2d:0", None, r"count of directions '2d:0' is 0; give a whole number from 1 to 1000000"),
+        ("3d:1000001", None, r"count of directions '3d:1000001' is 1000001; give a whole number from 1 to 1000000"),
+        ("none.csv", None, r"directions .*none\.csv: .*; give a readable CSV of azimuth, elevation in degrees"),
+        ("g.csv", "", r"directions .*g\.csv has not two numbers in every row; give azimuth, elevation in degrees"),
+        ("g.csv", "1, 2, 3\n", r"directions .*g\.csv has not two numbers in every row"),
+        ("g.csv", "1, two\n", r"directions .*g\.csv: could not convert .*; give rows of numbers"),
+        ("g.csv", "1, nan\n", r"directions .*g\.csv holds nan at \[0, 1\]; give finite numbers"),
+        ("g.csv", "1, 2\n0, 91\n", r"directions .*g\.csv: elevation in row 1 is 91; give a number from -90 to 90"),
+        ("g.csv", "999, 2\n", r"directions .*g\.csv: azimuth in row 0 is 999; give a number from -360 to 360"),
+    ],
+)
+def test_bad_grids_are_refused(tmp_path, directions, text, message):
+    if text is not None:
+        (tmp_path / directions).write_text(text)
+    path = str(tmp_path / directions) if directions.endswith(".csv") else directions
+    with pytest.raises(ArgumentError, match=message):
+        direction_grid(Processing(directions=path))
+
+
+# ---- directions and delays -------------------------------------------------------------------------
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-np.pi / 2, np.pi / 2))
+def test_unit_vectors_are_of_length_one_and_turn_back(azimuth_rad, elevation_rad):
+    x, y, z = unit_vectors(np.array(azimuth_rad), np.array(elevation_rad))
+    assert x**2 + y**2 + z**2 == pytest.approx(1)
+    assert np.arcsin(np.clip(z, -1, 1)) == pytest.approx(elevation_rad, abs=1e-7)
+    if np.cos(elevation_rad) > 1e-6:
+        assert np.cos(np.arctan2(y, x) - azimuth_rad) == pytest.approx(1)
+
+
+def test_axes_of_the_sensor_frame():
+    right = np.pi / 2
+    axes = unit_vectors(np.array([0, right, 0]), np.array([0, 0, right]))
+    assert_allclose(axes, np.eye(3), atol=1e-15)  # forward is x, azimuth 90° is y, elevation 90° is z
+
+
+def test_a_microphone_towards_the_source_hears_first():
+    positions_m = np.array([[0, 0.1, 0], [0, -0.1, 0]])
+    delays_s = far_field_delays(positions_m, unit_vectors(np.array([np.pi / 2]), np.zeros(1)), sound_speed_m_s=340.0)
+    assert_allclose(delays_s, [[-0.1 / 340, 0.1 / 340]])
+
+
+def test_spherical_delays_become_those_of_plane_waves_with_distance():
+    """The difference falls as p² / 2 r c, the curvature of the wave over the array."""
+    positions_m = load_layout("eRTIS_v3D1").positions_m
+    grid = direction_grid(Processing(directions="3d:100"))
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    plane_s = far_field_delays(positions_m, directions, sound_speed_m_s=343.0)
+    across_m2 = np.sum(positions_m**2, axis=1) - (directions @ positions_m.T) ** 2
+    for range_m in (1.0, 10.0, 1000.0):
+        bent_s = spherical_delays(positions_m, directions, range_m=range_m, sound_speed_m_s=343.0) - plane_s
+        assert_allclose(bent_s, across_m2 / (2 * range_m * 343.0), atol=2e-7 / range_m**2 + 1e-14)
+
+
+def test_spherical_delays_at_the_origin_and_on_a_microphone():
+    positions_m = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0]])
+    ahead = unit_vectors(np.zeros(1), np.zeros(1))
+    at_origin = spherical_delays(positions_m, ahead, range_m=0.0, sound_speed_m_s=300.0)
+    assert_allclose(at_origin, [[0, 1e-4]])
+    on_microphone = spherical_delays(positions_m, ahead, range_m=0.03, sound_speed_m_s=300.0)
+    assert_allclose(on_microphone, [[0, -1e-4]], atol=1e-15)

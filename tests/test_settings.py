@@ -1,0 +1,206 @@
+"""Settings: what is kept in TOML, what is refused and with which words, and the recording presets."""
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.settings import PRESETS, Air, Array, Call, Processing, Recording, Settings
+
+TWO = ((0.0, 0.0, 0.0), (0.0, 0.01, 0.0))
+
+
+def ordered(low, high):
+    return st.tuples(st.floats(low, high), st.floats(low, high)).map(lambda pair: (min(pair), max(pair)))
+
+
+@st.composite
+def arrays(draw):
+    if draw(st.booleans()):
+        return Array(layout=draw(st.text(max_size=20)), word_bits=draw(st.sampled_from([8, 16, 32, 64])))
+    axis = st.floats(-1, 1)
+    positions_m = draw(st.lists(st.tuples(axis, axis, axis), min_size=1, max_size=5))
+    count = len(positions_m)
+
+    def each(values):
+        return draw(st.none() | st.lists(values, min_size=count, max_size=count).map(tuple))
+
+    enabled = each(st.booleans())
+    assume(enabled is None or any(enabled))
+    gain, delay_s = each(st.floats(1e-3, 1e3)), each(st.floats(-1e-3, 1e-3))
+    return Array(positions_m=tuple(positions_m), enabled=enabled, gain=gain, delay_s=delay_s)
+
+
+calls = st.builds(
+    Call,
+    start_frequency_hz=st.floats(30_000, 90_000),
+    stop_frequency_hz=st.floats(10_000, 29_000),
+    duration_s=st.floats(1e-4, 1e-2),
+    sample_rate_hz=st.floats(200_000, 2e6),
+    ramp_fraction=st.floats(0, 0.5),
+)
+any_settings = st.builds(
+    Settings,
+    array=arrays(),
+    call=calls,
+    recording=st.builds(Recording, pdm_rate_hz=st.floats(3e6, 5e6), n_samples=st.integers(1, 2**30)),
+    air=st.builds(
+        Air,
+        temperature_c=st.floats(-40, 60),
+        humidity_percent=st.floats(0, 100),
+        pressure_pa=st.floats(10_000, 200_000),
+    ),
+    processing=st.builds(
+        Processing,
+        method=st.sampled_from(["fast", "paper"]),
+        directions=st.sampled_from(["90", "2d:181", "grid.csv"]),
+        azimuth_limits_deg=ordered(-180, 180),
+        elevation_limits_deg=ordered(-90, 90),
+        range_m=ordered(0, 100),
+        decimation=st.integers(1, 16),
+        output_decimation=st.integers(1, 100),
+        oversampling=st.integers(1, 64),
+    ),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(any_settings)
+def test_settings_survive_toml(made):
+    assert Settings.from_toml(made.to_toml()) == made
+    assert hash(made) == hash(Settings.from_toml(made.to_toml()))
+
+
+def test_an_empty_file_is_the_default_measurement():
+    assert Settings.from_toml("") == Settings() == Settings.from_preset("default_25_50")
+
+
+def test_settings_are_read_from_a_file(tmp_path):
+    path = tmp_path / "sensor.toml"
+    path.write_text("[air]\ntemperature_c = 3\n", encoding="utf-8")
+    assert Settings.load(path).air == Air(temperature_c=3.0)
+
+
+def test_nothing_can_be_changed_in_place():
+    with pytest.raises(AttributeError, match="immutable"):
+        Settings().air.temperature_c = 3.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[air", r"s: .*; correct it or take it out"),
+        ("[airs]", r"s: unknown key `airs`"),
+        ("[air]\ntemperature = 3", r"s: unknown key `temperature` - at `air`"),
+        ("[air]\ntemperature_c = 'cold'", r"Expected `float`, got `str` - at `air\.temperature_c`"),
+        ("[air]\ntemperature_c = nan", r"air\.temperature_c is nan; give a finite number"),
+        ("[air]\ntemperature_c = -41", r"air\.temperature_c is -41; give a number from -40 to 60"),
+        ("[air]\nhumidity_percent = 101", r"air\.humidity_percent is 101; give a number from 0 to 100"),
+        ("[air]\npressure_pa = 1013", r"air\.pressure_pa is 1013; give a number from 10000 to 200000"),
+        ("[array]\nword_bits = 12", r"array\.word_bits '12' is unknown.*known are 8, 16, 32, 64"),
+        ("[array]\nword_bits = 8.0", r"Expected `int`, got `float` - at `array\.word_bits`"),
+        ("[array]\nenabled = [true]", r"array\.enabled is given without array\.positions_m; give both or neither"),
+        ("[array]\ngain = [1]", r"array\.gain is given without array\.positions_m; give both or neither"),
+        ("[array]\ndelay_s = [0]", r"array\.delay_s is given without array\.positions_m; give both or neither"),
+        ("[array]\npositions_m = []", r"number of array\.positions_m is 0; give a whole number from 1 to 1024"),
+        ("[array]\npositions_m = [[0, 0]]", r"Expected `array` of length 3, got 2 - at `array\.positions_m"),
+        ("[array]\npositions_m = [[0, 0, nan]]", r"array\.positions_m holds nan at \[0, 2\]; give finite numbers"),
+        (
+            "[array]\npositions_m = [[0, 0, 0]]\nenabled = [true, true]",
+            r"array\.enabled has shape \(2,\); give shape \(1,\)",
+        ),
+        ("[array]\npositions_m = [[0, 0, 0]]\nenabled = [false]", r"array\.enabled is false for every channel; enable"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [1, 1]", r"array\.gain has shape \(2,\); give shape \(1,\)"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [0]", r"array\.gain\[0\] is 0; give a number from 0\.001 to 1000"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [nan]", r"array\.gain\[0\] is nan; give a finite number"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = []", r"array\.delay_s has shape \(0,\); give shape \(1,\)"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = [1]", r"array\.delay_s\[0\] is 1; give a number from -0\.001"),
+        ("[call]\nstart_frequency_hz = 0", r"call\.start_frequency_hz is 0; give a number above 0"),
+        ("[call]\nstop_frequency_hz = 225e3", r"call\.stop_frequency_hz is 225000; give less than half of call\.sample"),
+        ("[call]\nstop_frequency_hz = 5e4", r"call sweeps from 50000 Hz to itself; give two different frequencies"),
+        ("[call]\nduration_s = 0", r"call\.duration_s is 0; give a number from 3\.55556e-05 to 1"),
+        ("[call]\nsample_rate_hz = -1", r"call\.sample_rate_hz is -1; give a number above 0"),
+        ("[call]\nramp_fraction = 0.6", r"call\.ramp_fraction is 0\.6; give a number from 0 to 0\.5"),
+        ("[recording]\npdm_rate_hz = 0", r"recording\.pdm_rate_hz is 0; give a number above 0"),
+        ("[recording]\nn_samples = 0", r"recording\.n_samples is 0; give a whole number of at least 1"),
+        ("[processing]\nmethod = 'slow'", r"Invalid enum value 'slow' - at `processing\.method`"),
+        ("[processing]\ndecimation = 0", r"processing\.decimation is 0; give a whole number from 1 to 1000"),
+        ("[processing]\noutput_decimation = 0", r"processing\.output_decimation is 0; give a whole number from 1"),
+        ("[processing]\noversampling = 65", r"processing\.oversampling is 65; give a whole number from 1 to 64"),
+        ("[processing]\nrange_m = [2, 1]", r"processing\.range_m runs from 2 to 1; give the smaller number first"),
+        ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
+        ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
+        ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; give a number from"),
+        ("[processing]\ndecimation = 45", r"processing\.decimation 45 leaves signals at 100000 Hz; give one that leaves"),
+    ],
+)
+def test_bad_settings_are_refused(text, message):
+    with pytest.raises(SettingsError, match=message) as caught:
+        Settings.from_toml(text, "s")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Array(word_bits="32"), r"array\.word_bits is '32'; give a whole number"),
+        (lambda: Array(positions_m=((0.0, 0.0),)), r"array\.positions_m\[0\] has shape \(2,\); give shape \(3,\)"),
+        (lambda: Array(positions_m=((0.0,) * 3,) * 1025), r"number of array\.positions_m is 1025; give .* 1 to 1024"),
+        (lambda: Processing(method="slow"), r"processing\.method 'slow' is unknown; known are fast, paper"),
+        (lambda: Air(temperature_c="warm"), r"air\.temperature_c is 'warm'; give a number"),
+        (lambda: Air().replace(temperature=3), r"Air field 'temperature' is unknown .did you mean 'temperature_c'"),
+        (lambda: Air().replace(temperature_c=99), r"air\.temperature_c is 99; give a number from -40 to 60"),
+        (lambda: Settings.from_preset("defualt_25_50"), r"preset 'defualt_25_50' is unknown .did you mean 'default_25"),
+    ],
+)
+def test_bad_arguments_are_refused(make, message):
+    with pytest.raises(ArgumentError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe"])
+def test_unreadable_files_are_refused(tmp_path, content):
+    path = tmp_path / "s.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SettingsError, match=r"s\.toml: .*; give a readable settings file"):
+        Settings.load(path)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets(name):
+    made = Settings.from_preset(name)
+    words = {"short": 65_536, "default": 163_840, "long": 294_912}[name.split("_")[0]]
+    low_hz, high_hz = (1000 * int(edge) for edge in name.split("_")[1:])
+    assert made.recording.n_samples == words
+    assert (made.call.start_frequency_hz, made.call.stop_frequency_hz) == (high_hz, low_hz)
+    assert (made.call.low_frequency_hz, made.call.high_frequency_hz) == (low_hz, high_hz)
+    echo_ends_s = 2 * made.processing.range_m[1] / sound_speed_m_s(Air(temperature_c=-40.0)) + made.call.duration_s
+    assert echo_ends_s <= made.recording.duration_s
+
+
+def test_rates_and_durations():
+    made = Settings()
+    assert made.recording.duration_s == pytest.approx(36.4e-3, abs=1e-5)
+    assert (made.signal_rate_hz, made.output_rate_hz) == (450_000, 45_000)
+
+
+def test_stamps_and_images_are_frozen():
+    image = Energyscape(np.ones((1, 1), np.float32), np.zeros(1), np.zeros(1), np.ones(1), Settings())
+    assert image.is_planar
+    assert not image.replace(elevation_rad=np.full(1, math.pi / 4)).is_planar
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Stamp().sequence = 1
+
+
+def test_every_section_refuses_unknown_fields():
+    for section in (Array, Call, Recording, Air, Processing, Settings):
+        with pytest.raises(msgspec.ValidationError, match="unknown field"):
+            msgspec.convert({"colour": 1}, section)

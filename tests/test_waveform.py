@@ -1,0 +1,188 @@
+"""The call, its matched filter and the decimation filter against what their equations promise."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Call, Settings
+from ertis_numba.waveform import (
+    call_at,
+    call_samples,
+    decimation_taps,
+    filter_response,
+    matched_band_hz,
+    matched_filter,
+    matched_guard_s,
+)
+
+RATE_HZ = 450_000.0
+LOW = Call()
+HIGH = Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0)
+UP = Call(start_frequency_hz=25_000.0, stop_frequency_hz=50_000.0)
+CALLS = pytest.mark.parametrize("call", [LOW, HIGH, UP], ids=["25_50", "20_80", "upward"])
+calls = st.builds(
+    Call,
+    start_frequency_hz=st.floats(15_000, 100_000),
+    stop_frequency_hz=st.floats(15_000, 100_000),
+    duration_s=st.floats(5e-4, 5e-3),
+    ramp_fraction=st.floats(0, 0.5),
+).filter(lambda call: call.high_frequency_hz > 1.2 * call.low_frequency_hz)
+
+
+def compressed(signal, call, n_fft):
+    """Return the analytic signal behind the matched filter: (sample,) complex."""
+    matched = matched_filter(call, n_fft=n_fft, rate_hz=RATE_HZ)
+    bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    spectrum = np.zeros(n_fft, dtype=complex)
+    spectrum[bins] = np.fft.rfft(signal, n_fft)[bins] * matched.values
+    return np.fft.ifft(spectrum)
+
+
+# ---- the call --------------------------------------------------------------------------------------
+
+
+def test_default_call_has_the_length_of_the_device():
+    assert len(call_samples(LOW)) == 1126  # 0 to 2.5 ms inclusive at 450 kHz
+
+
+@CALLS
+def test_instantaneous_frequency_is_hyperbolic(call):
+    rate_hz = 40e6
+    samples = call_samples(call.replace(ramp_fraction=0.0), rate_hz=rate_hz)
+    up = np.flatnonzero((samples[:-1] < 0) & (samples[1:] >= 0))
+    crossing_s = (up + samples[up] / (samples[up] - samples[up + 1])) / rate_hz  # once a period
+    middle_s = (crossing_s[1:] + crossing_s[:-1]) / 2
+    period_s = 1 / call.start_frequency_hz + middle_s * (
+        (1 / call.stop_frequency_hz - 1 / call.start_frequency_hz) / call.duration_s
+    )
+    # Crossings lie evenly in the logarithm of the period, so a cycle's mean period is off by their square.
+    assert_allclose(np.diff(crossing_s), period_s, rtol=1e-3)
+    assert_allclose(1 / period_s[[0, -1]], [call.start_frequency_hz, call.stop_frequency_hz], rtol=0.02)
+
+
+@CALLS
+def test_phase_is_the_closed_form(call):
+    time_s = np.linspace(0, call.duration_s, 999)
+    f0, f1, duration_s = call.start_frequency_hz, call.stop_frequency_hz, call.duration_s
+    slope = (1 / f1 - 1 / f0) / duration_s
+    phase_rad = 2 * np.pi / slope * (np.log(1 / f0 + time_s * slope) - np.log(1 / f0))
+    assert_allclose(call_at(call.replace(ramp_fraction=0.0), time_s), np.sin(phase_rad), atol=1e-9)
+
+
+@CALLS
+def test_ramps_are_halves_of_a_hann_window(call):
+    ramp_s = 0.1 * call.duration_s
+    time_s = np.linspace(0, ramp_s, 50)
+    window = 0.5 - 0.5 * np.cos(np.pi * time_s / ramp_s)
+    plain = call.replace(ramp_fraction=0.0)
+    assert_allclose(call_at(call, time_s), window * call_at(plain, time_s), atol=1e-12)
+    late_s = call.duration_s - time_s
+    assert_allclose(call_at(call, late_s), window * call_at(plain, late_s), atol=1e-12)
+    between_s = np.linspace(ramp_s, call.duration_s - ramp_s, 2000)
+    assert_allclose(call_at(call, between_s), call_at(plain, between_s), atol=1e-12)
+
+
+@given(calls, st.lists(st.floats(-1, 1), min_size=1, max_size=20))
+def test_call_is_bounded_and_silent_outside(call, time_s):
+    time_s = np.array(time_s)
+    values = call_at(call, time_s)
+    assert np.all(np.abs(values) <= 1)
+    assert not values[(time_s < 0) | (time_s > call.duration_s)].any()
+
+
+# ---- the matched filter ----------------------------------------------------------------------------
+
+
+@CALLS
+def test_matched_filter_turns_the_call_into_one_peak(call):
+    image = compressed(call_samples(call, rate_hz=RATE_HZ), call, 4096)
+    assert image[0] == pytest.approx(1, abs=1e-12)  # real, 1, at lag 0
+    assert np.abs(image).argmax() == 0
+    bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
+    width = 2 * np.abs(compressed(call_samples(call, rate_hz=RATE_HZ), call, 2**20)[:2000] > 2**-0.5).sum() / RATE_HZ
+    assert width * bandwidth_hz < 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(calls, st.integers(2500, 9000))
+def test_matched_filter_of_any_call(call, n_fft):
+    low_hz, high_hz = matched_band_hz(call)
+    matched = matched_filter(call, n_fft=n_fft, rate_hz=RATE_HZ)
+    frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * RATE_HZ / n_fft
+    assert 0 < low_hz <= frequency_hz[0]
+    assert frequency_hz[-1] <= high_hz < RATE_HZ / 2
+    assert call.low_frequency_hz - 1500 < matched.centre_hz < call.high_frequency_hz + 1500
+    image = compressed(call_samples(call, rate_hz=RATE_HZ), call, n_fft)
+    assert image[0] == pytest.approx(1, abs=1e-9)
+    assert np.abs(image).max() == pytest.approx(1, abs=1e-9)
+
+
+@CALLS
+def test_matched_filter_has_ended_after_its_guard(call):
+    """An impulse rings for the call's length backwards and a guard on either side, down to −50 dB."""
+    n_fft, at = 16_384, 8192
+    impulse = np.zeros(n_fft)
+    impulse[at] = 1.0
+    ringing = np.abs(compressed(impulse, call, n_fft))
+    guard = int(matched_guard_s(call) * RATE_HZ)
+    length = int(call.duration_s * RATE_HZ)
+    outside = np.r_[ringing[: at - length - guard], ringing[at + guard + 1 :]]
+    assert 20 * np.log10(outside.max() / ringing.max()) < -50
+
+
+def test_matched_filter_scales_with_the_echo_and_nothing_else():
+    samples = call_samples(LOW, rate_hz=RATE_HZ)
+    late = np.zeros(8192)
+    late[3000 : 3000 + len(samples)] = -0.25 * samples
+    image = compressed(late, LOW, 8192)
+    assert np.abs(image).argmax() == 3000
+    assert image[3000] == pytest.approx(-0.25, abs=1e-12)
+
+
+# ---- the decimation filter -------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(decimation=st.integers(1, 40), share=st.floats(0.05, 0.98), pdm_rate_hz=st.floats(1e5, 1e7))
+def test_decimation_filter_keeps_its_promises(decimation, share, pdm_rate_hz):
+    rate_hz = pdm_rate_hz / decimation
+    pass_hz = share * rate_hz / 2
+    taps = decimation_taps(pdm_rate_hz=pdm_rate_hz, decimation=decimation, pass_hz=pass_hz)
+    assume(len(taps) < 6000)
+    assert taps.sum() == pytest.approx(1)
+    assert_allclose(taps, taps[::-1], atol=1e-15)
+    assert (len(taps) - 1) % (2 * decimation) == 0  # the group delay is whole in samples of either rate
+    passed = filter_response(taps, np.linspace(0, pass_hz, 200) / pdm_rate_hz)
+    assert_allclose(passed, 1, atol=2e-3)
+    for image in range(1, decimation // 2 + 1):  # whatever folds onto 0 … pass_hz
+        folding_hz = np.linspace(image * rate_hz - pass_hz, min(image * rate_hz + pass_hz, pdm_rate_hz / 2), 100)
+        gain_db = 20 * np.log10(np.abs(filter_response(taps, folding_hz / pdm_rate_hz)).max() + 1e-12)
+        assert gain_db < -59.5
+
+
+def test_decimation_filter_of_the_default_measurement():
+    made = Settings()
+    taps = decimation_taps(
+        pdm_rate_hz=made.recording.pdm_rate_hz, decimation=10, pass_hz=matched_band_hz(made.call)[1]
+    )
+    assert len(taps) == 61
+    folding = filter_response(taps, np.linspace(395e3, 505e3, 500) / 4.5e6)
+    assert 20 * np.log10(np.abs(folding).max()) < -60
+
+
+def test_filter_response_is_that_of_the_taps():
+    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=10, pass_hz=85e3)
+    frequency = np.linspace(0, 0.5, 64)
+    half = (len(taps) - 1) / 2
+    spectrum = np.exp(-2j * np.pi * np.outer(frequency, np.arange(len(taps)))) @ taps
+    assert_allclose(filter_response(taps, frequency), (spectrum * np.exp(2j * np.pi * frequency * half)).real)
+
+
+@pytest.mark.parametrize("decimation", [10, 30])
+def test_decimation_that_leaves_too_little_is_refused(decimation):
+    rate_hz = 4.5e6 / decimation
+    with pytest.raises(ArgumentError, match=f"decimation {decimation} leaves {rate_hz:g} Hz, too little.*lower it"):
+        decimation_taps(pdm_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
