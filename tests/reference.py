@@ -1,12 +1,13 @@
 """The referees: slow, obvious, float64, and independent of kernels and stages.
 
 `exact` is the image that the fast chain approximates. It never decimates: the spectrum of the bits themselves is
-matched, delayed by exact phase shifts and evaluated at the asked ranges. The plain functions below it say
-what each kernel should do.
+matched, delayed by exact phase shifts and evaluated at the asked ranges. `paper` is the image of the paper's
+algorithm. The plain functions below them say what each kernel should do.
 """
 
 import numpy as np
 import scipy.fft
+import scipy.signal
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
@@ -19,7 +20,7 @@ def error_db(image, exact) -> float:
     return float(20 * np.log10(np.linalg.norm(image - exact) / np.linalg.norm(exact)))
 
 
-def exact(words, settings: Settings, directions, range_m, *, spherical=False):
+def exact(words, settings: Settings, directions, range_m, *, spherical=False, delay_rate_hz=None):
     """The exact image: (direction, range) float64.
 
     Parameters
@@ -29,6 +30,8 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False):
     range_m : (range,)
     spherical : bool
         Delays of points at their ranges instead of plane waves.
+    delay_rate_hz : float
+        Round the delays of plane waves to whole samples of this rate.
     """
     layout = microphones(settings.array)
     speed_m_s = sound_speed_m_s(settings.air)
@@ -50,6 +53,8 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False):
             )
         else:
             delay_s = -(positions_m @ direction) / speed_m_s
+            if delay_rate_hz:
+                delay_s = np.rint(delay_s * delay_rate_hz) / delay_rate_hz
             beam = at_range @ (spectra * np.exp(2j * np.pi * frequency_hz * delay_s[:, None])).sum(axis=0)
         image[index] = np.abs(beam)
     return image
@@ -74,13 +79,70 @@ def _matched_spectra(signals, settings, rate_hz):
     return scipy.fft.rfft(signals, n_fft)[:, inside] * response, frequency_hz
 
 
+def paper(words, settings: Settings, directions):
+    """The image of the paper's algorithm, and its range axis: (direction, range), (range,) float64.
+
+    Filters, correlation and low pass in the time domain, one microphone and one direction at a time.
+    """
+    layout = microphones(settings.array)
+    rate_hz, speed_m_s = settings.signal_rate_hz, sound_speed_m_s(settings.air)
+    step = settings.processing.output_decimation
+    signals = unpack_bits(words, np.flatnonzero(layout.enabled)) / layout.gain[layout.enabled][:, None]
+    padded_s = settings.call.duration_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
+    emitted = call_at(
+        settings.call, np.arange(int(padded_s * settings.recording.pdm_rate_hz)) / settings.recording.pdm_rate_hz
+    )
+    call = _paper_filters(emitted, settings)
+    taps = _paper_low_pass(settings)
+    pulse = np.abs(np.correlate(call, call, "full"))
+    peak = np.convolve(pulse, taps, "same")[len(call) - 1]
+    n_samples = -(-signals.shape[1] // settings.processing.decimation)
+    at = np.arange(n_samples)
+    image = np.zeros((len(directions), len(at[::step])))
+    matched = [np.correlate(_paper_filters(signal, settings), call, "full") for signal in signals]
+    for index, direction in enumerate(directions):
+        delay_s = -(layout.enabled_positions_m @ direction) / speed_m_s + layout.delay_s[layout.enabled]
+        beam = np.zeros(n_samples)
+        for row, delay in zip(matched, np.rint(delay_s * rate_hz).astype(int), strict=True):
+            place = at + delay + len(call) - 1  # lag 0 of a full correlation
+            beam += np.where(place < len(row), row[np.clip(place, 0, len(row) - 1)], 0)
+        image[index] = np.convolve(np.abs(beam) / (peak * len(matched)), taps, "full")[len(taps) // 2 :][
+            :n_samples:step
+        ]
+    range_m = at[::step] * speed_m_s / (2 * rate_hz)
+    first_m, last_m = settings.processing.range_m
+    inside = (range_m > first_m - 1e-9) & (range_m < last_m + 1e-9)
+    return image[:, inside], range_m[inside]
+
+
+def _paper_filters(signal, settings):
+    """Demodulate: Butterworth low pass, every decimation-th sample, Butterworth band pass."""
+    rate_hz, call = settings.signal_rate_hz, settings.call
+    low_pass_hz = max(100e3 / 450e3 * rate_hz, call.high_frequency_hz)
+    low_pass = scipy.signal.butter(6, low_pass_hz, fs=settings.recording.pdm_rate_hz, output="sos")
+    band = (call.low_frequency_hz, call.high_frequency_hz)
+    band_pass = scipy.signal.butter(6, band, "bandpass", fs=rate_hz, output="sos")
+    slow = scipy.signal.sosfilt(low_pass, signal)[:: settings.processing.decimation]
+    return scipy.signal.sosfilt(band_pass, slow)
+
+
+def _paper_low_pass(settings):
+    """The envelope's low pass: -6 dB at half of the output rate or the call's lowest frequency."""
+    cutoff = min(settings.output_rate_hz / 2, settings.call.low_frequency_hz) / settings.signal_rate_hz
+    n_taps, beta = scipy.signal.kaiserord(60, 2 * cutoff)
+    at = np.arange(-(n_taps // 2), n_taps // 2 + 1)
+    taps = np.sinc(2 * cutoff * at) * np.kaiser(len(at), beta)
+    return taps / taps.sum()
+
+
 def unpack_bits(words, channels):
     """The signals of +1 and -1: (mic, sample) float64."""
     words = words.reshape(len(words), -1)
     word_bits = words.dtype.itemsize * 8
     return np.stack(
         [
-            ((words[:, channel // word_bits] >> words.dtype.type(channel % word_bits)) & words.dtype.type(1)) * 2.0 - 1.0
+            ((words[:, channel // word_bits] >> words.dtype.type(channel % word_bits)) & words.dtype.type(1)) * 2.0
+            - 1.0
             for channel in channels
         ]
     )

@@ -69,6 +69,13 @@ def test_two_reflectors_a_beam_width_and_a_half_apart_are_two():
     assert [peak.azimuth_deg for peak in peaks] == pytest.approx([0, 12], abs=1.5)
 
 
+@pytest.mark.parametrize(("directions", "azimuth_deg"), [("2d:91", 97.0), ("1850", 50.0)])
+def test_no_reflector_is_put_outside_the_grid(directions, azimuth_deg):
+    image = image_of([(azimuth_deg, 0, 1.2, 1.0)], directions=directions, range_m=(1.1, 1.3))
+    edge_deg = np.degrees(image.azimuth_rad).max()
+    assert all(peak.azimuth_deg <= edge_deg + 1e-9 for peak in find_peaks(image))
+
+
 def test_top_and_level_limit_the_list():
     image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
     assert len(find_peaks(image, top=2)) == 2

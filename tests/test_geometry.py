@@ -172,7 +172,12 @@ def test_solid_grids_meet_count_and_limits(count, azimuth_deg, elevation_deg):
 
 @pytest.mark.parametrize(
     ("count", "azimuth_deg", "elevation_deg"),
-    [(1850, (-45, 45), (-45, 45)), (3000, (-90, 90), (-90, 90)), (997, (-180, 180), (-90, 90)), (50, (0, 90), (60, 90))],
+    [
+        (1850, (-45, 45), (-45, 45)),
+        (3000, (-90, 90), (-90, 90)),
+        (997, (-180, 180), (-90, 90)),
+        (50, (0, 90), (60, 90)),
+    ],
 )
 def test_solid_cells_have_equal_area(count, azimuth_deg, elevation_deg):
     """Zones follow from the rows' counts; each row's centre halves its zone's area."""

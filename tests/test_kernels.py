@@ -20,6 +20,8 @@ CONTRACTS = {
     "delay_and_sum": _contract.DelayAndSum,
     "envelope": _contract.Envelope,
     "delay_and_sum_envelope": _contract.DelayAndSumEnvelope,
+    "quantise_tiles": _contract.QuantiseTiles,
+    "delay_and_sum_envelope_int16": _contract.DelayAndSumEnvelopeInt16,
 }
 FLOAT32 = 1e-5  # relative to the largest number that goes in
 
@@ -67,7 +69,7 @@ def real_noise(*shape, seed=1):
 
 def filled(*shape, dtype=np.float32):
     """An output with garbage in it: a kernel must fill all of it."""
-    return np.full(shape, 1e30, dtype=dtype)
+    return np.full(shape, 12_345, dtype=dtype)
 
 
 def taps_of(count):
@@ -95,7 +97,13 @@ def test_signature_is_the_contract(device, name):
 
 
 def test_contracts_are_complete():
-    assert set(CONTRACTS) == set(kernels.KernelSet.__slots__) - {"device", "max_threads", "threads"}
+    assert set(CONTRACTS) == set(kernels.KernelSet.__slots__) - {
+        "device",
+        "max_threads",
+        "tile_ranges",
+        "fastest_precision",
+        "threads",
+    }
 
 
 @pytest.mark.parametrize("name", WORDS)
@@ -117,7 +125,9 @@ def test_decimate(kernel_set, shape, n_taps, factor):
     assert out == pytest.approx(reference.decimate(signals, taps, factor), abs=FLOAT32)
 
 
-@pytest.mark.parametrize(("n_samples", "delay", "n_out"), [(10, 0, 10), (10, 3, 10), (10, 3, 5), (10, 20, 4), (1, 0, 1)])
+@pytest.mark.parametrize(
+    ("n_samples", "delay", "n_out"), [(10, 0, 10), (10, 3, 10), (10, 3, 5), (10, 20, 4), (1, 0, 1)]
+)
 def test_remove_group_delay(kernel_set, n_samples, delay, n_out):
     signals, out = real_noise(3, n_samples), filled(3, n_out)
     kernel_set.remove_group_delay(signals, delay, out)
@@ -177,6 +187,63 @@ def test_delay_and_sum_and_envelope(kernel_set, name):
     assert np.abs(beams - expected).max() < bound
     assert np.abs(energy - np.abs(expected)).max() < bound
     assert np.abs(fused - np.abs(expected)).max() < bound
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 50), (32, 10, 300)])
+def test_quantise_tiles(kernel_set, shape):
+    signals = complex_noise(*shape)
+    starts = np.array([0, shape[2] // 3, shape[2] - 1], dtype=np.int32)
+    signals[:, :, : starts[1]] *= 1e-4  # the first tile is far weaker than the others
+    width, limit = max(1, shape[2] // 3), np.float32(11_000)
+    tiles, scales = filled(3, *shape[:2], width, 2, dtype=np.int16), filled(3)
+    kernel_set.quantise_tiles(signals, starts, limit, tiles, scales)
+    for tile, start in enumerate(starts):
+        part = signals[:, :, start : start + width]
+        largest = max(np.abs(part.real).max(), np.abs(part.imag).max())
+        assert scales[tile] == pytest.approx(largest / limit)
+        back = (tiles[tile, ..., 0] + 1j * tiles[tile, ..., 1])[:, :, : part.shape[2]] * scales[tile]
+        assert np.abs(back - part).max() < 0.75 * largest / limit
+        assert not tiles[tile, :, :, part.shape[2] :].any()
+
+
+def test_quantise_tiles_of_silence(kernel_set):
+    tiles, scales = filled(1, 2, 3, 10, 2, dtype=np.int16), filled(1)
+    kernel_set.quantise_tiles(np.zeros((2, 3, 10), np.complex64), np.zeros(1, np.int32), np.float32(100), tiles, scales)
+    assert not tiles.any()
+    assert not scales.any()
+
+
+@pytest.mark.parametrize("n_ranges", [1, 95, 96, 97, 300])
+@pytest.mark.parametrize("n_mics", [1, 32, 1000])
+def test_delay_and_sum_envelope_int16(kernel_set, n_ranges, n_mics):
+    tile_ranges = kernel_set.tile_ranges
+    if not tile_ranges:
+        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
+    random = np.random.default_rng(1)
+    n_tiles = -(-n_ranges // tile_ranges)
+    starts = np.minimum(np.arange(n_tiles) * tile_ranges, max(0, n_ranges - tile_ranges)).astype(np.int32)
+    # As large as the sums can bear: all microphones at full scale and in phase.
+    limit, largest = 2 ** int((31 - 0.5 - np.log2(n_mics)) / 2), 2 ** int((31 - 0.5 - np.log2(n_mics)) / 2)
+    limit, largest = min(limit, 32_767), min(largest, 32_767)
+    tiles = random.integers(-limit, limit, (n_tiles, n_mics, 2, tile_ranges + 4, 2), np.int16, endpoint=True)
+    tiles[0, :, :, 0] = limit
+    offsets = (np.arange(n_mics) * 2 + random.integers(0, 2, (5, n_mics))) * (tile_ranges + 4)
+    offsets = (offsets + random.integers(0, 4, offsets.shape)).astype(np.int32)
+    real, imag = random.integers(-largest // 2, largest // 2, (2, 5, n_mics))
+    real[0], imag[0] = largest * 7 // 10, largest * 7 // 10
+    weights = np.stack([np.stack([real, -imag], -1), np.stack([imag, real], -1)], -2).astype(np.int16)
+    scales, out = random.random(n_tiles).astype(np.float32), filled(5, n_ranges)
+    kernel_set.delay_and_sum_envelope_int16(tiles, scales, starts, offsets, weights, np.float32(0.5), out)
+    for tile, start in enumerate(starts):
+        flat = tiles[tile].reshape(-1, 2).astype(float) @ [1, 1j]
+        count = min(tile_ranges, n_ranges)
+        beams = reference.delay_and_sum(flat, offsets, real + 1j * imag, count)
+        # Where tiles overlap, either may have written.
+        own = slice(
+            starts[tile - 1] + count - start if tile else 0, starts[tile + 1] - start if tile + 1 < n_tiles else count
+        )
+        expected = 0.5 * scales[tile] * np.abs(beams)[:, own]
+        assert out[:, start:][:, own] == pytest.approx(expected, rel=1e-6, abs=1e-6 * expected.max(initial=0))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

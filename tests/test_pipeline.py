@@ -12,6 +12,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement, Stamp
@@ -68,11 +69,19 @@ def exact(pipeline: Pipeline, measurement: Measurement):
     return reference.exact(measurement.words, pipeline.settings, directions, pipeline.range_m)
 
 
+def has_int16(device: str) -> bool:
+    return bool(kernels.load(device).tile_ranges)
+
+
+@pytest.mark.parametrize("precision", ["float32", "int16"])
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", CASES)
-def test_image_is_the_exact_one(name, device):
-    pipeline = Pipeline(CASES[name], device=device)
-    measurement = noise(CASES[name])
+def test_image_is_the_exact_one(name, device, precision):
+    if precision == "int16" and not has_int16(device):
+        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
+    settings = CASES[name].replace(processing=CASES[name].processing.replace(precision=precision))
+    pipeline = Pipeline(settings, device=device)
+    measurement = noise(settings)
     image = pipeline.process(measurement)
     assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
     assert np.isfinite(image.energy).all()

@@ -123,7 +123,10 @@ def test_nothing_can_be_changed_in_place():
         ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = []", r"array\.delay_s has shape \(0,\); give shape \(1,\)"),
         ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = [1]", r"array\.delay_s\[0\] is 1; give a number from -0\.001"),
         ("[call]\nstart_frequency_hz = 0", r"call\.start_frequency_hz is 0; give a number above 0"),
-        ("[call]\nstop_frequency_hz = 225e3", r"call\.stop_frequency_hz is 225000; give less than half of call\.sample"),
+        (
+            "[call]\nstop_frequency_hz = 225e3",
+            r"call\.stop_frequency_hz is 225000; give less than half of call\.sample",
+        ),
         ("[call]\nstop_frequency_hz = 5e4", r"call sweeps from 50000 Hz to itself; give two different frequencies"),
         ("[call]\nduration_s = 0", r"call\.duration_s is 0; give a number from 3\.55556e-05 to 1"),
         ("[call]\nsample_rate_hz = -1", r"call\.sample_rate_hz is -1; give a number above 0"),
@@ -138,7 +141,10 @@ def test_nothing_can_be_changed_in_place():
         ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
         ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
         ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; give a number from"),
-        ("[processing]\ndecimation = 45", r"processing\.decimation 45 leaves signals at 100000 Hz; give one that leaves"),
+        (
+            "[processing]\ndecimation = 45",
+            r"processing\.decimation 45 leaves signals at 100000 Hz; give one that leaves",
+        ),
     ],
 )
 def test_bad_settings_are_refused(text, message):

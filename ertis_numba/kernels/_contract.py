@@ -18,6 +18,7 @@ Words = NDArray[np.unsignedinteger[Any]]
 Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Index = NDArray[np.int32]
+Short = NDArray[np.int16]
 
 
 class UnpackBits(Protocol):
@@ -162,6 +163,57 @@ class DelayAndSumEnvelope(Protocol):
     def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Real) -> None: ...
 
 
+class QuantiseTiles(Protocol):
+    """Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale.
+
+    ``tiles[tile, mic, phase, k] ≈ signals[mic, phase, starts[tile] + k] / scales[tile]``, rounded, as pairs of
+    real and imaginary part; the largest part of a tile becomes ``limit``. Past the end of the signals
+    tiles are 0. A tile spans decimetres, so an echo keeps its 16 bits however much stronger the
+    reflectors at other ranges are.
+
+    Parameters
+    ----------
+    signals : (mic, phase, sample) complex64
+    starts : (tile,) int32
+    limit : float32
+    tiles : (tile, mic, phase, k, 2) int16
+    scales : (tile,) float32
+    """
+
+    def __call__(self, signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None: ...
+
+
+class DelayAndSumEnvelopeInt16(Protocol):
+    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
+
+    ``out[direction, starts[tile] + k] = scales[tile] · weight_scale · |Σ_mic w · x|`` with
+    ``x = tiles[tile].flat[offsets[direction, mic] + k]``, for k below the device's ``tile_ranges``.
+
+    Parameters
+    ----------
+    tiles, scales, starts
+        As in `QuantiseTiles`. Tiles may overlap; where the image has fewer ranges than a tile there is one.
+    offsets : (direction, mic) int32
+        Into one tile, in complex samples.
+    weights : (direction, mic, 2, 2) int16
+        ``((re w, −im w), (im w, re w))``.
+    weight_scale : float32
+        Worth of a weight of 1.
+    out : (direction, range) float32
+    """
+
+    def __call__(
+        self,
+        tiles: Short,
+        scales: Real,
+        starts: Index,
+        offsets: Index,
+        weights: Short,
+        weight_scale: np.float32,
+        out: Real,
+    ) -> None: ...
+
+
 class Threads(Protocol):
     """Run the enclosed kernels of this Python thread on ``count`` threads.
 
@@ -182,10 +234,15 @@ class KernelSet:
     ----------
     device : str
     max_threads : int
+    tile_ranges : int
+        Ranges in a tile of the 16-bit kernels; 0 where the device cannot run them.
+    fastest_precision : {"float32", "int16"}
     """
 
     device: str
     max_threads: int
+    tile_ranges: int
+    fastest_precision: str
     threads: Threads
     unpack_bits: UnpackBits
     decimate: Decimate
@@ -196,3 +253,5 @@ class KernelSet:
     delay_and_sum: DelayAndSum
     envelope: Envelope
     delay_and_sum_envelope: DelayAndSumEnvelope
+    quantise_tiles: QuantiseTiles
+    delay_and_sum_envelope_int16: DelayAndSumEnvelopeInt16

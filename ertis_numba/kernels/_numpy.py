@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Words
+from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short, Words
 
 __all__ = ["KERNELS"]
+
+_TILE_RANGES = 96  # as many as the compiled kernel has with AVX-512
 
 
 @contextlib.contextmanager
@@ -110,9 +112,37 @@ def delay_and_sum_envelope(signals: Complex, offsets: Index, weights: Complex, o
     envelope(beams, out)
 
 
+def quantise_tiles(signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None:
+    """See `QuantiseTiles`."""
+    tiles[:] = 0
+    for tile, start in enumerate(starts):
+        part = np.ascontiguousarray(signals[:, :, start : start + tiles.shape[3]])
+        parts = part.view(np.float32).reshape(*part.shape, 2)
+        largest = np.max(np.abs(parts), initial=0)
+        scales[tile] = largest / limit
+        if largest:
+            tiles[tile, :, :, : part.shape[2]] = np.rint(parts * (limit / largest))
+
+
+def delay_and_sum_envelope_int16(
+    tiles: Short, scales: Real, starts: Index, offsets: Index, weights: Short, weight_scale: np.float32, out: Real
+) -> None:
+    """See `DelayAndSumEnvelopeInt16`."""
+    n_ranges = min(_TILE_RANGES, out.shape[1])
+    for tile, start in enumerate(starts):
+        flat = tiles[tile].reshape(-1, 2).astype(np.int32)
+        for direction, places in enumerate(offsets):
+            samples = flat[places[:, None] + np.arange(n_ranges)]  # (mic, range, 2)
+            real, imag = np.einsum("mrc,mpc->pr", samples, weights[direction].astype(np.int32)).astype(np.float32)
+            level = np.sqrt(real * real + imag * imag)
+            out[direction, start : start + n_ranges] = level * (scales[tile] * weight_scale)
+
+
 KERNELS = KernelSet(
     device="numpy",
     max_threads=1,
+    tile_ranges=_TILE_RANGES,
+    fastest_precision="float32",
     threads=threads,
     unpack_bits=unpack_bits,
     decimate=decimate,
@@ -123,4 +153,6 @@ KERNELS = KernelSet(
     delay_and_sum=delay_and_sum,
     envelope=envelope,
     delay_and_sum_envelope=delay_and_sum_envelope,
+    quantise_tiles=quantise_tiles,
+    delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
 )

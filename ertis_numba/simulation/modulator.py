@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba import checks, kernels
 from ertis_numba.kernels._cpu.modulate import modulate_pdm
 
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]
 
-MAX_ORDER = 4
+_MAX_ORDER = 4
 _OUT_OF_BAND_GAIN = 1.5  # Lee's rule: a one-bit loop with no more gain than this is stable
-_LIMIT = 2.0  # twice what the integrators reach at half scale; with 4 the loop no longer recovers
+_LIMIT = 2.0  # integrators reach 1.7 at half scale; with 8 the loop no longer returns from overload
 _GAIN_STEP = 2.0**-20  # gains as short numbers: no processor's last digit can change a bit
 
 
@@ -32,14 +32,20 @@ class Modulator:
         half it costs range.
     band : float
         Upper edge of the band where noise is to be low, in cycles per sample.
+    threads : int, optional
+        All cores by default. The bits do not depend on it.
     """
 
-    def __init__(self, keys: NDArray[np.uint64], *, order: int, dither: float, band: float) -> None:
+    def __init__(
+        self, keys: NDArray[np.uint64], *, order: int, dither: float, band: float, threads: int | None = None
+    ) -> None:
         self._keys = keys
         self._gains = np.asarray(loop_gains(order, band))
-        self._states = np.zeros((len(keys), MAX_ORDER))
+        self._states = np.zeros((len(keys), _MAX_ORDER))
         self._dither = dither
         self._first = 0
+        self._kernels = kernels.load("cpu")
+        self._threads = self._kernels.max_threads if threads is None else threads
 
     def process(self, signals: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Return the bits of the next block: (mic, sample) uint8, 0 or 1.
@@ -50,7 +56,8 @@ class Modulator:
             Full scale 1. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
         """
         bits = np.empty(signals.shape, dtype=np.uint8)
-        modulate_pdm(signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits)
+        with self._kernels.threads(self._threads):
+            modulate_pdm(signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits)
         self._first += signals.shape[1]
         return bits
 
@@ -63,7 +70,7 @@ def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArra
     makes the noise in it least (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters,
     IEEE Press 2005, chapter 4).
     """
-    checks.whole("order", order, 1, MAX_ORDER)
+    checks.whole("order", order, 1, _MAX_ORDER)
     checks.between("band", band, 0.0, 0.25)
     angle = math.pi * (2 * np.arange(order) + order + 1) / (2 * order)
     low, high = 0.0, 2.0
@@ -94,7 +101,7 @@ def loop_gains(order: int, band: float) -> tuple[float, float, float, float, flo
     turn = np.zeros(2)  # one resonator per pair of zeros, and none for a zero at 0 Hz
     turn[: (order + 1) // 2] = 2 * math.pi * band * _legendre_roots(order)[: (order + 1) // 2]
     resonances = 2 - 2 * np.cos(turn)
-    weights = np.zeros(MAX_ORDER)
+    weights = np.zeros(_MAX_ORDER)
     weights[:order] = np.linalg.solve(_integrators(order, resonances), loop[1:])
     ratio = [after / before if before else 0.0 for before, after in itertools.pairwise(weights)]
     back = [g / forward if forward else 0.0 for g, forward in zip(resonances, ratio[::2], strict=True)]
@@ -110,7 +117,7 @@ def _legendre_roots(order: int) -> NDArray[np.float64]:
 
 def _integrators(order: int, resonances: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the response of unscaled integrators to a unit error: (sample, integrator) float64."""
-    state = np.zeros(MAX_ORDER)
+    state = np.zeros(_MAX_ORDER)
     response = np.empty((order, order))
     error = 1.0
     for n in range(order):

@@ -10,10 +10,10 @@ from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.simulation.arrivals import Arrivals, arrivals
 from ertis_numba.simulation.modulator import Modulator
-from ertis_numba.simulation.scene import Scene, load_scene
+from ertis_numba.simulation.scene import Scene
 from ertis_numba.waveform import call_at
 
-__all__ = ["load_scene", "received", "render"]
+__all__ = ["received", "render"]
 
 _BLOCK = 32_768  # PDM samples rendered at a time, so that memory does not grow with the record
 _SIGNAL_STEP = 2.0**-20  # −131 dBFS of noise, to hide the last digits, in which processors differ

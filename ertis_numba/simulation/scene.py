@@ -12,6 +12,7 @@ import tomli_w
 
 from ertis_numba import checks
 from ertis_numba.errors import SettingsError
+from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Settings
 
 __all__ = ["DirectSound", "Electronics", "Point", "Scene", "load_scene"]
@@ -144,12 +145,17 @@ class Scene(_Part, frozen=True, kw_only=True):
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Read a scene file. A layout file that it names is looked for beside it.
+    """Read a scene file.
+
+    A layout file that it names is looked for beside it and written out, so that the scene depends on no
+    other file.
 
     Raises
     ------
     SettingsError
         The file cannot be read or used.
+    ArgumentError
+        Its layout file cannot be read or used.
     """
     path = Path(path)
     try:
@@ -157,9 +163,9 @@ def load_scene(path: str | Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: {error}; give a readable scene file") from error
     scene = Scene.from_toml(text, str(path))
-    array = scene.sensor.array
-    if array.positions_m is None and Path(array.layout).suffix.lower() in {".toml", ".csv"}:
-        array = array.replace(layout=str(path.parent / array.layout))
+    layout = scene.sensor.array.layout
+    if scene.sensor.array.positions_m is None and Path(layout).suffix.lower() in {".toml", ".csv"}:
+        array = load_layout(path.parent / layout).to_array()
         scene = scene.replace(sensor=scene.sensor.replace(array=array))
     return scene
 

@@ -18,6 +18,7 @@ __all__ = ["find_peaks"]
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
 _PULSE_M = 0.04  # length of a compressed pulse down to -40 dB
+_ONE_SIDED = 0.25  # mean offset of neighbours, by their reach, that tells the edge of a grid
 _PSF_BINS = 1024  # transform of the point-spread function: some 80 bins in the band
 
 
@@ -175,11 +176,13 @@ def _interpolate(
 def _quadric_top(offsets: NDArray[np.float64], rises: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Return where a quadric through samples around 0 is highest, and by how much it rises there.
 
-    The quadric is fitted over the plane, or the line, in which the offsets mainly lie. Without a
-    maximum within the samples, the place itself is kept.
+    The quadric is fitted over the plane, or the line, in which the offsets mainly lie. The place itself
+    is kept where there is no maximum within the samples, and at the edge of a grid, whose samples lie
+    to one side.
     """
     none = np.zeros(3), 0.0
-    if len(offsets) < 3:
+    reach = np.max(np.linalg.norm(offsets, axis=1))
+    if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > _ONE_SIDED * reach:
         return none
     _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
     n_axes = 2 if sizes[1] > 0.2 * sizes[0] else 1
@@ -196,6 +199,6 @@ def _quadric_top(offsets: NDArray[np.float64], rises: NDArray[np.float64]) -> tu
     if np.max(np.linalg.eigvalsh(curve)) >= 0:
         return none
     top = np.linalg.solve(curve, -slope)
-    if np.linalg.norm(top) > np.max(np.linalg.norm(x, axis=1)):
+    if np.linalg.norm(top) > reach:
         return none
     return top @ axes[:n_axes], float(0.5 * slope @ top)

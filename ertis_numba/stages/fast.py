@@ -11,7 +11,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, direction_grid, far_field_delays, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beamform import Beamform
+from ertis_numba.stages.beamform import Beamform, DelayTable, beamform
 from ertis_numba.stages.demodulate import Demodulate
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.window import time_window
@@ -23,6 +23,7 @@ __all__ = ["FastChain"]
 class _Buffers(NamedTuple):
     signals: NDArray[np.float32]
     analytic: NDArray[np.complex64]
+    beamform: tuple[NDArray[np.int16], NDArray[np.float32]]
 
 
 class FastChain:
@@ -55,9 +56,14 @@ class FastChain:
         self._matched_filter = MatchedFilter(
             settings, window, kernels, fft.load(kernels.device), taps=taps, n_mics=delays_s.shape[1]
         )
-        self._beamform = Beamform(
-            settings, layout, window, kernels, delays_s=delays_s, centre_hz=self._matched_filter.centre_hz
+        table = DelayTable.of(
+            delays_s,
+            1 / (layout.gain[layout.enabled] * delays_s.shape[1]),
+            settings,
+            window,
+            centre_hz=self._matched_filter.centre_hz,
         )
+        self._beamform: Beamform = beamform(settings, window, kernels, table)
         self._spare: LifoQueue[_Buffers] = LifoQueue()
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
@@ -66,7 +72,7 @@ class FastChain:
         with self._kernels.threads(self._threads):
             self._demodulate(words, buffers.signals)
             self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
-            self._beamform(buffers.analytic, out)
+            self._beamform(buffers.analytic, buffers.beamform, out)
         self._spare.put(buffers)
 
     def _take_buffers(self) -> _Buffers:
@@ -77,4 +83,5 @@ class FastChain:
             return _Buffers(
                 np.zeros(self._demodulate.shape, dtype=np.float32),
                 np.zeros(self._matched_filter.shape, dtype=np.complex64),
+                self._beamform.new_buffers(),
             )

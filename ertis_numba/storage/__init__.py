@@ -12,10 +12,10 @@ from ertis_numba.storage.recording import (
     Gap,
     RecordingReader,
     RecordingWriter,
-    Truth,
     open_recording,
     write_recording,
 )
+from ertis_numba.storage.truth import Truth
 
 __all__ = [
     "EnergyscapeReader",

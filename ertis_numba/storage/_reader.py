@@ -167,7 +167,7 @@ def _open(path: Path) -> h5py.File:
     if n_bytes == 0:
         raise DataError(f"{path} is empty; give a recording or an energyscape file")
     if not h5py.is_hdf5(path):
-        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file")
+        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file, import raw words first")
     try:
         return h5py.File(path, "r")
     except OSError as error:

@@ -1,6 +1,5 @@
 """Rows along time: one array per measurement, and one number per measurement and column."""
 
-import shutil
 import zlib
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,11 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Stamp
+from ertis_numba.storage.atomic import require_room
 from ertis_numba.storage.schema import CHUNK_ROWS
 
 __all__ = ["RowReader", "RowWriter"]
 
-# HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
-# 914), so writing stops while there is still room for its tables.
-_FREE_BYTES_KEPT = 8 * 2**20
 _STAMP_COLUMNS = ("time", "time_uncertainty", "sequence", "sync_count", "epoch", "crc32")
 
 
@@ -50,7 +47,7 @@ class RowWriter:
         stored = np.ascontiguousarray(row, dtype=self._data.dtype)
         checks.shape(f"measurement {self._n_rows}", stored.shape, self._data.shape[1:])
         uncertainty_ns = checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1)
-        self._require_room(stored.nbytes)
+        require_room(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
         # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
@@ -89,14 +86,6 @@ class RowWriter:
             if stamp.sequence > self._last.sequence + 1:
                 self.gaps.append((self._last.sequence + 1, stamp.sequence - 1))
         self._last = stamp
-
-    def _require_room(self, n_bytes: int) -> None:
-        free = shutil.disk_usage(self._folder).free
-        if free < n_bytes + _FREE_BYTES_KEPT:
-            raise DataError(
-                f"{self._folder} has {free / 1e6:.0f} MB free, too little for the next {n_bytes / 1e6:.1f} MB; "
-                "free some or write elsewhere"
-            )
 
 
 class RowReader:

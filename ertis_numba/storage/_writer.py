@@ -20,7 +20,7 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader, RowWriter
-from ertis_numba.storage.atomic import check_target, replacing
+from ertis_numba.storage.atomic import check_target, replacing, require_room
 from ertis_numba.storage.schema import (
     CONVENTIONS,
     FORMAT_VERSION,
@@ -103,6 +103,7 @@ class Writer(ABC, Generic[Item]):
     @contextmanager
     def _open_part(self) -> Iterator[h5py.File]:
         """Yield the part file; complete, close and compare it when the block ends well."""
+        require_room(self.path.parent, 0)
         with self._naming_file():
             file = h5py.File(self._part, "w", track_order=True)
         try:

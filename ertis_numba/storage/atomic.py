@@ -1,13 +1,18 @@
 """A file appears under its name complete, or not at all."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["check_target", "replacing"]
+__all__ = ["check_target", "replacing", "require_room"]
+
+# HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
+# 914), so writing stops while there is still room for its tables.
+_SPARE_BYTES = 8_000_000
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
@@ -24,6 +29,22 @@ def check_target(path: Path, *, overwrite: bool) -> None:
         raise ArgumentError(f"output {path}: there is no folder {path.parent}; make it or give another")
     if path.exists() and not overwrite:
         raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+
+
+def require_room(folder: Path, n_bytes: int) -> None:
+    """Refuse to write ``n_bytes`` into a folder that would then have no room to spare.
+
+    Raises
+    ------
+    DataError
+        The disk is full, or nearly so.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < n_bytes + _SPARE_BYTES:
+        raise DataError(
+            f"{folder} has {free / 1e6:.1f} MB free, wanted {n_bytes / 1e6:.1f} MB and {_SPARE_BYTES / 1e6:.0f} MB "
+            "to spare; free some space or write elsewhere"
+        )
 
 
 @contextmanager

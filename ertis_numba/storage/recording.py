@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones
@@ -17,13 +16,13 @@ from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer, self_contained
-from ertis_numba.storage.schema import RECORDING, TRUTH, Variable, lay_out
+from ertis_numba.storage.schema import RECORDING, Variable, lay_out
+from ertis_numba.storage.truth import Truth, read_truth, write_truth
 from ertis_numba.waveform import call_samples
 
-__all__ = ["Gap", "RecordingReader", "RecordingWriter", "Truth", "open_recording", "write_recording"]
+__all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
 
 _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
-_TRUTH_ARRAYS = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m", "level": "level_db"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,34 +32,6 @@ class Gap:
     first: int
     last: int
     reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Truth:
-    """What a simulated recording should show.
-
-    Attributes
-    ----------
-    scene : str
-        The scene as TOML.
-    seed : int
-    azimuth_rad, elevation_rad, range_m, level_db : (measurement, target) float64
-        The reflectors as the sensor sees them; levels below the strongest. NaN where a measurement
-        has fewer reflectors than others.
-    """
-
-    scene: str
-    seed: int
-    azimuth_rad: NDArray[np.float64]
-    elevation_rad: NDArray[np.float64]
-    range_m: NDArray[np.float64]
-    level_db: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        if self.azimuth_rad.ndim != 2:
-            raise ArgumentError(f"azimuth_rad has shape {self.azimuth_rad.shape}; give (measurement, target)")
-        for name in _TRUTH_ARRAYS.values():
-            checks.shape(name, getattr(self, name).shape, self.azimuth_rad.shape)
 
 
 class RecordingWriter(Writer[Measurement]):
@@ -124,7 +95,7 @@ class RecordingWriter(Writer[Measurement]):
         for name, values in _copies(layout).items():
             group[name][:] = values
         if self._truth is not None:
-            _write_truth(group.file, self._truth)
+            write_truth(group.file, self._truth)
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
         self._require_same(item.settings)
@@ -179,16 +150,6 @@ def _mounting(sensor: str, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _write_truth(file: h5py.File, truth: Truth) -> None:
-    n_measurements, n_targets = truth.azimuth_rad.shape
-    group = file.create_group("truth", track_order=True)
-    lay_out(group, TRUTH, sizes={"measurement": n_measurements, "target": n_targets})
-    group.attrs["seed"] = truth.seed
-    group["scene"][()] = truth.scene
-    for name, field in _TRUTH_ARRAYS.items():
-        group[name][:] = getattr(truth, field)
-
-
 class RecordingReader(Reader[Measurement]):
     """A recording as a sequence of measurements, read one at a time.
 
@@ -214,7 +175,7 @@ class RecordingReader(Reader[Measurement]):
                         *(self._group[f"gap_{name}"][:] for name in ("first", "last", "reason")), strict=True
                     )
                 )
-                self.truth = _read_truth(self._file)
+                self.truth = read_truth(self._file)
         except BaseException:
             self.close()
             raise
@@ -245,14 +206,6 @@ class RecordingReader(Reader[Measurement]):
                     f"{self.path}: {name} of channel {place[0]} is {values[place]:g}, the settings in the file say "
                     f"{wanted[place]:g}; change the settings with it"
                 )
-
-
-def _read_truth(file: h5py.File) -> Truth | None:
-    if "truth" not in file:
-        return None
-    group = file["truth"]
-    arrays = {field: np.asarray(group[name][:]) for name, field in _TRUTH_ARRAYS.items()}
-    return Truth(scene=group["scene"][()].decode(), seed=int(group.attrs["seed"]), **arrays)
 
 
 def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingReader:

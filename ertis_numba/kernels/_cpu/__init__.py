@@ -16,10 +16,16 @@ from ertis_numba.kernels._contract import KernelSet
 from ertis_numba.kernels._cpu.decimate import decimate
 from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
 from ertis_numba.kernels._cpu.delay_and_sum_envelope import delay_and_sum_envelope
+from ertis_numba.kernels._cpu.delay_and_sum_envelope_int16 import (
+    HAS_INT16_DOT,
+    RANGES,
+    delay_and_sum_envelope_int16,
+)
 from ertis_numba.kernels._cpu.demodulate_words import demodulate_words
 from ertis_numba.kernels._cpu.envelope import envelope
 from ertis_numba.kernels._cpu.multiply_and_fold import multiply_and_fold
 from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
+from ertis_numba.kernels._cpu.quantise_tiles import quantise_tiles
 from ertis_numba.kernels._cpu.remove_group_delay import remove_group_delay
 from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
 
@@ -57,6 +63,8 @@ def threads(count: int) -> Iterator[None]:
 KERNELS = KernelSet(
     device="cpu",
     max_threads=_MAX_THREADS,
+    tile_ranges=RANGES if HAS_INT16_DOT else 0,
+    fastest_precision="int16" if HAS_INT16_DOT else "float32",
     threads=threads,
     unpack_bits=unpack_bits,
     decimate=decimate,
@@ -67,4 +75,6 @@ KERNELS = KernelSet(
     delay_and_sum=delay_and_sum,
     envelope=envelope,
     delay_and_sum_envelope=delay_and_sum_envelope,
+    quantise_tiles=quantise_tiles,
+    delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
 )

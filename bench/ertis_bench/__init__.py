@@ -1,0 +1,1 @@
+"""Measure speed: `paper` and `scaling` are run by ``ertis bench``."""

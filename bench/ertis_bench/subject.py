@@ -1,0 +1,32 @@
+"""What is processed in a benchmark."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ertis_numba.frames import Measurement
+from ertis_numba.settings import Settings
+from ertis_numba.storage import open_recording
+
+__all__ = ["measurement", "noise"]
+
+_RECORDING = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
+
+
+def measurement() -> tuple[Measurement, str]:
+    """Return a measurement of the default preset and what it is, for the report.
+
+    It comes from data/synthetic; where this package runs without the repository around it, it is noise.
+    """
+    if not _RECORDING.exists():
+        return noise(Settings.from_preset("default_25_50")), "white noise, seed 1"
+    with open_recording(_RECORDING) as recording:
+        return recording[0], "data/synthetic/reflectors.h5"
+
+
+def noise(settings: Settings, *, n_words: int = 1) -> Measurement:
+    """Return random words of the settings' size."""
+    word_type = np.dtype(f"u{settings.array.word_bits // 8}")
+    shape = (settings.recording.n_samples, n_words) if n_words > 1 else (settings.recording.n_samples,)
+    random = np.random.default_rng(1)
+    return Measurement(random.integers(0, np.iinfo(word_type).max, shape, dtype=word_type, endpoint=True), settings)

@@ -1,0 +1,115 @@
+"""Reports as Markdown, and where they go."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ertis_bench.machine import sentence
+from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["paper", "scaling", "update"]
+
+_MEANING = {
+    "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
+    "numpy": "`numpy`: this package's algorithm, NumPy and SciPy",
+    "cpu": "`cpu`: this package's algorithm, Numba",
+}
+
+
+def update(path: Path, name: str, text: str) -> None:
+    """Replace what stands between the markers ``<!-- ertis bench NAME -->`` and its end in a file.
+
+    Raises
+    ------
+    ArgumentError
+        The file cannot be read, or the markers are not in it.
+    """
+    begin, end = f"<!-- ertis bench {name} -->", f"<!-- /ertis bench {name} -->"
+    try:
+        content = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArgumentError(f"{path}: {error}; give a readable Markdown file") from error
+    head, found, rest = content.partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not (found and closed):
+        raise ArgumentError(f"{path} has no place for this table; give a file with the lines {begin} and {end}")
+    path.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}", encoding="utf-8")
+
+
+def paper(report: dict[str, Any]) -> str:
+    """Return the times, the ratios and the paper's own times, and what they include."""
+    found = {(row["backend"], row["directions"]): row for row in report["rows"]}
+    backends = list(dict.fromkeys(row["backend"] for row in report["rows"]))
+    measured = [[_MEANING[backend], *(_spread(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
+    ratios = [
+        [
+            f"`{backend}`",
+            *(f"{found['scipy', n]['median_ms'] / found[backend, n]['median_ms']:.1f}×" for n in DIRECTIONS),
+        ]
+        for backend in backends
+        if backend != "scipy"
+    ]
+    published = [[name, *(f"{mean:.2f} ± {std:.2f}" for mean, std in times)] for name, times in PUBLISHED_MS.items()]
+    columns = [f"{n} directions" for n in DIRECTIONS]
+    worst_db = max(error for errors in report["error_db"].values() for error in errors.values())
+    return "\n\n".join(
+        [
+            _table(
+                ["ms, mean ± std (median)", *columns],
+                [*measured, ["`cuda`", *["not measured"] * len(DIRECTIONS)]],
+            ),
+            _table(["times faster than `scipy`, by medians", *columns], ratios),
+            _table(["the paper's own, ms, mean ± std", *columns], published),
+            f"Measured on {sentence(report['machine'])}",
+            f"{report['count']} measurements each, in one process, the backends in turns of five: "
+            f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+            f"{report['range_m'][0]:g}–{report['range_m'][1]:g} m. Included: everything from the words in memory to "
+            "the image in memory. Not included: reading the file, making the pipeline, compilation, and three calls "
+            "of each to warm up; images go to one array that is used again. `scipy` runs on one thread, as its "
+            "filters and sums do anyhow, and over the whole record, as the paper does; the others compute the part "
+            "of the record that the image needs, and transform and, for `cpu`, beamform on all cores.",
+            "Results were checked first: `numpy` and `cpu` differ from the exact image (float64, fractional delays) by "
+            f"{worst_db:.1f} dB at most, and `scipy` shows the same strongest reflector. The paper does not state the "
+            "length of its records.",
+        ]
+    )
+
+
+def scaling(report: dict[str, Any]) -> str:
+    """Return one table per series, the ceilings, and what is reached of them."""
+    parts = []
+    for series in dict.fromkeys(row["series"] for row in report["rows"]):
+        rows = [row for row in report["rows"] if row["series"] == series]
+        table = [[f"{row['value']:g}", _spread(**row), f"{row['n_ranges']}"] for row in rows]
+        parts.append(_table([series.replace("_m", " (m)"), "ms, mean ± std (median)", "ranges"], table))
+    ceilings = [
+        [f"{row['threads']}", f"{row['copy_gb_s']}", f"{row['triad_gb_s']}", f"{row['multiply_add_gflop_s']}"]
+        for row in report["ceilings"]
+    ]
+    parts.append(_table(["threads", "copy, GB/s", "triad, GB/s", "float32 multiply-add, GFLOP/s"], ceilings))
+    reached = report["delay_and_sum"]
+    parts.append(
+        f"Delay-and-sum with envelope takes {reached['us_per_direction']:.2f} µs per direction (the slope over "
+        f"directions; the rest of the chain takes {reached['rest_of_chain_ms']:.2f} ms): {reached['points_per_s']:.3g} "
+        f"complex multiply-adds per second, {reached['gflop_s']:.0f} GFLOP/s or {100 * reached['of_multiply_add']:.0f} % "
+        f"of what float32 multiply-adds can do here. It writes {reached['written_gb_s']:.2f} GB/s, "
+        f"{100 * reached['of_copy']:.0f} % of what a copy moves in both directions, so arithmetic and caches bind it, "
+        "not memory."
+    )
+    parts.append(
+        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white noise; "
+        "what is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
+        "against the exact one before it was timed; three calls to warm up are not counted. Ceilings are the best of as "
+        "many runs, over arrays of 64 MiB and in registers."
+    )
+    return "\n\n".join(parts)
+
+
+def _spread(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
+    return f"{mean_ms:.2f} ± {std_ms:.2f} ({median_ms:.2f})"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    rule = ["---", *["---:"] * (len(head) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))

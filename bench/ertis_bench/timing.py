@@ -1,0 +1,47 @@
+"""Time several things fairly."""
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["round_robin", "summary"]
+
+_WARM_UP = 3
+_BURST = 5  # calls in a row: as in a stream, and still many rounds that spread a drift over all
+
+
+def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> dict[str, NDArray[np.float64]]:
+    """Return the times of ``count`` calls of each subject in milliseconds: (call,) float64 each.
+
+    Subjects take turns, so that whatever slows the machine for a while hits all of them. The first
+    calls of each are not counted, and the garbage collector is off.
+    """
+    for subject in subjects.values():
+        for _ in range(_WARM_UP):
+            subject()
+    times_ms: dict[str, list[float]] = {name: [] for name in subjects}
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for begin in range(0, count, _BURST):
+            for name, subject in subjects.items():
+                for _ in range(begin, min(begin + _BURST, count)):
+                    start_ns = time.perf_counter_ns()
+                    subject()
+                    times_ms[name].append((time.perf_counter_ns() - start_ns) / 1e6)
+    finally:
+        if collecting:
+            gc.enable()
+    return {name: np.asarray(times) for name, times in times_ms.items()}
+
+
+def summary(times_ms: NDArray[np.float64]) -> dict[str, float]:
+    """Return mean, standard deviation and median, rounded to microseconds."""
+    return {
+        "mean_ms": round(float(np.mean(times_ms)), 3),
+        "std_ms": round(float(np.std(times_ms)), 3),
+        "median_ms": round(float(np.median(times_ms)), 3),
+    }

@@ -1,0 +1,67 @@
+"""One table of settings that every chain and every device is tested on, and words to test them with."""
+
+import numpy as np
+
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+
+LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
+SHORT = Settings(
+    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9), oversampling=32)
+)
+CASES = {
+    "default": SHORT,
+    "wide band": SHORT.replace(call=Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0)),
+    "upward sweep": SHORT.replace(call=Call(start_frequency_hz=25_000.0, stop_frequency_hz=50_000.0)),
+    "one direction": SHORT.replace(processing=SHORT.processing.replace(directions="2d:1")),
+    "first sample": SHORT.replace(processing=SHORT.processing.replace(range_m=(0.0, 0.4))),
+    "last sample": SHORT.replace(processing=SHORT.processing.replace(range_m=(1.2, 1.55))),
+    "prime record": SHORT.replace(recording=Recording(n_samples=40_961)),
+    "odd record": SHORT.replace(recording=Recording(n_samples=40_965)),
+    "solid angle": SHORT.replace(processing=SHORT.processing.replace(directions="3d:11")),
+    "cold": SHORT.replace(air=Air(temperature_c=-40.0, humidity_percent=0.0)),
+    "one microphone": SHORT.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)),
+    "line of 8": SHORT.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8)),
+    "16 bits, disabled": SHORT.replace(
+        array=Array(layout="line", positions_m=LINE_8, enabled=(True, False) * 4, word_bits=16)
+    ),
+    "64 bits, two words": SHORT.replace(
+        array=Array(layout="long", positions_m=tuple((0.0, 0.001 * m, 0.0) for m in range(70)), word_bits=64)
+    ),
+    "calibrated": SHORT.replace(
+        array=Array(
+            layout="line", positions_m=LINE_8, gain=(2.0, 1.0) * 4, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
+        )
+    ),
+    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15)),
+    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(output_decimation=3, oversampling=10)),
+    "every sample": SHORT.replace(processing=SHORT.processing.replace(output_decimation=1, range_m=(0.6, 0.62))),
+}
+"""Settings by name. Records are short, so that the float64 referees are quick."""
+
+
+def noise(settings: Settings, seed: int = 1) -> Measurement:
+    """White noise: it tells at all ranges and directions at once what echoes would."""
+    array = settings.array
+    n_words = -(-len(array.positions_m or range(32)) // array.word_bits)
+    shape = (settings.recording.n_samples, n_words) if n_words > 1 else (settings.recording.n_samples,)
+    random = np.random.default_rng(seed)
+    dtype = np.dtype(f"u{array.word_bits // 8}")
+    return Measurement(random.integers(0, 2**array.word_bits, shape, dtype=dtype), settings, Stamp(sequence=5))
+
+
+def words_of(signals, seed: int = 1):
+    """Words whose bits are 1 with probability (1 + signal) / 2: (sample,) uint32.
+
+    The simplest one-bit converter: its mean is the signal, whatever the signal is, and its error is white.
+
+    Parameters
+    ----------
+    signals : (mic, sample)
+        Within -1 and 1; at most 32 microphones.
+    """
+    random = np.random.default_rng(seed)
+    words = np.zeros(signals.shape[1], dtype=np.uint32)
+    for mic, signal in enumerate(signals):
+        words |= (random.random(len(signal)) < (1 + signal) / 2).astype(np.uint32) << np.uint32(mic)
+    return words

@@ -1,0 +1,49 @@
+"""Small files that the tests of storage, figures and command line share."""
+
+import numpy as np
+
+from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.settings import Array, Processing, Recording, Settings
+
+SMALL = Settings(
+    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9), oversampling=32)
+)
+
+
+def line(n_channels, word_bits):
+    """Settings of a line array."""
+    positions_m = tuple((0.0, 0.004 * channel, 0.0) for channel in range(n_channels))
+    return SMALL.replace(array=Array(layout="line", positions_m=positions_m, word_bits=word_bits))
+
+
+def noise(settings=SMALL, count=3, seed=1):
+    """Measurements of noise whose stamps all differ."""
+    array = settings.array
+    n_words = -(-len(array.positions_m or range(32)) // array.word_bits)
+    shape = (settings.recording.n_samples, n_words)[: 1 + (n_words > 1)]
+    rng = np.random.default_rng(seed)
+    return [
+        Measurement(
+            rng.integers(0, 2**array.word_bits, shape, dtype=f"u{array.word_bits // 8}"),
+            settings,
+            Stamp(
+                sensor="eRTIS-7",
+                sequence=10 + index,
+                sync_count=200 + index,
+                timestamp_ns=1_700_000_000_123_456_789 + 50_000_000 * index,
+                timestamp_uncertainty_ns=400 + index,
+            ),
+        )
+        for index in range(count)
+    ]
+
+
+def image(azimuth_deg=None, elevation_deg=None, *, range_m=None, seed=1, settings=SMALL):
+    """An energyscape of speckle with one bright place."""
+    azimuth_deg = np.linspace(-90, 90, 37) if azimuth_deg is None else np.asarray(azimuth_deg, dtype=float)
+    elevation_deg = np.zeros_like(azimuth_deg) if elevation_deg is None else np.asarray(elevation_deg, dtype=float)
+    range_m = np.linspace(0.5, 5.0, 400) if range_m is None else np.asarray(range_m, dtype=float)
+    rng = np.random.default_rng(seed)
+    energy = (0.002 * rng.rayleigh(size=(len(azimuth_deg), len(range_m)))).astype(np.float32)
+    energy[len(azimuth_deg) // 2, len(range_m) // 2] = 0.5
+    return Energyscape(energy, np.radians(azimuth_deg), np.radians(elevation_deg), range_m, settings)

@@ -1,0 +1,97 @@
+"""The paper's algorithm against its plain float64 form, and against an echo made by formula."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Call, Processing, Recording, Settings
+from ertis_numba.waveform import call_at
+from tests import reference
+from tests.cases import CASES, SHORT, noise, words_of
+
+FLOAT32_DB = -100  # 111 dB below the float64 image on a real measurement
+
+
+def with_paper(settings: Settings, **changes) -> Settings:
+    return settings.replace(processing=settings.processing.replace(method="paper", **changes))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_image_is_the_plain_one(name):
+    settings = with_paper(CASES[name])
+    pipeline = Pipeline(settings)
+    measurement = noise(settings)
+    image = pipeline.process(measurement)
+    directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
+    expected, range_m = reference.paper(measurement.words, settings, directions)
+    assert image.range_m == pytest.approx(range_m, rel=1e-12)
+    assert reference.error_db(image.energy, expected) < FLOAT32_DB
+
+
+def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float):
+    """One plane echo of the call, in the words of the settings' array."""
+    speed_m_s = sound_speed_m_s(settings.air)
+    direction = unit_vectors(np.radians(azimuth_deg), np.float64(0))
+    delay_s = -(microphones(settings.array).enabled_positions_m @ direction) / speed_m_s
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    arrival_s = 2 * range_m / speed_m_s + delay_s[:, None]
+    return words_of(level * call_at(settings.call, time_s - arrival_s))
+
+
+@pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)])
+def test_echo_lies_at_its_range_with_its_amplitude(call):
+    """Group delays of all filters are gone, also those of the recursive ones."""
+    settings = with_paper(SHORT.replace(call=call), directions="2d:181", output_decimation=1, range_m=(0.65, 0.75))
+    words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
+    image = Pipeline(settings).process(Measurement(words, settings))
+    direction, distance = np.unravel_index(np.argmax(image.energy), image.energy.shape)
+    assert math.degrees(image.azimuth_rad[direction]) == pytest.approx(20.0, abs=1.0)
+    assert image.range_m[distance] == pytest.approx(0.7, abs=4e-4)  # one sample: 0.38 mm
+    assert image.energy.max() == pytest.approx(0.8, rel=0.03)
+
+
+def test_image_agrees_with_the_exact_one_on_where_the_echo_is():
+    settings = with_paper(SHORT, directions="2d:61")
+    words = echo(settings, azimuth_deg=-33.0, range_m=0.6, level=0.5)
+    image = Pipeline(settings).process(Measurement(words, settings))
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    exact = reference.exact(words, settings, directions, image.range_m)
+    assert np.argmax(image.energy) == np.argmax(exact)
+    assert image.energy.max() == pytest.approx(exact.max(), rel=0.12)  # both sample the range axis at 45 kHz
+
+
+def test_range_axis_is_that_of_the_paper():
+    settings = with_paper(Settings())
+    step_m = sound_speed_m_s(settings.air) / (2 * 45_000)
+    indices = Pipeline(settings).range_m / step_m
+    assert indices == pytest.approx(np.arange(131, 1309), abs=1e-9)  # 0.5 and 5 m in steps of 3.82 mm
+
+
+def test_rectified_carrier_is_gone():
+    """With every sample kept, the envelope of a call is smooth: no ripple at twice the carrier."""
+    settings = with_paper(SHORT, directions="2d:1", output_decimation=1, range_m=(0.65, 0.75))
+    words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
+    row = Pipeline(settings).process(Measurement(words, settings)).energy[0]
+    spectrum = np.abs(np.fft.rfft(row * np.hanning(len(row))))
+    frequency_hz = np.fft.rfftfreq(len(row), 1 / 450e3)
+    assert spectrum[frequency_hz > 45e3].max() < 2e-3 * spectrum.max()
+
+
+@pytest.mark.parametrize(
+    ("processing", "n_samples", "match"),
+    [
+        (Processing(range_m=(0.5, 5.0)), 40_960, "range_m ends at 5 m, but the record of 9.102 ms reaches 1.563 m"),
+        (Processing(range_m=(0.701, 0.702)), 40_960, "0.701 to 0.702 m holds no multiple of 0.003821 m; give a longer"),
+        (Processing(range_m=(0.0, 0.1)), 9, "range_m ends at 0.1 m, but the record of 0.002 ms reaches 0 m"),
+    ],
+)
+def test_refuses_ranges(processing, n_samples, match):
+    settings = Settings(recording=Recording(n_samples=n_samples), processing=processing.replace(method="paper"))
+    with pytest.raises(ArgumentError, match=match):
+        Pipeline(settings)

@@ -1,0 +1,343 @@
+"""Recordings and energyscapes survive the way to the disk and back, and other programs can read them."""
+
+import tracemalloc
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.storage import (
+    EnergyscapeWriter,
+    Gap,
+    RecordingWriter,
+    Truth,
+    file_kind,
+    open_energyscapes,
+    open_recording,
+    write_energyscapes,
+    write_recording,
+)
+from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, TRUTH
+from tests.files import SMALL, image, line, noise
+
+
+def truth(n_measurements=3):
+    values = np.arange(2.0 * n_measurements).reshape(n_measurements, 2)
+    return Truth(
+        scene='name = "two"\n', seed=7, azimuth_rad=values, elevation_rad=-values, range_m=values + 1, level_db=-values
+    )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [SMALL, line(1, 8), line(8, 8), line(16, 16), line(64, 64), line(33, 32), line(70, 16)],
+    ids=["32", "1 of 8", "8", "16", "64", "33 in 2 words", "70 in 5 words"],
+)
+def test_recording_comes_back(tmp_path, settings):
+    given = noise(settings)
+    path = write_recording(tmp_path / "rec.h5", given, source="noise")
+    with open_recording(path) as recording:
+        assert len(recording) == len(given)
+        for back, measurement in zip(recording, given, strict=True):
+            assert back.words.dtype == measurement.words.dtype
+            assert np.array_equal(back.words, measurement.words)
+            assert back.stamp == measurement.stamp
+        assert recording[-1].stamp == given[-1].stamp
+        assert recording.attributes["source"] == "noise"
+        assert file_kind(path) == "recording"
+        changed = recording.settings.replace(array=settings.array)
+        assert changed == settings
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_recording_depends_on_no_other_file(tmp_path):
+    layout = tmp_path / "mine.csv"
+    layout.write_text("0, 0\n4, 0\n8, 1\n")
+    settings = SMALL.replace(array=Array(layout=str(layout)))
+    words = noise(count=1)[0].words
+    write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
+    layout.unlink()
+    with open_recording(tmp_path / "rec.h5") as recording:
+        image = Pipeline(recording.settings).process(recording[0])
+        again = write_recording(tmp_path / "again.h5", recording)
+    assert len(image.settings.array.positions_m) == 3
+    with open_recording(tmp_path / "again.h5") as recording:  # a copy of a copy drifts by no bit
+        assert np.array_equal(Pipeline(recording.settings).process(recording[0]).energy, image.energy)
+    assert again.name == "again.h5"
+
+
+def test_gaps_epochs_and_air(tmp_path):
+    warm = SMALL.replace(air=Air(temperature_c=31.25, humidity_percent=80.0))
+    words = noise(count=1)[0].words
+    stamps = [Stamp(sequence=s, sync_count=c) for s, c in [(3, 9), (4, 10), (9, 2), (10, 3), (12, 0)]]
+    write_recording(
+        tmp_path / "rec.h5", (Measurement(words, warm if s.sequence == 9 else SMALL, s) for s in stamps), settings=SMALL
+    )
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert [(gap.first, gap.last) for gap in recording.gaps] == [(5, 8), (11, 11)]
+        assert isinstance(recording.gaps[0], Gap)
+        assert [m.settings.air for m in recording] == [SMALL.air, SMALL.air, warm.air, SMALL.air, SMALL.air]
+        assert recording.settings.air == SMALL.air
+    with h5py.File(tmp_path / "rec.h5") as file:
+        assert file["sensors/sensor/epoch"][:].tolist() == [0, 0, 1, 1, 2]
+
+
+def test_columns_pass_the_end_of_a_chunk(tmp_path):
+    short = line(8, 8).replace(recording=Recording(n_samples=16))
+    words = np.zeros(16, np.uint8)
+    write_recording(tmp_path / "rec.h5", (Measurement(words, short, Stamp(sequence=i)) for i in range(1100)))
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert [recording[index].stamp.sequence for index in (0, 511, 512, 1099)] == [0, 511, 512, 1099]
+
+
+def test_calibration_is_kept(tmp_path):
+    settings = line(8, 8)
+    array = settings.array.replace(gain=(1.0, 0.5) * 4, delay_s=(0.0, 2e-6) * 4, enabled=(True,) * 7 + (False,))
+    write_recording(tmp_path / "rec.h5", noise(settings.replace(array=array), 1))
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.settings.array == array
+    with h5py.File(tmp_path / "rec.h5") as file:
+        group = file["sensors/eRTIS-7"]
+        assert group["calibration_gain"][:].tolist() == [1.0, 0.5] * 4
+        assert group["calibration_delay"][:].tolist() == [0.0, 2e-6] * 4
+        assert group["microphone_enabled"][:].tolist() == [1] * 7 + [0]
+
+
+def test_truth_is_kept(tmp_path):
+    write_recording(tmp_path / "rec.h5", noise(), truth=truth())
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.truth.scene == truth().scene
+        assert recording.truth.seed == 7
+        for field in ("azimuth_rad", "elevation_rad", "range_m", "level_db"):
+            assert np.array_equal(getattr(recording.truth, field), getattr(truth(), field))
+
+
+def test_xarray_shows_named_axes(tmp_path):
+    write_recording(tmp_path / "rec.h5", noise(), truth=truth())
+    write_energyscapes(tmp_path / "img.h5", [image()])
+    with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
+        assert data["pdm"].dims == ("time", "sample")
+        assert data["pdm"].dtype == np.uint32
+        assert data["microphone_position"].dims == ("microphone", "axis")
+        assert data["time"].values[0] == np.datetime64(1_700_000_000_123_456_789, "ns")
+        assert set(data.variables) == {variable.name for variable in RECORDING}
+    with xarray.open_dataset(tmp_path / "rec.h5", group="/truth", engine="netcdf4") as data:
+        assert data["range"].dims == ("measurement", "target")
+        assert set(data.variables) == {variable.name for variable in TRUTH}
+    with xarray.open_dataset(tmp_path / "img.h5", group="/sensors/sensor", engine="netcdf4") as data:
+        assert data["energy"].dims == ("time", "direction", "range")
+        assert {"azimuth", "elevation", "range", "time"} == set(data.coords)
+        assert data["range"].attrs["units"] == "m"
+        assert set(data.variables) == {variable.name for variable in ENERGYSCAPE}
+
+
+def test_several_words_have_an_axis_of_their_own(tmp_path):
+    write_recording(tmp_path / "rec.h5", noise(line(33, 32)))
+    with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
+        assert data["pdm"].dims == ("time", "sample", "word")
+
+
+def test_energyscapes_come_back(tmp_path):
+    given = image()
+    write_energyscapes(tmp_path / "img.h5", [given, given.replace(energy=given.energy * 2)])
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        assert len(images) == 2
+        assert np.array_equal(images[1].energy, given.energy * 2)
+        for field in ("azimuth_rad", "elevation_rad", "range_m"):
+            assert np.array_equal(getattr(images[0], field), getattr(given, field))
+        assert images[0].settings.processing == given.settings.processing
+        assert file_kind(tmp_path / "img.h5") == "energyscape"
+
+
+def test_half_precision_keeps_three_digits(tmp_path):
+    given = image()
+    write_energyscapes(tmp_path / "img.h5", [given], dtype="float16")
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        assert images[0].energy.dtype == np.float32
+        np.testing.assert_allclose(images[0].energy, given.energy, rtol=2**-11, atol=2**-25)
+
+
+def test_result_names_its_recording(tmp_path):
+    write_recording(tmp_path / "rec.h5", noise())
+    with open_recording(tmp_path / "rec.h5") as recording:
+        write_energyscapes(tmp_path / "img.h5", [image()], recording=recording)
+        identity, digest = recording.uuid, recording.sha256()
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        assert images.attributes["recording_uuid"] == identity
+        assert images.attributes["recording_sha256"] == digest
+        assert images.attributes["numpy_version"] == np.__version__
+
+
+@pytest.mark.parametrize("directions", ["2d:181", "3d:500"])
+def test_replay_gives_the_same_bits_for_any_number_of_threads(tmp_path, directions):
+    write_recording(tmp_path / "rec.h5", noise())
+    energies = []
+    with open_recording(tmp_path / "rec.h5") as recording:
+        settings = recording.settings.replace(
+            processing=Processing(directions=directions, range_m=(0.3, 0.9), elevation_limits_deg=(-30.0, 30.0))
+        )
+        for threads in (1, 2, 1):
+            pipeline = Pipeline(settings, threads=threads)
+            write_energyscapes(tmp_path / "img.h5", map(pipeline.process, recording), overwrite=True)
+            with h5py.File(tmp_path / "img.h5") as file:
+                energies.append(file["sensors/eRTIS-7/energy"][:].tobytes())
+    assert energies[0] == energies[1] == energies[2]
+
+
+def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    first = write_recording(tmp_path / "a.h5", noise(), truth=truth())
+    second = write_recording(tmp_path / "b.h5", noise(), truth=truth())
+    other = write_recording(tmp_path / "c.h5", noise(seed=2), truth=truth())
+    assert first.read_bytes() == second.read_bytes()
+    with open_recording(first) as a, open_recording(other) as c:
+        assert a.attributes["date_created"] == "2023-11-14T22:13:20Z"
+        assert a.uuid != c.uuid
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path):
+    long = Settings()  # 640 KiB a measurement
+    words = noise(long, 1)[0].words
+
+    def copy():
+        with open_recording(tmp_path / "rec.h5") as recording:
+            write_recording(tmp_path / "copy.h5", recording)
+
+    write_recording(tmp_path / "rec.h5", (Measurement(words, long, Stamp(sequence=i)) for i in range(60)))
+    tracemalloc.start()
+    try:
+        copy()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 * words.nbytes
+
+
+def test_an_exception_leaves_nothing(tmp_path):
+    for error in (KeyboardInterrupt, ZeroDivisionError, GeneratorExit):
+        with pytest.raises(error), RecordingWriter(tmp_path / "rec.h5") as writer:
+            writer.write(noise(count=1)[0])
+            raise error
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_failure_leaves_the_older_file(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", noise())
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, overwrite=True) as writer:
+        writer.write(noise(count=1)[0])
+        raise KeyboardInterrupt
+    assert path.read_bytes() == before
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_what_reads_back_differently_is_refused(tmp_path):
+    words = noise(count=2)
+    with (
+        pytest.raises(DataError, match=r"damaged|reads back differently"),
+        RecordingWriter(tmp_path / "r.h5") as writer,
+    ):
+        for measurement in words:
+            writer.write(measurement)
+        writer._file["sensors/eRTIS-7/pdm"][1, 5] ^= 1  # noqa: SLF001  a fault between memory and disk
+    assert not list(tmp_path.iterdir())
+
+
+def spoilt(**settings):
+    return [*noise(count=1), *noise(SMALL.replace(**settings), 1)]
+
+
+@pytest.mark.parametrize(
+    ("measurements", "message"),
+    [
+        ([], "would hold no measurement"),
+        (spoilt(array=Array(layout="eRTIS_v2")), "other array settings"),
+        (spoilt(call=Call(duration_s=2e-3)), "other call settings"),
+        (spoilt(recording=Recording(n_samples=50_000)), "other recording settings"),
+        (
+            [Measurement(m.words, SMALL, Stamp(sensor=s)) for m, s in zip(noise(count=2), "ab", strict=True)],
+            "measurement 1 is of sensor 'b', the ones before it of 'a'; write one file per sensor",
+        ),
+        ([Measurement(noise()[0].words, SMALL, Stamp(sensor="a/b"))], "sensor name 'a/b' cannot stand in a file"),
+        ([Measurement(noise()[0].words[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
+        (
+            [Measurement(noise()[0].words, SMALL, Stamp(timestamp_uncertainty_ns=2**32))],
+            "timestamp_uncertainty_ns is 4294967296",
+        ),
+        (noise(SMALL.replace(processing=Processing(directions="grid.csv"))), "is the file grid.csv"),
+    ],
+)
+def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
+    with pytest.raises(ArgumentError, match=message):
+        write_recording(tmp_path / "rec.h5", measurements)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (image(range_m=np.linspace(0.5, 5.1, 400)), "another range_m than the first"),
+        (image(azimuth_deg=np.linspace(-80, 80, 37)), "another azimuth_rad than the first"),
+        (image(settings=Settings()), "other settings than the first"),
+    ],
+)
+def test_energyscapes_that_cannot_be_written(tmp_path, other, message):
+    with pytest.raises(ArgumentError, match=message):
+        write_energyscapes(tmp_path / "img.h5", [image(), other])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("there.h5", "there.h5 exists; give another name, or ask to overwrite it"),
+        ("nowhere/rec.h5", "there is no folder"),
+        ("folder", "folder is a folder; give the name of a file"),
+    ],
+)
+def test_places_that_cannot_be_written(tmp_path, name, message):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "there.h5").write_text("mine")
+    with pytest.raises(ArgumentError, match=message):
+        write_recording(tmp_path / name, noise())
+    assert (tmp_path / "there.h5").read_text() == "mine"
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
+    with pytest.raises(ArgumentError, match="exists"), RecordingWriter(tmp_path / "rec.h5") as writer:
+        writer.write(noise(count=1)[0])
+        (tmp_path / "rec.h5").write_text("mine")
+    assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [("rec.h5", "mine")]
+
+
+def test_writer_is_used_in_a_with_statement(tmp_path):
+    with pytest.raises(ArgumentError, match="is not open for writing; use the writer in a with statement"):
+        RecordingWriter(tmp_path / "rec.h5").write(noise()[0])
+
+
+def test_result_does_not_replace_its_recording(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", noise())
+    with open_recording(path) as recording, pytest.raises(ArgumentError, match="is the recording itself"):
+        EnergyscapeWriter(path, recording=recording, overwrite=True)
+
+
+def test_unknown_dtype(tmp_path):
+    with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
+        EnergyscapeWriter(tmp_path / "img.h5", dtype="float64")
+
+
+def test_truth_of_another_shape():
+    with pytest.raises(ArgumentError, match=r"range_m has shape \(2, 2\); give shape \(3, 2\)"):
+        Truth(**{**truth_fields(), "range_m": np.zeros((2, 2))})
+    with pytest.raises(ArgumentError, match=r"azimuth_rad has shape \(3,\); give \(measurement, target\)"):
+        Truth(**{**truth_fields(), "azimuth_rad": np.zeros(3)})
+
+
+def truth_fields():
+    made = truth()
+    return {name: getattr(made, name) for name in made.__slots__}

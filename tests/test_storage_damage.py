@@ -1,0 +1,214 @@
+"""Files that are not what they should be are refused in a line, and a full disk leaves nothing."""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.settings import Recording
+from ertis_numba.storage import (
+    atomic,
+    file_kind,
+    open_energyscapes,
+    open_recording,
+    write_energyscapes,
+    write_recording,
+)
+from tests.files import image, line, noise
+
+GROUP = "sensors/eRTIS-7"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write_recording(tmp_path / "rec.h5", noise())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file or directory; give a recording or an energyscape file"),
+        (b"", "is empty; give a recording"),
+        (b"abc" * 1000, "is not an HDF5 file; give a recording"),
+    ],
+)
+def test_not_a_recording(tmp_path, content, message):
+    path = tmp_path / "file.h5"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        open_recording(path)
+
+
+def test_a_folder(tmp_path):
+    with pytest.raises(DataError, match="is a folder; give"):
+        open_recording(tmp_path)
+
+
+def test_hdf5_of_somebody_else(tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    for read in (open_recording, open_energyscapes, file_kind):
+        with pytest.raises(DataError, match="is HDF5, but not of this package; give a"):
+            read(tmp_path / "other.h5")
+
+
+def test_the_other_kind(path, tmp_path):
+    write_energyscapes(tmp_path / "img.h5", [image()])
+    with pytest.raises(DataError, match="rec.h5 is a recording, wanted an energyscape file; process it first"):
+        open_energyscapes(path)
+    with pytest.raises(DataError, match="img.h5 is an energyscape file, wanted a recording; give the recording"):
+        open_recording(tmp_path / "img.h5")
+
+
+@pytest.mark.parametrize("kept", [0.0001, 0.01, 0.3, 0.9, 0.9999])
+def test_cut_short(path, kept):
+    os.truncate(path, int(kept * path.stat().st_size))
+    with pytest.raises(DataError, match=r"is cut short or damaged, it has \d+ of \d+ bytes|is not an HDF5 file"):
+        open_recording(path)
+
+
+def test_newer_version(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["ertis_format_version"] = 2
+    with pytest.raises(FormatVersionError, match="has format version 2, this package reads up to 1; update"):
+        open_recording(path)
+
+
+def test_one_flipped_bit_in_the_words(path):
+    with h5py.File(path, "r+") as file:
+        file[f"{GROUP}/pdm"][1, 777] ^= 1 << 9
+    with open_recording(path) as recording:
+        assert recording[0].stamp.sequence == 10
+        with pytest.raises(DataError, match="rec.h5: measurement 1 has CRC-32 .* the file is damaged; copy it again"):
+            recording[1]
+
+
+def test_arrays_that_contradict_the_settings(path):
+    for name, place, message in [
+        ("calibration_gain", (3,), "calibration_gain of channel 3 is nan, the settings in the file say 1"),
+        ("calibration_delay", (0,), "calibration_delay of channel 0 is nan"),
+        ("microphone_position", (31, 1), "microphone_position of channel 31 is nan"),
+    ]:
+        with h5py.File(path, "r+") as file:
+            values = file[f"{GROUP}/{name}"]
+            before, values[place] = values[place], np.nan
+        with pytest.raises(DataError, match=message):
+            open_recording(path)
+        with h5py.File(path, "r+") as file:
+            file[f"{GROUP}/{name}"][place] = before
+    open_recording(path).close()
+
+
+def test_settings_that_cannot_be_used(path):
+    with h5py.File(path, "r+") as file:
+        text = file[f"{GROUP}/settings"]
+        text[()] = text[()].decode().replace("duration_s = 0.0025", "duration_s = nan")
+    with pytest.raises(DataError, match=r"rec.h5: settings: call.duration_s is nan; give a finite number"):
+        open_recording(path)
+
+
+def test_missing_variable(path):
+    with h5py.File(path, "r+") as file:
+        del file[f"{GROUP}/crc32"]
+    with pytest.raises(DataError, match="has no 'crc32' for sensor eRTIS-7; copy it again"):
+        open_recording(path)
+
+
+def test_variables_of_other_lengths(path):
+    with h5py.File(path, "r+") as file:
+        file[f"{GROUP}/sequence"].resize((2,))
+    with pytest.raises(DataError, match=r"sequence has shape \(2,\), wanted \(3,\); copy it again"):
+        open_recording(path)
+
+
+def test_no_such_measurement(path):
+    with open_recording(path) as recording:
+        with pytest.raises(IndexError, match="has no measurement 3; it has 3, counted from 0"):
+            recording[3]
+        with pytest.raises(IndexError, match="has no measurement -4"):
+            recording[-4]
+
+
+def test_closed(path):
+    recording = open_recording(path)
+    recording.close()
+    recording.close()
+    with pytest.raises(DataError, match="rec.h5 is closed; open it again"):
+        recording[0]
+
+
+def test_several_sensors(path):
+    with h5py.File(path, "r+") as file:
+        file.copy(GROUP, file["sensors"], name="other")
+    with pytest.raises(ArgumentError, match="holds 2 sensors; choose one of eRTIS-7, other"):
+        open_recording(path)
+    with pytest.raises(ArgumentError, match="has no sensor 'none'; choose one of eRTIS-7, other"):
+        open_recording(path, sensor="none")
+    with open_recording(path, sensor="other") as recording:
+        assert recording[0].stamp.sensor == "other"
+
+
+def test_damaged_bytes_never_pass_as_words(tmp_path):
+    """Whatever byte is hit, reading gives the words that were written or a `DataError`."""
+    small = line(8, 8).replace(recording=Recording(n_samples=512))
+    given = noise(small, 2)
+    whole = write_recording(tmp_path / "rec.h5", given).read_bytes()
+    rng = np.random.default_rng(5)
+    refused = 0
+    for place in rng.integers(0, len(whole), 150):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << rng.integers(0, 8)
+        path = tmp_path / "spoilt.h5"
+        path.write_bytes(spoilt)
+        try:
+            with open_recording(path) as recording:
+                for back, measurement in zip(recording, given, strict=True):
+                    assert np.array_equal(back.words, measurement.words)
+        except DataError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused
+
+
+def test_no_room(tmp_path, monkeypatch):
+    free = shutil.disk_usage(tmp_path).free
+    monkeypatch.setattr(atomic, "_SPARE_BYTES", 2 * free)
+    with pytest.raises(DataError, match=r"MB free, wanted 0.0 MB and \d+ MB to spare; free some space"):
+        write_recording(tmp_path / "rec.h5", noise())
+    assert not list(tmp_path.iterdir())
+
+
+WRITE_UNDER_A_LIMIT = """
+import sys
+import tests.files as files
+from ertis_numba.errors import DataError
+from ertis_numba.storage import write_recording
+
+try:
+    write_recording(sys.argv[1], files.noise(count=30))
+except DataError as error:
+    print(error)
+    raise SystemExit(7)
+"""
+
+
+def test_disk_fails_in_the_middle(tmp_path):
+    """The limit on the size of a file stands for a full disk: writing fails in the same way."""
+    done = subprocess.run(
+        [sys.executable, "-c", WRITE_UNDER_A_LIMIT, tmp_path / "rec.h5"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000)),
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (7, "")
+    assert "rec.h5 cannot be written (File too large); free some space or write elsewhere" in done.stdout
+    assert not list(tmp_path.iterdir())
