@@ -29,7 +29,6 @@ __all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settin
 _WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
 _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
-_SPACING = {"20_80": {"output_decimation": 4, "oversampling": 6}}
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
 
@@ -257,7 +256,9 @@ class Settings(_Section, frozen=True):
         call = Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz)
         recording = Recording(n_samples=_WORDS[length])
         echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
-        processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)), **_SPACING.get(band, {}))
+        processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)))
+        if band == "20_80":
+            processing = processing.replace(output_decimation=4, oversampling=6)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 
     @classmethod

@@ -64,7 +64,7 @@ def _exact(image: Energyscape, measurement: Measurement, chosen: NDArray[np.intp
         spectrum = scipy.fft.rfft(bits, n_fft)[matched.first_bin :][: len(matched.values)]
         beams += np.exp(wave_1_s * delays_s[:, mic, None]) * spectrum
     beams *= matched.values / (n_fft * delays_s.shape[1])
-    return np.abs(beams @ np.exp(wave_1_s[:, None] * (2 * image.range_m / speed_m_s)))
+    return np.asarray(np.abs(beams @ np.exp(wave_1_s[:, None] * (2 * image.range_m / speed_m_s))))
 
 
 def require_same_reflector(image: Energyscape, other: Energyscape) -> None:

@@ -52,7 +52,6 @@ def paper(report: dict[str, Any]) -> str:
     ]
     published = [[name, *(f"{mean:.2f} ± {std:.2f}" for mean, std in times)] for name, times in PUBLISHED_MS.items()]
     columns = [f"{n} directions" for n in DIRECTIONS]
-    worst_db = max(error for errors in report["error_db"].values() for error in errors.values())
     return "\n\n".join(
         [
             _table(
@@ -62,17 +61,30 @@ def paper(report: dict[str, Any]) -> str:
             _table(["times faster than `scipy`, by medians", *columns], ratios),
             _table(["the paper's own, ms, mean ± std", *columns], published),
             f"Measured on {sentence(report['machine'])}",
-            f"{report['count']} measurements each, in one process, the backends in turns of five: "
-            f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
-            f"{report['range_m'][0]:g}–{report['range_m'][1]:g} m. Included: everything from the words in memory to "
-            "the image in memory. Not included: reading the file, making the pipeline, compilation, and three calls "
-            "of each to warm up; images go to one array that is used again. `scipy` runs on one thread, as its "
-            "filters and sums do anyhow, and over the whole record, as the paper does; the others compute the part "
-            "of the record that the image needs, and transform and, for `cpu`, beamform on all cores.",
-            "Results were checked first: `numpy` and `cpu` differ from the exact image (float64, fractional delays) by "
-            f"{worst_db:.1f} dB at most, and `scipy` shows the same strongest reflector. The paper does not state the "
-            "length of its records.",
+            _conditions(report),
+            _checked(report),
         ]
+    )
+
+
+def _checked(report: dict[str, Any]) -> str:
+    worst_db = max(error_db for errors_db in report["error_db"].values() for error_db in errors_db.values())
+    return (
+        "Results were checked before they were timed: `numpy` and `cpu` differ from the exact image (float64, fractional "
+        f"delays) by at most {worst_db:.1f} dB, and `scipy` shows the same strongest reflector."
+    )
+
+
+def _conditions(report: dict[str, Any]) -> str:
+    first_m, last_m = report["range_m"]
+    return (
+        f"{report['count']} measurements each, in one process, the backends in turns of five: {report['words']:,} words "
+        f"of 32 microphones ({report['source']}) to an energyscape of {first_m:g}–{last_m:g} m. Included: everything from "
+        "the words in memory to the image in memory. Not included: reading the file, making the pipeline, compilation, "
+        "and three calls of each to warm up; images go to one array that is used again. `scipy` runs on one thread, as "
+        "its filters and sums do anyhow, and over the whole record, as the paper does; the others compute the part of "
+        "the record that the image needs, with transforms on all cores and, for `cpu`, everything on all cores. The "
+        "paper does not state the length of its records."
     )
 
 
@@ -87,23 +99,25 @@ def scaling(report: dict[str, Any]) -> str:
         [f"{row['threads']}", f"{row['copy_gb_s']}", f"{row['triad_gb_s']}", f"{row['multiply_add_gflop_s']}"]
         for row in report["ceilings"]
     ]
-    parts.append(_table(["threads", "copy, GB/s", "triad, GB/s", "float32 multiply-add, GFLOP/s"], ceilings))
-    reached = report["delay_and_sum"]
+    parts += [_table(["threads", "copy, GB/s", "triad, GB/s", "float32 multiply-add, GFLOP/s"], ceilings)]
+    parts += [_reached(report["delay_and_sum"])]
     parts.append(
-        f"Delay-and-sum with envelope takes {reached['us_per_direction']:.2f} µs per direction (the slope over "
-        f"directions; the rest of the chain takes {reached['rest_of_chain_ms']:.2f} ms): {reached['points_per_s']:.3g} "
-        f"complex multiply-adds per second, {reached['gflop_s']:.0f} GFLOP/s or {100 * reached['of_multiply_add']:.0f} % "
-        f"of what float32 multiply-adds can do here. It writes {reached['written_gb_s']:.2f} GB/s, "
-        f"{100 * reached['of_copy']:.0f} % of what a copy moves in both directions, so arithmetic and caches bind it, "
-        "not memory."
-    )
-    parts.append(
-        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white noise; "
-        "what is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
-        "against the exact one before it was timed; three calls to warm up are not counted. Ceilings are the best of as "
-        "many runs, over arrays of 64 MiB and in registers."
+        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white noise. "
+        "What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
+        "against the exact one before it was timed; three calls to warm up are not counted. Ceilings are the best of "
+        "as many runs, over arrays of 64 MiB and in registers."
     )
     return "\n\n".join(parts)
+
+
+def _reached(reached: dict[str, float]) -> str:
+    return (
+        f"Delay-and-sum with envelope takes {reached['us_per_direction']:.2f} µs per direction (the slope over "
+        f"directions; the rest of the chain takes {reached['rest_of_chain_ms']:.2f} ms): {reached['points_per_s']:.3g} "
+        f"complex multiply-adds per second. That is {reached['gflop_s']:.0f} GFLOP/s, "
+        f"{100 * reached['of_multiply_add']:.0f} % of what float32 multiply-adds alone do here. Its images are written "
+        f"at {reached['written_gb_s']:.2f} GB/s, {100 * reached['of_copy']:.0f} % of what a copy writes."
+    )
 
 
 def _spread(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:

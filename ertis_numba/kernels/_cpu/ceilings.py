@@ -1,3 +1,4 @@
+# mypy: ignore-errors  what Numba compiles has no annotations
 """What this machine can do at most: memory bandwidth and arithmetic, measured by kernels that do nothing else.
 
 Only benchmarks use these; they are no part of the signal chain.
