@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test check data bench clean
+.PHONY: demo test check data pictures bench clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -27,6 +27,9 @@ check: $(VENV)/ready
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes
 	$(BIN)/python data/synthetic/build.py
+
+pictures: $(VENV)/ready  ## redraw the pictures of the README
+	$(BIN)/python docs/pictures/build.py
 
 bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench paper --update bench/README.md

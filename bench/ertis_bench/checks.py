@@ -18,6 +18,7 @@ MAX_ERROR_DB = -30.0
 _DIRECTIONS = 5  # checked against the exact image, spread over the grid
 _NEAR_RAD = math.radians(5)
 _NEAR_M = 0.01
+_SAME_LEVEL_DB = 1.5
 
 
 def require_exact(image: Energyscape, measurement: Measurement) -> float:
@@ -68,23 +69,23 @@ def _exact(image: Energyscape, measurement: Measurement, chosen: NDArray[np.intp
 
 
 def require_same_reflector(image: Energyscape, other: Energyscape) -> None:
-    """Refuse two images whose strongest reflectors differ by more than 5 degrees or a centimetre.
+    """Refuse two images unless the strongest place of one is among the strongest of the other, near by.
+
+    Methods sample pulses differently, so two reflectors of nearly one level may change places.
 
     Raises
     ------
     DataError
-        They differ.
+        The other image is weak there.
     """
-    (here, here_m), (there, there_m) = _strongest(image), _strongest(other)
-    apart_rad = math.acos(min(1.0, float(here @ there)))
-    if apart_rad > _NEAR_RAD or abs(here_m - there_m) > _NEAR_M:
-        raise DataError(
-            f"strongest reflectors of two images are {math.degrees(apart_rad):.1f}° and {abs(here_m - there_m):.3f} m "
-            "apart; wanted the same one: the times would be those of a wrong result"
-        )
-
-
-def _strongest(image: Energyscape) -> tuple[NDArray[np.float64], float]:
     direction, distance = np.unravel_index(np.argmax(image.energy), image.energy.shape)
-    vector = unit_vectors(image.azimuth_rad[direction], image.elevation_rad[direction])
-    return vector, float(image.range_m[distance])
+    vectors = unit_vectors(other.azimuth_rad, other.elevation_rad)
+    there = unit_vectors(image.azimuth_rad[direction], image.elevation_rad[direction])
+    near = np.ix_(vectors @ there > math.cos(_NEAR_RAD), np.abs(other.range_m - image.range_m[distance]) < _NEAR_M)
+    ratio = float(np.max(other.energy[near], initial=0.0) / np.max(other.energy))
+    level_db = 20 * math.log10(ratio) if ratio else -math.inf
+    if not level_db >= -_SAME_LEVEL_DB:
+        raise DataError(
+            f"strongest reflector of one image, at {image.range_m[distance]:.3f} m, has {level_db:.1f} dB in another; "
+            f"wanted at least {-_SAME_LEVEL_DB:g} dB: the times would be those of a wrong result"
+        )

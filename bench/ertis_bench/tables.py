@@ -70,21 +70,21 @@ def paper(report: dict[str, Any]) -> str:
 def _checked(report: dict[str, Any]) -> str:
     worst_db = max(error_db for errors_db in report["error_db"].values() for error_db in errors_db.values())
     return (
-        "Results were checked before they were timed: `numpy` and `cpu` differ from the exact image (float64, fractional "
-        f"delays) by at most {worst_db:.1f} dB, and `scipy` shows the same strongest reflector."
+        "Results were checked before they were timed: `numpy` and `cpu` differ from the exact image (float64, "
+        f"fractional delays) by at most {worst_db:.1f} dB, and `scipy` shows the strongest reflector at the same place."
     )
 
 
 def _conditions(report: dict[str, Any]) -> str:
     first_m, last_m = report["range_m"]
     return (
-        f"{report['count']} measurements each, in one process, the backends in turns of five: {report['words']:,} words "
-        f"of 32 microphones ({report['source']}) to an energyscape of {first_m:g}–{last_m:g} m. Included: everything from "
-        "the words in memory to the image in memory. Not included: reading the file, making the pipeline, compilation, "
-        "and three calls of each to warm up; images go to one array that is used again. `scipy` runs on one thread, as "
-        "its filters and sums do anyhow, and over the whole record, as the paper does; the others compute the part of "
-        "the record that the image needs, with transforms on all cores and, for `cpu`, everything on all cores. The "
-        "paper does not state the length of its records."
+        f"{report['count']} measurements each, in one process, the backends in turns of five: {report['words']:,} "
+        f"words of 32 microphones ({report['source']}) to an energyscape of {first_m:g}–{last_m:g} m. Included: "
+        "everything from the words in memory to the image in memory. Not included: reading the file, making the "
+        "pipeline, compilation, and three calls of each to warm up; images go to one array that is used again. "
+        "`scipy` runs on one thread, as its filters and sums do anyhow, and over the whole record, as the paper does; "
+        "`numpy` and `cpu` compute the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
+        "The paper does not state the length of its records."
     )
 
 
@@ -102,8 +102,8 @@ def scaling(report: dict[str, Any]) -> str:
     parts += [_table(["threads", "copy, GB/s", "triad, GB/s", "float32 multiply-add, GFLOP/s"], ceilings)]
     parts += [_reached(report["delay_and_sum"])]
     parts.append(
-        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white noise. "
-        "What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
+        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white "
+        "noise. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
         "against the exact one before it was timed; three calls to warm up are not counted. Ceilings are the best of "
         "as many runs, over arrays of 64 MiB and in registers."
     )

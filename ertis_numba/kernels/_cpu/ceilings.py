@@ -1,4 +1,5 @@
-# mypy: ignore-errors  what Numba compiles has no annotations
+# What Numba compiles has no annotations.
+# mypy: ignore-errors
 """What this machine can do at most: memory bandwidth and arithmetic, measured by kernels that do nothing else.
 
 Only benchmarks use these; they are no part of the signal chain.
