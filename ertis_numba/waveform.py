@@ -18,6 +18,7 @@ __all__ = [
     "matched_band_hz",
     "matched_filter",
     "matched_guard_s",
+    "whole_taps",
 ]
 
 _TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
@@ -142,6 +143,17 @@ def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.f
     position = np.arange(-half, half + 1)
     taps = np.sinc(position / decimation) * np.kaiser(2 * half + 1, beta)
     return np.asarray(taps / taps.sum())
+
+
+def whole_taps(taps: NDArray[np.float64]) -> NDArray[np.int16]:
+    """Return a filter in whole numbers whose magnitudes add up to 32767 at most: (tap,) int16.
+
+    It is a filter of its own rather than an approximation at every sum: rounding the taps lifts the
+    stop band to about -80 dB, and everything after is exact.
+    """
+    limit = np.iinfo(np.int16).max
+    scale = (limit - len(taps) / 2) / np.abs(taps).sum()  # rounding adds up to a half a tap
+    return np.asarray(np.rint(taps * scale), dtype=np.int16)
 
 
 def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -142,16 +142,25 @@ def test_remove_group_delay(kernel_set, n_samples, delay, n_out):
 )
 def test_demodulate_words_is_unpack_decimate_and_group_delay(kernel_set, name, factor, first, n_outputs, n_out):
     words, channels = words_of(name)
-    taps = taps_of(61)
+    taps = np.rint(32_000 * taps_of(61)).astype(np.int16)
     out = filled(len(channels), n_out)
-    kernel_set.demodulate_words(words, channels, taps, factor, first, n_outputs, out)
+    kernel_set.demodulate_words(words, channels, taps, np.float32(0.25), factor, first, n_outputs, out)
     signals = reference.unpack_bits(words, channels)
     filtered = np.stack([np.convolve(signal, taps.astype(float)) for signal in signals])
     places = (first + np.arange(n_outputs)) * factor + len(taps) // 2
     inside = (places >= 0) & (places < filtered.shape[1])
     expected = np.zeros((len(channels), n_out))
-    expected[:, :n_outputs][:, inside] = filtered[:, places[inside]]
-    assert out == pytest.approx(expected, abs=FLOAT32)
+    expected[:, :n_outputs][:, inside] = 0.25 * filtered[:, places[inside]]
+    assert (out == expected).all()  # sums of integers: not a bit less
+
+
+@pytest.mark.parametrize("word", [0, 0xFFFF_FFFF])
+def test_demodulate_words_bears_taps_at_the_limit(kernel_set, word):
+    taps = np.array([-1_000, 3_000, 24_767, 3_000, -1_000], dtype=np.int16)
+    out = filled(32, 64)
+    words = np.full((128, 1), word, dtype=np.uint32)
+    kernel_set.demodulate_words(words, np.arange(32, dtype=np.int32), taps, np.float32(1), 1, 10, 64, out)
+    assert (out == (28_767 if word else -28_767)).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 17), (32, 1009)])
@@ -270,6 +279,8 @@ def test_results_do_not_depend_on_the_number_of_threads():
         with cpu.threads(count):
             energy, demodulated = filled(*shape), filled(len(channels), 300)
             cpu.delay_and_sum_envelope(signals, offsets, weights, energy)
-            cpu.demodulate_words(words, channels, taps_of(61), 10, 20, 300, demodulated)
+            cpu.demodulate_words(
+                words, channels, np.arange(-30, 31, dtype=np.int16), np.float32(1), 10, 20, 300, demodulated
+            )
         results.append(energy.tobytes() + demodulated.tobytes())
     assert len(set(results)) == 1

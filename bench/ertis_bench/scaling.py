@@ -13,7 +13,7 @@ from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["FLOPS_PER_POINT", "SERIES", "run"]
+__all__ = ["FLOPS_PER_POINT", "SERIES", "reached", "run"]
 
 FLOPS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone
 _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
@@ -63,7 +63,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         "rows": rows,
         "count": count,
         "ceilings": ceilings_found,
-        "delay_and_sum": _reached(rows, ceilings_found[-1]),
+        "delay_and_sum": reached(rows, ceilings_found[-1]),
     }
 
 
@@ -116,11 +116,18 @@ def _ceilings(n_threads: int, count: int) -> dict[str, float]:
     }
 
 
-def _reached(rows: list[dict[str, Any]], ceiling: dict[str, float]) -> dict[str, float]:
+def reached(rows: list[dict[str, Any]], ceiling: dict[str, float]) -> dict[str, float]:
     """Return what delay-and-sum with envelope reaches of the ceilings.
 
     Its time per direction is the slope of a line through the times over directions; what does not
     depend on directions, the line's start, is the rest of the chain.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Those of the series ``directions`` are used.
+    ceiling : dict
+        What the machine does on as many threads.
     """
     points = [row for row in rows if row["series"] == "directions"]
     directions = np.array([row["value"] for row in points])

@@ -8,7 +8,7 @@ from ertis_bench.machine import sentence
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["paper", "scaling", "update"]
+__all__ = ["around", "paper", "scaling", "update"]
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
@@ -25,6 +25,18 @@ def update(path: Path, name: str, text: str) -> None:
     ArgumentError
         The file cannot be read, or the markers are not in it.
     """
+    head, tail = around(path, name)
+    path.write_text(f"{head}\n{text.strip()}\n{tail}", encoding="utf-8")
+
+
+def around(path: Path, name: str) -> tuple[str, str]:
+    """Return a file's text up to the end of the first marker, and from the second marker on.
+
+    Raises
+    ------
+    ArgumentError
+        As in `update`; so a file can be refused before anything is measured for it.
+    """
     begin, end = f"<!-- ertis bench {name} -->", f"<!-- /ertis bench {name} -->"
     try:
         content = path.read_text("utf-8")
@@ -34,7 +46,7 @@ def update(path: Path, name: str, text: str) -> None:
     _, closed, tail = rest.partition(end)
     if not (found and closed):
         raise ArgumentError(f"{path} has no place for this table; give a file with the lines {begin} and {end}")
-    path.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}", encoding="utf-8")
+    return head + begin, end + tail
 
 
 def paper(report: dict[str, Any]) -> str:
@@ -101,11 +113,12 @@ def scaling(report: dict[str, Any]) -> str:
     ]
     parts += [_table(["threads", "copy, GB/s", "triad, GB/s", "float32 multiply-add, GFLOP/s"], ceilings)]
     parts += [_reached(report["delay_and_sum"])]
+    parts += [f"Measured on {sentence(report['machine'])}"]
     parts.append(
-        f"Measured on {sentence(report['machine'])} {report['count']} measurements per line, device `cpu`, white "
-        "noise. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. Every image was checked "
-        "against the exact one before it was timed; three calls to warm up are not counted. Ceilings are the best of "
-        "as many runs, over arrays of 64 MiB and in registers."
+        f"{report['count']} measurements per line, device `cpu`, white noise. What is not varied stays at 1850 "
+        "directions, 0.5–5 m, 32 microphones, all threads. Every image was checked against the exact one before it was "
+        "timed; three calls to warm up are not counted. Ceilings are the best of as many runs, over arrays of 64 MiB "
+        "and in registers."
     )
     return "\n\n".join(parts)
 

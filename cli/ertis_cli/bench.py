@@ -68,6 +68,8 @@ def scaling(**given: Any) -> None:
 def _run(name: str, benchmark: ModuleType, *, count: int, target: Path | None, quiet: bool, as_json: bool) -> None:
     from ertis_bench import tables
 
+    if target is not None:
+        tables.around(target, name)  # refused now rather than after minutes
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
     table: str = getattr(tables, name)(report)
     if target is not None:

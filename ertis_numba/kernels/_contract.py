@@ -71,21 +71,31 @@ class RemoveGroupDelay(Protocol):
 class DemodulateWords(Protocol):
     """Unpack, decimate and remove the group delay in one pass over the words.
 
-    ``out[mic, n] = Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]`` with x = ±1
-    from the bits, 0 outside the record. Samples of ``out`` past ``n_outputs`` are set to 0.
+    ``out[mic, n] = scale · Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]`` with x = ±1
+    from the bits, 0 outside the record. Samples of ``out`` past ``n_outputs`` are set to 0. The sum is one of
+    integers, so every device gives the same bits.
 
     Parameters
     ----------
     words, channels
         As in `UnpackBits`.
-    taps : (tap,) float32
-        Symmetric, an odd number.
+    taps : (tap,) int16
+        Symmetric, an odd number; their magnitudes add up to 32767 at most.
+    scale : float32
     factor, first, n_outputs : int
     out : (mic, sample) float32
     """
 
     def __call__(
-        self, words: Words, channels: Index, taps: Real, factor: int, first: int, n_outputs: int, out: Real
+        self,
+        words: Words,
+        channels: Index,
+        taps: Short,
+        scale: np.float32,
+        factor: int,
+        first: int,
+        n_outputs: int,
+        out: Real,
     ) -> None: ...
 
 

@@ -43,7 +43,14 @@ def remove_group_delay(signals: Real, delay: int, out: Real) -> None:
 
 
 def demodulate_words(
-    words: Words, channels: Index, taps: Real, factor: int, first: int, n_outputs: int, out: Real
+    words: Words,
+    channels: Index,
+    taps: Short,
+    scale: np.float32,
+    factor: int,
+    first: int,
+    n_outputs: int,
+    out: Real,
 ) -> None:
     """See `DemodulateWords`."""
     half = len(taps) // 2
@@ -51,7 +58,9 @@ def demodulate_words(
     stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
     signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
     unpack_bits(words[start : start + signals.shape[1]], channels, signals)
-    out[:, :n_outputs] = _filtered(signals, taps, factor, first * factor - half - start, n_outputs)
+    # Sums of whole numbers below 2^24 are exact in float32, in whatever order.
+    out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, first * factor - half - start, n_outputs)
+    out *= scale
     out[:, n_outputs:] = 0
 
 

@@ -29,10 +29,11 @@ class Demodulate:
         window: TimeWindow,
         kernels: KernelSet,
         *,
-        taps: NDArray[np.float64],
+        taps: NDArray[np.int16],
     ) -> None:
         self._kernel = kernels.demodulate_words
-        self._taps = taps.astype(np.float32)
+        self._taps = taps
+        self._scale = np.float32(1 / taps.sum(dtype=np.int64))
         self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
         self._factor = settings.processing.decimation
         self._window = window
@@ -41,4 +42,6 @@ class Demodulate:
     def __call__(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word)."""
         window = self._window
-        self._kernel(words, self._channels, self._taps, self._factor, window.first_sample, window.n_samples, out)
+        self._kernel(
+            words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
+        )

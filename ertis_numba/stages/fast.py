@@ -15,7 +15,7 @@ from ertis_numba.stages.beamform import Beamform, DelayTable, beamform
 from ertis_numba.stages.demodulate import Demodulate
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.window import time_window
-from ertis_numba.waveform import decimation_taps, matched_band_hz
+from ertis_numba.waveform import decimation_taps, matched_band_hz, whole_taps
 
 __all__ = ["FastChain"]
 
@@ -43,10 +43,12 @@ class FastChain:
             unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
             sound_speed_m_s=sound_speed_m_s(settings.air),
         )
-        taps = decimation_taps(
-            pdm_rate_hz=settings.recording.pdm_rate_hz,
-            decimation=settings.processing.decimation,
-            pass_hz=matched_band_hz(settings.call)[1],
+        taps = whole_taps(
+            decimation_taps(
+                pdm_rate_hz=settings.recording.pdm_rate_hz,
+                decimation=settings.processing.decimation,
+                pass_hz=matched_band_hz(settings.call)[1],
+            )
         )
         window = time_window(settings, largest_delay_s=float(np.max(np.abs(delays_s))), n_taps=len(taps))
         self.range_m = window.range_m

@@ -37,14 +37,16 @@ class MatchedFilter:
         kernels: KernelSet,
         transforms: Transforms,
         *,
-        taps: NDArray[np.float64],
+        taps: NDArray[np.int16],
         n_mics: int,
     ) -> None:
         rate_hz = settings.signal_rate_hz
         matched = matched_filter(settings.call, n_fft=window.n_fft, rate_hz=rate_hz)
         n_phases = settings.processing.oversampling
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
-        flat = matched.values / filter_response(taps, frequency_hz / settings.recording.pdm_rate_hz)
+        flat = matched.values / filter_response(
+            taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.pdm_rate_hz
+        )
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
         # The inverse transform divides by its own length instead of the forward one's.

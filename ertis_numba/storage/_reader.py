@@ -14,7 +14,7 @@ import h5py
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError, SettingsError
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.schema import FORMAT_VERSION, Variable
+from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
 
 __all__ = ["Reader", "file_kind"]
 
@@ -67,6 +67,8 @@ class Reader(ABC, Generic[Item]):
                 self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
                 self.settings = Settings.from_toml(self._group["settings"][()].decode(), f"{self.path}: settings")
                 self._require_shapes()
+                self._load()
+                self._require_content()
         except BaseException:
             self._file.close()
             raise
@@ -74,6 +76,10 @@ class Reader(ABC, Generic[Item]):
     @abstractmethod
     def _item(self, index: int) -> Item:
         """Return one row as what flows."""
+
+    @abstractmethod
+    def _load(self) -> None:
+        """Read what one kind of file has beyond its rows."""
 
     @abstractmethod
     def _sizes(self) -> dict[str, int]:
@@ -154,6 +160,15 @@ class Reader(ABC, Generic[Item]):
             shape = self._group[variable.name].shape
             if len(wanted) == len(shape) and shape != wanted:
                 raise DataError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
+
+    def _require_content(self) -> None:
+        wanted = _plain(self._group.attrs["content_sha256"])
+        got = content_sha256(self._group, self._table)
+        if got != wanted:
+            raise DataError(
+                f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, its record says "
+                f"{str(wanted)[:8]}…: the file is damaged; copy it again"
+            )
 
 
 def _open(path: Path) -> h5py.File:

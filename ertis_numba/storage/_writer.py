@@ -1,6 +1,5 @@
 """What the writers of both kinds of file share: a part file, rows, and reading back."""
 
-import hashlib
 import os
 import re
 import uuid
@@ -24,6 +23,8 @@ from ertis_numba.storage.atomic import check_target, replacing, require_room
 from ertis_numba.storage.schema import (
     CONVENTIONS,
     FORMAT_VERSION,
+    Variable,
+    content_sha256,
     date_created,
     sensor_path,
     software_versions,
@@ -39,6 +40,7 @@ class Writer(ABC, Generic[Item]):
 
     _kind: ClassVar[str]
     _data: ClassVar[str]
+    _table: ClassVar[tuple[Variable, ...]]
 
     def __init__(self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str]) -> None:
         self.path = Path(path)
@@ -48,7 +50,6 @@ class Writer(ABC, Generic[Item]):
         self._file: h5py.File | None = None
         self._rows: RowWriter | None = None
         self._sensor = ""
-        self._content = hashlib.sha256()
         check_target(self.path, overwrite=overwrite)
 
     @abstractmethod
@@ -58,6 +59,9 @@ class Writer(ABC, Generic[Item]):
     @abstractmethod
     def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
         """Return the array of an item and what it adds to the columns; refuse what does not fit."""
+
+    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        """Write what is known at the end only."""
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -83,7 +87,6 @@ class Writer(ABC, Generic[Item]):
                 self._sensor = item.stamp.sensor
                 group = self._file.create_group(sensor_path(self._sensor), track_order=True)
                 self._begin(group, item)
-                self._content.update(group["settings"][()])
                 self._rows = RowWriter(group, self._data)
             if item.stamp.sensor != self._sensor:
                 raise ArgumentError(
@@ -92,7 +95,6 @@ class Writer(ABC, Generic[Item]):
                 )
             row, columns = self._row(item)
             self._rows.append(row, item.stamp, **columns)
-            self._content.update(repr((item.stamp, self._rows.check, columns)).encode())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -105,7 +107,8 @@ class Writer(ABC, Generic[Item]):
         """Yield the part file; complete, close and compare it when the block ends well."""
         require_room(self.path.parent, 0)
         with self._naming_file():
-            file = h5py.File(self._part, "w", track_order=True)
+            # The newer layout has a checksum in every table, so that a damaged one is noticed.
+            file = h5py.File(self._part, "w", track_order=True, libver=("v110", "v110"))
         try:
             yield file
             with self._naming_file():
@@ -124,6 +127,10 @@ class Writer(ABC, Generic[Item]):
         if self._rows is None:
             raise ArgumentError(f"{self.path} would hold no measurement; give at least one")
         self._rows.flush()
+        group = file[sensor_path(self._sensor)]
+        self._complete(group, self._rows)
+        content = content_sha256(group, self._table)
+        group.attrs["content_sha256"] = content
         file.attrs.update(
             {
                 "Conventions": CONVENTIONS,
@@ -131,7 +138,7 @@ class Writer(ABC, Generic[Item]):
                 "ertis_format_version": FORMAT_VERSION,
                 "date_created": date_created(),
                 # Version 8: the content makes the identity, so the same content is recognised.
-                "uuid": str(uuid.UUID(bytes=_as_version_8(self._content.digest()[:16]))),
+                "uuid": str(uuid.UUID(bytes=_as_version_8(bytes.fromhex(content)[:16]))),
                 **self._attributes,
                 **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
             }

@@ -37,6 +37,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
 
     _kind: ClassVar[str] = "energyscape"
     _data: ClassVar[str] = "energy"
+    _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
 
     def __init__(
         self,
@@ -98,11 +99,16 @@ class EnergyscapeReader(Reader[Energyscape]):
     _data: ClassVar[str] = "energy"
     _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
 
+    azimuth_rad: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+
+    def _load(self) -> None:
+        for name, field in _AXES.items():
+            setattr(self, field, np.asarray(self._group[name][:]))
+
     def _sizes(self) -> dict[str, int]:
-        self.azimuth_rad = np.asarray(self._group["azimuth"][:])
-        self.elevation_rad = np.asarray(self._group["elevation"][:])
-        self.range_m = np.asarray(self._group["range"][:])
-        return {"direction": len(self.azimuth_rad), "range": len(self.range_m)}
+        return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"])}
 
     def _item(self, index: int) -> Energyscape:
         return Energyscape(

@@ -52,6 +52,7 @@ class RecordingWriter(Writer[Measurement]):
 
     _kind: ClassVar[str] = "recording"
     _data: ClassVar[str] = "pdm"
+    _table: ClassVar[tuple[Variable, ...]] = RECORDING
 
     def __init__(
         self,
@@ -112,9 +113,7 @@ class RecordingWriter(Writer[Measurement]):
                 raise ArgumentError(f"a measurement has other {name} settings than the recording; write it to its own")
         self._checked = settings
 
-    def _finish(self, file: h5py.File) -> RowWriter:
-        rows = super()._finish(file)
-        group = file["sensors"][self._sensor]
+    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         values: dict[str, list[Any]] = {
             "gap": [0.0] * len(rows.gaps),
             "gap_first": [first for first, _ in rows.gaps],
@@ -125,7 +124,6 @@ class RecordingWriter(Writer[Measurement]):
             group[name].resize((len(rows.gaps),))
             if len(column):
                 group[name][:] = column
-        return rows
 
 
 def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
@@ -164,21 +162,16 @@ class RecordingReader(Reader[Measurement]):
     _data: ClassVar[str] = "pdm"
     _table: ClassVar[tuple[Variable, ...]] = RECORDING
 
-    def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
-        super().__init__(path, sensor=sensor)
-        try:
-            with self._reading():
-                self._require_agreement()
-                self.gaps = tuple(
-                    Gap(int(first), int(last), reason.decode())
-                    for first, last, reason in zip(
-                        *(self._group[f"gap_{name}"][:] for name in ("first", "last", "reason")), strict=True
-                    )
-                )
-                self.truth = read_truth(self._file)
-        except BaseException:
-            self.close()
-            raise
+    gaps: tuple[Gap, ...]
+    truth: Truth | None
+
+    def _load(self) -> None:
+        self._require_agreement()
+        columns = (self._group[f"gap_{name}"][:] for name in ("first", "last", "reason"))
+        self.gaps = tuple(
+            Gap(int(first), int(last), reason.decode()) for first, last, reason in zip(*columns, strict=True)
+        )
+        self.truth = read_truth(self._file)
 
     def _item(self, index: int) -> Measurement:
         air = Air(**{field: self._rows.column(name, index) for name, field in _AIR.items()})

@@ -4,6 +4,7 @@ Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so th
 and MATLAB show the same names. One group ``/sensors/<name>`` holds one sensor.
 """
 
+import hashlib
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -26,6 +27,7 @@ __all__ = [
     "STAMPS",
     "TRUTH",
     "Variable",
+    "content_sha256",
     "date_created",
     "lay_out",
     "sensor_path",
@@ -163,6 +165,22 @@ def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Datase
     scale = group.create_dataset(dim, shape, np.dtype(">f4"), **growing)
     scale.make_scale(f"This is a netCDF dimension but not a netCDF variable. {size:10d}")
     return scale
+
+
+def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
+    """Return the SHA-256 over the variables of a sensor, in hexadecimal.
+
+    Of those with one array per measurement, only the CRC-32 of each row goes in. So all of a file can
+    be checked, in parts, without reading all of it first.
+    """
+    digest = hashlib.sha256()
+    for variable in table:
+        if variable.dtype:
+            values = np.asarray(group[variable.name][()])
+            text = variable.dtype == "str"
+            digest.update(variable.name.encode())
+            digest.update(b"\0".join(values.ravel().tolist()) if text else values.tobytes())
+    return digest.hexdigest()
 
 
 def sensor_path(name: str) -> str:

@@ -2,9 +2,9 @@
 
 A word is a ready-made mask: bit m says whether microphone m takes a tap or not. So one tap of all
 microphones of a word is one masked vector addition, ``sums += bits(word) ? tap : 0``, and since
-``x = 2 · bit − 1``, twice that sum less the sum of the taps is the filtered signal. Against a table of
-the filter's response to 10 bits at a time, this is about four times faster with AVX-512 (whose mask
-registers take the word as it is) and about as fast with AVX2.
+``x = 2 · bit − 1``, twice that sum less the sum of the taps is the filtered signal. Taps of 16 bits put 32
+microphones into one vector of AVX-512, whose mask registers take the word as it is. Against a table of
+the filter's response to 10 bits at a time this is about five times faster.
 """
 
 import numpy as np
@@ -37,11 +37,11 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
         tile_array = context.make_array(signature.args[4])(context, builder, tile_value)
         n_words = cgutils.unpack_tuple(builder, words_array.shape)[1]
         n_taps = cgutils.unpack_tuple(builder, taps_array.shape)[0]
-        vector = ir.VectorType(ir.FloatType(), lanes)
+        vector = ir.VectorType(ir.IntType(16), lanes)
         mask = ir.VectorType(ir.IntType(1), lanes)
         lane_0 = ir.Constant(ir.IntType(32), 0)
         all_lanes_0 = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
-        zero = ir.Constant(vector, [0.0] * lanes)
+        zero = ir.Constant(vector, [0] * lanes)
         blank = ir.Constant(vector, ir.Undefined)
 
         sums = [cgutils.alloca_once(builder, vector) for _ in range(_GROUP)]
@@ -55,11 +55,11 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
             for start, total in zip(starts, sums, strict=True):
                 word = builder.load(builder.gep(words_array.data, [builder.add(start, ahead)]))
                 chosen = builder.select(builder.bitcast(word, mask), tap, zero)
-                builder.store(builder.fadd(builder.load(total), chosen), total)
+                builder.store(builder.add(builder.load(total), chosen), total)
         for g, total in enumerate(sums):
             place = builder.mul(builder.add(row, ir.Constant(row.type, g)), ir.Constant(row.type, lanes))
             target = builder.bitcast(builder.gep(tile_array.data, [place]), vector.as_pointer())
-            builder.store(builder.load(total), target).align = 4
+            builder.store(builder.load(total), target).align = 2
         return context.get_dummy_value()
 
     return signature, codegen
@@ -76,38 +76,38 @@ def _tap_sum_at_edge(words, word, shift, taps, first):
 
 
 @njit(nogil=True, cache=True)
-def _turn_tile(tile, word, channels, tap_total, begin, end, out):
+def _turn_tile(tile, word, channels, tap_total, scale, begin, end, out):
     """Write the sums of one word's channels, from ``tile`` (sample, bit) to ``out`` (mic, sample)."""
     word_bits = tile.shape[1]
     for mic in range(channels.size):
         if channels[mic] // word_bits == word:
             bit = channels[mic] % word_bits
             for n in range(begin, end):
-                out[mic, n] = np.float32(2) * tile[n - begin, bit] - tap_total
+                out[mic, n] = np.float32(2 * np.int32(tile[n - begin, bit]) - tap_total) * scale
 
 
 @njit(nogil=True, cache=True)
-def _filter_at_edge(words, channels, taps, factor, first, begin, end, out):
+def _filter_at_edge(words, channels, taps, scale, factor, first, begin, end, out):
     """Fill samples ``begin … end`` of all microphones where taps reach over an end of the record, where x is 0."""
     word_bits = words.itemsize * 8
     for mic in range(channels.size):
         word, bit = channels[mic] // word_bits, np.uint64(channels[mic] % word_bits)
         for n in range(begin, end):
             start = (first + n) * factor - taps.size // 2
-            total = np.float32(0)
+            total = np.int32(0)
             for tap in range(max(0, -start), min(taps.size, words.shape[0] - start)):
                 sign = 2 * (np.int64(words[start + tap, word] >> bit) & 1) - 1
-                total += taps[tap] * np.float32(sign)
-            out[mic, n] = total
+                total += np.int32(taps[tap] * sign)
+            out[mic, n] = np.float32(total) * scale
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def demodulate_words(words, channels, taps, factor, first, n_outputs, out):
+def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out):
     """See `DemodulateWords`."""
     n_samples, n_words = words.shape
-    tap_total = np.float32(0)
+    tap_total = np.int32(0)
     for tap in range(taps.size):
-        tap_total += taps[tap]
+        tap_total += np.int32(taps[tap])
     for block in prange((out.shape[1] + _TILE - 1) // _TILE):
         begin = block * _TILE
         end = max(begin, min(begin + _TILE, n_outputs))
@@ -115,12 +115,12 @@ def demodulate_words(words, channels, taps, factor, first, n_outputs, out):
         if begin == end:
             pass
         elif start < 0 or start + (_TILE - 1) * factor + taps.size > n_samples:
-            _filter_at_edge(words, channels, taps, factor, first, begin, end, out)
+            _filter_at_edge(words, channels, taps, scale, factor, first, begin, end, out)
         else:
-            tile = np.empty((_TILE, words.itemsize * 8), np.float32)
+            tile = np.empty((_TILE, words.itemsize * 8), np.int16)
             for word in range(n_words):
                 for row in range(0, _TILE, _GROUP):
                     at = (start + row * factor) * n_words + word
                     _sum_masked_taps(words, at, factor * n_words, taps, tile, row)
-                _turn_tile(tile, word, channels, tap_total, begin, end, out)
+                _turn_tile(tile, word, channels, tap_total, scale, begin, end, out)
         out[:, end : min(begin + _TILE, out.shape[1])] = np.float32(0)

@@ -1,0 +1,170 @@
+"""The benchmarks measure what they say, refuse wrong results, and write their tables where they belong."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_bench import checks, machine, paper, scaling, subject, tables, timing
+from ertis_cli.main import cli
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.kernels._cpu import ceilings
+from ertis_numba.pipeline import Pipeline
+from tests.cases import SHORT, noise
+
+MARKED = "# Mine\n\n<!-- ertis bench {0} -->\nold\n<!-- /ertis bench {0} -->\n\nrest\n"
+
+
+@pytest.fixture(scope="module")
+def image():
+    return Pipeline(SHORT).process(noise(SHORT))
+
+
+def test_subjects_take_turns_in_bursts_after_warming_up():
+    calls = []
+    subjects = {name: lambda name=name: calls.append(name) for name in "ab"}
+    times_ms = timing.round_robin(subjects, count=7)
+    assert "".join(calls) == "aaabbb" + "aaaaabbbbb" + "aabb"
+    assert [len(times) for times in times_ms.values()] == [7, 7]
+    assert min(times.min() for times in times_ms.values()) >= 0
+
+
+def test_summary_is_mean_deviation_and_median():
+    assert timing.summary(np.array([1.0, 2.0, 6.0])) == {"mean_ms": 3.0, "std_ms": 2.16, "median_ms": 2.0}
+
+
+def test_paper_command_reports_and_updates(tmp_path):
+    target = tmp_path / "README.md"
+    target.write_text(MARKED.format("paper"), "utf-8")
+    result = CliRunner().invoke(cli, ["bench", "paper", "--count", "1", "--json", "--update", str(target)])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert {"cpu", "cores", "python", "numpy", "numba"} <= report["machine"].keys()
+    assert [(row["backend"], row["directions"]) for row in report["rows"]] == [
+        (backend, directions) for directions in (90, 1850, 3000) for backend in ("scipy", "numpy", "cpu")
+    ]
+    assert all(set(row) == {"backend", "directions", "mean_ms", "std_ms", "median_ms"} for row in report["rows"])
+    assert all(row["median_ms"] > 0 for row in report["rows"])
+    text = target.read_text("utf-8")
+    assert text.startswith("# Mine\n\n<!-- ertis bench paper -->\n| ms, mean ± std (median) | 90 directions |")
+    assert text.endswith("<!-- /ertis bench paper -->\n\nrest\n")
+    assert "old" not in text
+    assert "| `cuda` | not measured | not measured | not measured |" in text
+    assert "| GPU GTX 1080 Ti | 5.93 ± 0.66 | 51.58 ± 6.38 | 77.02 ± 7.81 |" in text
+    assert "timing 1 measurements" in result.stderr
+
+
+def test_scaling_command_prints_every_series(monkeypatch):
+    series = {"directions": (90, 180), "last_range_m": (1.0,), "microphones": (40,)}
+    monkeypatch.setattr(scaling, "SERIES", series)
+    monkeypatch.setattr(scaling, "_STREAM", 2**16)
+    report = scaling.run(count=1, say=lambda _: None)
+    assert [(row["series"], row["value"]) for row in report["rows"]][:4] == [
+        (name, value) for name, values in series.items() for value in values
+    ]
+    assert next(row["value"] for row in report["rows"] if row["series"] == "threads") == 1
+    assert report["ceilings"][-1]["multiply_add_gflop_s"] > 1
+    text = tables.scaling(report)
+    for name in ("directions", "last_range (m)", "microphones", "threads"):
+        assert f"| {name} | ms, mean ± std (median) | ranges |" in text
+
+
+def test_delay_and_sum_is_the_slope_over_directions():
+    rows = [
+        {"series": "directions", "value": n, "n_ranges": 1000, "median_ms": 2.0 + n / 1000} for n in (100, 1000, 5000)
+    ]
+    ceiling = {"copy_gb_s": 40.0, "multiply_add_gflop_s": 512.0}
+    reached = scaling.reached(rows, ceiling)
+    assert reached["us_per_direction"] == pytest.approx(1.0)
+    assert reached["rest_of_chain_ms"] == pytest.approx(2.0)
+    assert reached["points_per_s"] == pytest.approx(32_000 / 1e-6)
+    assert reached["of_multiply_add"] == pytest.approx(0.5)  # 256 of 512 GFLOP/s
+    assert reached["of_copy"] == pytest.approx(0.2)  # 4 GB/s written of 20 GB/s
+
+
+def test_right_image_passes_and_its_error_is_told(image):
+    assert -60 < checks.require_exact(image, noise(SHORT)) < checks.MAX_ERROR_DB
+    checks.require_same_reflector(image, image)
+
+
+@pytest.mark.parametrize(
+    "wrong", [lambda e: 1.1 * e, lambda e: np.roll(e, 1, axis=1), lambda e: np.full_like(e, np.nan)]
+)
+def test_refuses_a_wrong_image(image, wrong):
+    with pytest.raises(DataError, match=r"image of 7 directions is .* dB off the exact one; wanted at most -30 dB"):
+        checks.require_exact(image.replace(energy=wrong(image.energy)), noise(SHORT))
+
+
+@pytest.mark.parametrize("shift", [(3, 0), (0, 30)])
+def test_refuses_another_strongest_reflector(image, shift):
+    energy = np.full_like(image.energy, 0.1)
+    energy[2, 50] = 1.0
+    with pytest.raises(DataError, match=r"strongest reflector of one image, at 0.591 m, has -20.0 dB in another"):
+        checks.require_same_reflector(
+            image.replace(energy=energy), image.replace(energy=np.roll(energy, shift, axis=(0, 1)))
+        )
+
+
+def test_update_refuses_a_file_without_a_place(tmp_path):
+    target = tmp_path / "a.md"
+    with pytest.raises(ArgumentError, match=r"a\.md: .*No such file.*; give a readable Markdown file"):
+        tables.update(target, "paper", "x")
+    target.write_text(MARKED.format("scaling"), "utf-8")
+    with pytest.raises(ArgumentError, match=r"no place for this table; .* <!-- ertis bench paper --> and <!-- /ertis"):
+        tables.update(target, "paper", "x")
+    tables.update(target, "scaling", "| new |\n")
+    tables.update(target, "scaling", "| new |")
+    assert target.read_text("utf-8") == MARKED.format("scaling").replace("old", "| new |")
+
+
+def test_command_refuses_a_file_without_a_place_before_it_measures(tmp_path):
+    target = tmp_path / "a.md"
+    target.write_text("nothing", "utf-8")
+    result = CliRunner().invoke(cli, ["bench", "paper", "--count", "1", "--update", str(target)])
+    assert result.exit_code == 1
+    assert result.stderr.splitlines()[-1].startswith(f"ertis: error: {target} has no place for this table")
+    assert "timing" not in result.stderr
+
+
+def test_subject_is_the_shipped_recording_or_noise(monkeypatch):
+    measurement, source = subject.measurement()
+    assert source == "data/synthetic/reflectors.h5"
+    assert measurement.words.shape == (163_840,)
+    monkeypatch.setattr(subject, "_RECORDING", Path("nowhere.h5"))
+    measurement, source = subject.measurement()
+    assert source == "white noise, seed 1"
+    assert measurement.words.shape == (163_840,)
+
+
+def test_machine_is_named(monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    found = machine.describe()
+    assert found["cores"] >= 1
+    assert machine.sentence(found).startswith(found["cpu"])
+    assert "OPENBLAS_NUM_THREADS=1" in machine.sentence(found)
+    monkeypatch.setattr(machine, "_processor", dict)
+    assert machine.describe()["cpu"]
+
+
+def test_ceilings_compute():
+    source, out = np.arange(1000, dtype=np.float32), np.zeros(1000, dtype=np.float32)
+    ceilings.copy(source, out)
+    assert np.array_equal(out, source)
+    ceilings.triad(source, source, np.float32(2), out)
+    assert np.array_equal(out, 3 * source)
+    strands = np.zeros(3, dtype=np.float32)
+    ceilings.multiply_add(100, strands)  # each number tends to 1 / (1 - 1/2)
+    assert strands == pytest.approx(2 * ceilings.FLOPS_PER_TURN / 2)
+
+
+def test_published_times_have_one_entry_per_configuration():
+    assert all(len(times) == len(paper.DIRECTIONS) for times in paper.PUBLISHED_MS.values())
+
+
+@pytest.mark.parametrize("name", ["paper", "scaling"])
+def test_generated_readme_has_both_tables(name):
+    text = (Path(__file__).parents[1] / "bench" / "README.md").read_text("utf-8")
+    table = text.partition(f"<!-- ertis bench {name} -->")[2].partition(f"<!-- /ertis bench {name} -->")[0]
+    assert "| ---: |" in table
