@@ -29,6 +29,7 @@ __all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settin
 _WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
 _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
+_LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
 
@@ -188,10 +189,11 @@ class Processing(_Section, frozen=True):
         Limits of the grids that are named by a count (``2d:N`` and ``3d:N``).
     range_m : (first, last)
         Window of the range axis.
-    decimation : int
-        PDM samples per signal sample.
-    output_decimation : int
-        Signal samples per range of the energyscape.
+    range_decimation : int
+        PDM samples per range of the energyscape.
+    decimation : int, optional
+        PDM samples per signal sample, a divisor of ``range_decimation``. By default the largest that
+        suits the method and the call's band; see `Settings.decimation`.
     oversampling : int
         Delays are kept in steps of ``1 / oversampling`` of the range spacing.
     precision : {"auto", "float32", "int16"}
@@ -204,8 +206,8 @@ class Processing(_Section, frozen=True):
     azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
     elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
     range_m: tuple[float, float] = (0.5, 5.0)
-    decimation: int = 10
-    output_decimation: int = 10
+    range_decimation: int = 100
+    decimation: int | None = None
     oversampling: int = 10
     precision: Literal["auto", "float32", "int16"] = "auto"
 
@@ -214,8 +216,14 @@ class Processing(_Section, frozen=True):
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
-        checks.whole("processing.decimation", self.decimation, 1, 1000)
-        checks.whole("processing.output_decimation", self.output_decimation, 1, 1000)
+        checks.whole("processing.range_decimation", self.range_decimation, 1, 10_000)
+        if self.decimation is not None:
+            checks.whole("processing.decimation", self.decimation, 1, 1000)
+            if self.range_decimation % self.decimation:
+                raise ArgumentError(
+                    f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
+                    f"({self.range_decimation})"
+                )
         checks.whole("processing.oversampling", self.oversampling, 1, 64)
         checks.choice("processing.precision", self.precision, ("auto", "float32", "int16"))
 
@@ -232,7 +240,7 @@ class Settings(_Section, frozen=True):
     def __post_init__(self) -> None:
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
-                f"processing.decimation {self.processing.decimation} leaves signals at "
+                f"processing.decimation {self.decimation} leaves signals at "
                 f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
                 f"{self.call.high_frequency_hz:g} Hz"
             )
@@ -258,7 +266,7 @@ class Settings(_Section, frozen=True):
         echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
         processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)))
         if band == "20_80":
-            processing = processing.replace(output_decimation=4, oversampling=6)
+            processing = processing.replace(range_decimation=40, oversampling=6)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 
     @classmethod
@@ -299,11 +307,32 @@ class Settings(_Section, frozen=True):
         )
 
     @property
+    def decimation(self) -> int:
+        """PDM samples per signal sample.
+
+        Where ``processing.decimation`` leaves it open, the largest divisor of ``range_decimation`` that
+        keeps the signal rate at 4.4 times the call's highest frequency or more, so that the low pass needs
+        few taps; for the paper's integer delays at 5.5 times, which is its 450 kHz for its calls.
+        """
+        given = self.processing.decimation
+        if given is not None:
+            return given
+        least_hz = _LEAST_RATE[self.processing.method] * self.call.high_frequency_hz
+        largest = max(1, math.floor(self.recording.pdm_rate_hz / least_hz))
+        step = self.processing.range_decimation
+        return max(divisor for divisor in range(1, min(largest, step) + 1) if step % divisor == 0)
+
+    @property
+    def output_decimation(self) -> int:
+        """Signal samples per range of the energyscape."""
+        return self.processing.range_decimation // self.decimation
+
+    @property
     def signal_rate_hz(self) -> float:
         """Rate of the demodulated signals."""
-        return self.recording.pdm_rate_hz / self.processing.decimation
+        return self.recording.pdm_rate_hz / self.decimation
 
     @property
     def output_rate_hz(self) -> float:
         """Rate at which the energyscape samples its range axis."""
-        return self.signal_rate_hz / self.processing.output_decimation
+        return self.recording.pdm_rate_hz / self.processing.range_decimation

@@ -33,9 +33,9 @@ CASES = {
             layout="line", positions_m=LINE_8, gain=(2.0, 1.0) * 4, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
         )
     ),
-    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15)),
-    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(output_decimation=3, oversampling=10)),
-    "every sample": SHORT.replace(processing=SHORT.processing.replace(output_decimation=1, range_m=(0.6, 0.62))),
+    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15, range_decimation=150)),
+    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30, oversampling=10)),
+    "every sample": SHORT.replace(processing=SHORT.processing.replace(range_decimation=10, range_m=(0.6, 0.62))),
 }
 """Settings by name. Records are short, so that the float64 referees are quick."""
 

@@ -86,7 +86,7 @@ def paper(words, settings: Settings, directions):
     """
     layout = microphones(settings.array)
     rate_hz, speed_m_s = settings.signal_rate_hz, sound_speed_m_s(settings.air)
-    step = settings.processing.output_decimation
+    step = settings.output_decimation
     signals = unpack_bits(words, np.flatnonzero(layout.enabled)) / layout.gain[layout.enabled][:, None]
     padded_s = settings.call.duration_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
     emitted = call_at(
@@ -96,7 +96,7 @@ def paper(words, settings: Settings, directions):
     taps = _paper_low_pass(settings)
     pulse = np.abs(np.correlate(call, call, "full"))
     peak = np.convolve(pulse, taps, "same")[len(call) - 1]
-    n_samples = -(-signals.shape[1] // settings.processing.decimation)
+    n_samples = -(-signals.shape[1] // settings.decimation)
     at = np.arange(n_samples)
     image = np.zeros((len(directions), len(at[::step])))
     matched = [np.correlate(_paper_filters(signal, settings), call, "full") for signal in signals]
@@ -122,7 +122,7 @@ def _paper_filters(signal, settings):
     low_pass = scipy.signal.butter(6, low_pass_hz, fs=settings.recording.pdm_rate_hz, output="sos")
     band = (call.low_frequency_hz, call.high_frequency_hz)
     band_pass = scipy.signal.butter(6, band, "bandpass", fs=rate_hz, output="sos")
-    slow = scipy.signal.sosfilt(low_pass, signal)[:: settings.processing.decimation]
+    slow = scipy.signal.sosfilt(low_pass, signal)[:: settings.decimation]
     return scipy.signal.sosfilt(band_pass, slow)
 
 

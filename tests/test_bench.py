@@ -9,6 +9,7 @@ from click.testing import CliRunner
 from ertis_bench import checks, machine, paper, scaling, subject, tables, timing
 from ertis_cli.main import cli
 
+from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
@@ -56,32 +57,37 @@ def test_paper_command_reports_and_updates(tmp_path):
     assert "timing 1 measurements" in result.stderr
 
 
-def test_scaling_command_prints_every_series(monkeypatch):
+def test_scaling_measures_every_series(monkeypatch):
     series = {"directions": (90, 180), "last_range_m": (1.0,), "microphones": (40,)}
     monkeypatch.setattr(scaling, "SERIES", series)
     monkeypatch.setattr(scaling, "_STREAM", 2**16)
     report = scaling.run(count=1, say=lambda _: None)
-    assert [(row["series"], row["value"]) for row in report["rows"]][:4] == [
-        (name, value) for name, values in series.items() for value in values
-    ]
-    assert next(row["value"] for row in report["rows"] if row["series"] == "threads") == 1
-    assert report["ceilings"][-1]["multiply_add_gflop_s"] > 1
+    found = {(row["series"], row["precision"], row["value"]) for row in report["rows"]}
+    assert {
+        ("directions", "float32", 90.0),
+        ("directions", "float32", 180.0),
+        ("last_range_m", "auto", 1.0),
+        ("microphones", "auto", 40.0),
+        ("threads", "auto", 1.0),
+    } <= found
+    assert report["ceilings"][-1]["float32_gop_s"] > 1
+    assert report["delay_and_sum"][0]["precision"] == "float32"
     text = tables.scaling(report)
-    for name in ("directions", "last_range (m)", "microphones", "threads"):
+    for name in ("directions, float32", "last range, m", "microphones", "threads"):
         assert f"| {name} | ms, mean ± std (median) | ranges |" in text
 
 
 def test_delay_and_sum_is_the_slope_over_directions():
     rows = [
-        {"series": "directions", "value": n, "n_ranges": 1000, "median_ms": 2.0 + n / 1000} for n in (100, 1000, 5000)
+        {"series": series, "precision": "int16", "value": n, "n_ranges": 1000, "median_ms": 2.0 + n / 1000}
+        for series, n in (("directions", 100), ("directions", 1000), ("directions", 5000), ("threads", 1))
     ]
-    ceiling = {"copy_gb_s": 40.0, "multiply_add_gflop_s": 512.0}
-    reached = scaling.reached(rows, ceiling)
-    assert reached["us_per_direction"] == pytest.approx(1.0)
-    assert reached["rest_of_chain_ms"] == pytest.approx(2.0)
-    assert reached["points_per_s"] == pytest.approx(32_000 / 1e-6)
-    assert reached["of_multiply_add"] == pytest.approx(0.5)  # 256 of 512 GFLOP/s
-    assert reached["of_copy"] == pytest.approx(0.2)  # 4 GB/s written of 20 GB/s
+    found = scaling.reached(rows, "int16", {"copy_gb_s": 40.0, "int16_gop_s": 512.0})
+    assert found["us_per_direction"] == pytest.approx(1.0)
+    assert found["rest_of_chain_ms"] == pytest.approx(2.0)
+    assert found["gop_s"] == pytest.approx(256.0)  # 1000 ranges, 32 microphones, 8 operations in a microsecond
+    assert found["of_arithmetic"] == pytest.approx(0.5)
+    assert found["of_copy"] == pytest.approx(0.2)  # 4 GB/s of the 20 that a copy writes
 
 
 def test_right_image_passes_and_its_error_is_told(image):
@@ -155,8 +161,15 @@ def test_ceilings_compute():
     ceilings.triad(source, source, np.float32(2), out)
     assert np.array_equal(out, 3 * source)
     strands = np.zeros(3, dtype=np.float32)
-    ceilings.multiply_add(100, strands)  # each number tends to 1 / (1 - 1/2)
-    assert strands == pytest.approx(2 * ceilings.FLOPS_PER_TURN / 2)
+    ceilings.multiply_add(100, strands)  # each of twelve sums tends to 1 / (1 - 1/2)
+    assert strands == pytest.approx(24)
+
+
+@pytest.mark.skipif(kernels.load("cpu").fastest_precision != "int16", reason="this processor has no 16-bit dot product")
+def test_ceiling_of_dot_products_computes():
+    strands = np.zeros(3, dtype=np.int32)
+    ceilings.dot_16(100, strands)  # twelve sums from 0 to 11, each with 100 times two products of 1
+    assert strands.tolist() == [12 * 200 + 66] * 3
 
 
 def test_published_times_have_one_entry_per_configuration():

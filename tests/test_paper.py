@@ -47,7 +47,7 @@ def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)])
 def test_echo_lies_at_its_range_with_its_amplitude(call):
     """Group delays of all filters are gone, also those of the recursive ones."""
-    settings = with_paper(SHORT.replace(call=call), directions="2d:181", output_decimation=1, range_m=(0.65, 0.75))
+    settings = with_paper(SHORT.replace(call=call), directions="2d:181", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
     image = Pipeline(settings).process(Measurement(words, settings))
     direction, distance = np.unravel_index(np.argmax(image.energy), image.energy.shape)
@@ -75,7 +75,7 @@ def test_range_axis_is_that_of_the_paper():
 
 def test_rectified_carrier_is_gone():
     """With every sample kept, the envelope of a call is smooth: no ripple at twice the carrier."""
-    settings = with_paper(SHORT, directions="2d:1", output_decimation=1, range_m=(0.65, 0.75))
+    settings = with_paper(SHORT, directions="2d:1", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
     row = Pipeline(settings).process(Measurement(words, settings)).energy[0]
     spectrum = np.abs(np.fft.rfft(row * np.hanning(len(row))))

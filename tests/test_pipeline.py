@@ -50,8 +50,8 @@ CASES = {
             layout="line", positions_m=LINE_8, gain=(2.0,) * 8, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
         )
     ),
-    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15)),
-    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(output_decimation=3, oversampling=10)),
+    "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15, range_decimation=150)),
+    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30, oversampling=10)),
 }
 
 

@@ -64,8 +64,8 @@ any_settings = st.builds(
         azimuth_limits_deg=ordered(-180, 180),
         elevation_limits_deg=ordered(-90, 90),
         range_m=ordered(0, 100),
-        decimation=st.integers(1, 16),
-        output_decimation=st.integers(1, 100),
+        decimation=st.sampled_from([None, 1, 4, 10, 16]),
+        range_decimation=st.integers(1, 100).map(lambda count: 80 * count),
         oversampling=st.integers(1, 64),
     ),
 )
@@ -135,15 +135,19 @@ def test_nothing_can_be_changed_in_place():
         ("[recording]\nn_samples = 0", r"recording\.n_samples is 0; give a whole number of at least 1"),
         ("[processing]\nmethod = 'slow'", r"Invalid enum value 'slow' - at `processing\.method`"),
         ("[processing]\ndecimation = 0", r"processing\.decimation is 0; give a whole number from 1 to 1000"),
-        ("[processing]\noutput_decimation = 0", r"processing\.output_decimation is 0; give a whole number from 1"),
+        ("[processing]\nrange_decimation = 0", r"processing\.range_decimation is 0; give a whole number from 1"),
+        (
+            "[processing]\ndecimation = 7",
+            r"processing\.decimation is 7; give a divisor of processing\.range_decimation",
+        ),
         ("[processing]\noversampling = 65", r"processing\.oversampling is 65; give a whole number from 1 to 64"),
         ("[processing]\nrange_m = [2, 1]", r"processing\.range_m runs from 2 to 1; give the smaller number first"),
         ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
         ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
         ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; give a number from"),
         (
-            "[processing]\ndecimation = 45",
-            r"processing\.decimation 45 leaves signals at 100000 Hz; give one that leaves",
+            "[processing]\ndecimation = 50",
+            r"processing\.decimation 50 leaves signals at 90000 Hz; give one that leaves",
         ),
     ],
 )
@@ -195,7 +199,7 @@ def test_presets(name):
 def test_rates_and_durations():
     made = Settings()
     assert made.recording.duration_s == pytest.approx(36.4e-3, abs=1e-5)
-    assert (made.signal_rate_hz, made.output_rate_hz) == (450_000, 45_000)
+    assert (made.signal_rate_hz, made.output_rate_hz) == (225_000, 45_000)
 
 
 def test_stamps_and_images_are_frozen():
@@ -210,3 +214,19 @@ def test_every_section_refuses_unknown_fields():
     for section in (Array, Call, Recording, Air, Processing, Settings):
         with pytest.raises(msgspec.ValidationError, match="unknown field"):
             msgspec.convert({"colour": 1}, section)
+
+
+@pytest.mark.parametrize(
+    ("preset", "method", "decimation"),
+    [
+        ("default_25_50", "fast", 20),
+        ("default_25_50", "paper", 10),
+        ("default_20_80", "fast", 10),
+        ("long_20_80", "paper", 10),
+    ],
+)
+def test_decimation_suits_method_and_band(preset, method, decimation):
+    made = Settings.from_preset(preset)
+    made = made.replace(processing=made.processing.replace(method=method))
+    assert made.decimation == decimation
+    assert made.decimation * made.output_decimation == made.processing.range_decimation

@@ -218,34 +218,49 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
     assert peak < 8 * words.nbytes
 
 
-def test_an_exception_leaves_nothing(tmp_path):
-    for error in (KeyboardInterrupt, ZeroDivisionError, GeneratorExit):
-        with pytest.raises(error), RecordingWriter(tmp_path / "rec.h5") as writer:
-            writer.write(noise(count=1)[0])
+def write_and_fail(path, error, *, before=None):
+    with RecordingWriter(path, overwrite=path.exists()) as writer:
+        writer.write(noise(count=1)[0])
+        if before:
+            before(writer)
+        if error:
             raise error
-        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, GeneratorExit])
+def test_an_exception_leaves_nothing(tmp_path, error):
+    with pytest.raises(error):
+        write_and_fail(tmp_path / "rec.h5", error)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failure_leaves_the_older_file(tmp_path):
     path = write_recording(tmp_path / "rec.h5", noise())
     before = path.read_bytes()
-    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, overwrite=True) as writer:
-        writer.write(noise(count=1)[0])
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        write_and_fail(path, KeyboardInterrupt)
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
 def test_what_reads_back_differently_is_refused(tmp_path):
-    words = noise(count=2)
-    with (
-        pytest.raises(DataError, match=r"damaged|reads back differently"),
-        RecordingWriter(tmp_path / "r.h5") as writer,
-    ):
-        for measurement in words:
-            writer.write(measurement)
-        writer._file["sensors/eRTIS-7/pdm"][1, 5] ^= 1  # noqa: SLF001  a fault between memory and disk
+    def flip_on_disk(writer):
+        writer._file["sensors/eRTIS-7/pdm"][0, 5] ^= 1  # noqa: SLF001  a fault between memory and disk
+
+    def drop_a_row(writer):
+        writer._file["sensors/eRTIS-7/pdm"].resize(0, axis=0)  # noqa: SLF001
+
+    with pytest.raises(DataError, match=r"measurement 0 has CRC-32 .* the file is damaged"):
+        write_and_fail(tmp_path / "rec.h5", None, before=flip_on_disk)
+    with pytest.raises(DataError, match="reads back differently than it was written; check the disk"):
+        write_and_fail(tmp_path / "rec.h5", None, before=drop_a_row)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
+    with pytest.raises(ArgumentError, match="exists"):
+        write_and_fail(tmp_path / "rec.h5", None, before=lambda writer: writer.path.write_text("mine"))
+    assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [("rec.h5", "mine")]
 
 
 def spoilt(**settings):
@@ -306,13 +321,6 @@ def test_places_that_cannot_be_written(tmp_path, name, message):
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / name, noise())
     assert (tmp_path / "there.h5").read_text() == "mine"
-
-
-def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
-    with pytest.raises(ArgumentError, match="exists"), RecordingWriter(tmp_path / "rec.h5") as writer:
-        writer.write(noise(count=1)[0])
-        (tmp_path / "rec.h5").write_text("mine")
-    assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [("rec.h5", "mine")]
 
 
 def test_writer_is_used_in_a_with_statement(tmp_path):

@@ -8,14 +8,13 @@ import numpy as np
 
 from ertis_bench import checks, machine, subject, timing
 from ertis_numba import kernels
-from ertis_numba.frames import Measurement
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["FLOPS_PER_POINT", "SERIES", "reached", "run"]
+__all__ = ["OPERATIONS_PER_POINT", "SERIES", "reached", "run"]
 
-FLOPS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone
+OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone
 _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
 SERIES: dict[str, tuple[float, ...]] = {
     "directions": (90, 250, 500, 1000, 1850, 3000, 6000),
@@ -47,24 +46,44 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         A result is wrong, so it is not timed.
     """
     rows = []
-    for series, value, pipeline, measurement in _points():
-        say(f"{series} {value:g}: checking and timing {count} measurements")
-        image = pipeline.process(measurement)
-        checks.require_exact(image, measurement)
-        subjects = {"cpu": functools.partial(pipeline.process, measurement, out=image.energy)}
-        times_ms = timing.round_robin(subjects, count=count)["cpu"]
-        rows.append(
-            {"series": series, "value": value, "n_ranges": image.energy.shape[1], **timing.summary(times_ms)},
-        )
-    say("measuring ceilings")
+    for series, precision in _series():
+        say(f"{series}, {precision}: checking and timing {count} measurements each")
+        rows += [{"series": series, "precision": precision, **row} for row in _measure(series, precision, count)]
+    say("ceilings")
     ceilings_found = [_ceilings(n_threads, count) for n_threads in _thread_counts()]
     return {
         "machine": machine.describe(),
         "rows": rows,
         "count": count,
         "ceilings": ceilings_found,
-        "delay_and_sum": reached(rows, ceilings_found[-1]),
+        "delay_and_sum": [reached(rows, precision, ceilings_found[-1]) for precision in _precisions()],
     }
+
+
+def _series() -> Iterator[tuple[str, str]]:
+    """Directions are varied at each precision, since that tells what delay-and-sum reaches."""
+    for series in (*SERIES, "threads"):
+        for precision in _precisions() if series == "directions" else ["auto"]:
+            yield series, precision
+
+
+def _precisions() -> list[str]:
+    return list(dict.fromkeys(["float32", kernels.load("cpu").fastest_precision]))
+
+
+def _measure(series: str, precision: str, count: int) -> Iterator[dict[str, Any]]:
+    """Yield a row per value; the values take turns, so that a drift does not look like a trend."""
+    subjects, n_ranges = {}, {}
+    for value in _thread_counts() if series == "threads" else SERIES[series]:
+        threads = int(value) if series == "threads" else None
+        settings, n_words = _settings(precision, **{**_BASE, **({series: value} if series in _BASE else {})})
+        pipeline, measurement = Pipeline(settings, "cpu", threads), subject.noise(settings, n_words=n_words)
+        image = pipeline.process(measurement)
+        checks.require_exact(image, measurement)
+        subjects[f"{value:g}"] = functools.partial(pipeline.process, measurement, out=image.energy)
+        n_ranges[f"{value:g}"] = image.energy.shape[1]
+    for name, times_ms in timing.round_robin(subjects, count=count).items():
+        yield {"value": float(name), "n_ranges": n_ranges[name], **timing.summary(times_ms)}
 
 
 def _thread_counts() -> list[int]:
@@ -72,17 +91,7 @@ def _thread_counts() -> list[int]:
     return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < most] + [most]
 
 
-def _points() -> Iterator[tuple[str, float, Pipeline, Measurement]]:
-    for series, values in SERIES.items():
-        for value in values:
-            settings, n_words = _settings(**{**_BASE, series: value})
-            yield series, value, Pipeline(settings, "cpu"), subject.noise(settings, n_words=n_words)
-    settings, n_words = _settings(**_BASE)
-    for n_threads in _thread_counts():
-        yield "threads", n_threads, Pipeline(settings, "cpu", n_threads), subject.noise(settings, n_words=n_words)
-
-
-def _settings(*, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
+def _settings(precision: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
     """Return settings and words per sample, with microphones at random places on a disc."""
     n_mics, settings = int(microphones), Settings.from_preset("default_25_50")
     random = np.random.default_rng(1)
@@ -91,7 +100,7 @@ def _settings(*, directions: float, last_range_m: float, microphones: float) -> 
     positions_m = np.stack([np.zeros(n_mics), radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], axis=1)
     array = Array(layout=f"disc of {n_mics}", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32)
     processing = settings.processing.replace(
-        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m))
+        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m)), precision=precision
     )
     return settings.replace(array=array, processing=processing), -(-n_mics // array.word_bits)
 
@@ -99,24 +108,29 @@ def _settings(*, directions: float, last_range_m: float, microphones: float) -> 
 def _ceilings(n_threads: int, count: int) -> dict[str, float]:
     """Return the best of ``count`` runs: what the machine can do is not an average."""
     a, b, out = (np.ones(_STREAM, dtype=np.float32) for _ in range(3))
-    strands = np.empty(n_threads * _STRANDS_PER_THREAD, dtype=np.float32)
+    n_strands = n_threads * _STRANDS_PER_THREAD
+    strands = {"float32": np.empty(n_strands, dtype=np.float32), "int16": np.empty(n_strands, dtype=np.int32)}
+    turn = {"float32": ceilings.multiply_add, "int16": ceilings.dot_16}
+    operations = {"float32": ceilings.MULTIPLY_ADD_OPERATIONS, "int16": ceilings.DOT_16_OPERATIONS}
     subjects: dict[str, Callable[[], object]] = {
         "copy": functools.partial(ceilings.copy, a, out),
         "triad": functools.partial(ceilings.triad, a, b, np.float32(2), out),
-        "multiply_add": functools.partial(ceilings.multiply_add, _TURNS, strands),
+        **{name: functools.partial(turn[name], _TURNS, strands[name]) for name in _precisions()},
     }
     with kernels.load("cpu").threads(n_threads):
-        best_s = {name: times.min() / 1e3 for name, times in timing.round_robin(subjects, count=count).items()}
-    flops = len(strands) * _TURNS * ceilings.FLOPS_PER_TURN
+        best_s = {name: float(times.min()) / 1e3 for name, times in timing.round_robin(subjects, count=count).items()}
     return {
         "threads": n_threads,
         "copy_gb_s": round(2 * a.nbytes / best_s["copy"] / 1e9, 1),
         "triad_gb_s": round(3 * a.nbytes / best_s["triad"] / 1e9, 1),
-        "multiply_add_gflop_s": round(flops / best_s["multiply_add"] / 1e9, 1),
+        **{
+            f"{name}_gop_s": round(n_strands * _TURNS * operations[name] / best_s[name] / 1e9, 1)
+            for name in _precisions()
+        },
     }
 
 
-def reached(rows: list[dict[str, Any]], ceiling: dict[str, float]) -> dict[str, float]:
+def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float]) -> dict[str, Any]:
     """Return what delay-and-sum with envelope reaches of the ceilings.
 
     Its time per direction is the slope of a line through the times over directions; what does not
@@ -125,23 +139,24 @@ def reached(rows: list[dict[str, Any]], ceiling: dict[str, float]) -> dict[str, 
     Parameters
     ----------
     rows : list of dict
-        Those of the series ``directions`` are used.
+        Those of the series ``directions`` at this precision are used.
+    precision : {"float32", "int16"}
     ceiling : dict
         What the machine does on as many threads.
     """
-    points = [row for row in rows if row["series"] == "directions"]
+    points = [row for row in rows if (row["series"], row["precision"]) == ("directions", precision)]
     directions = np.array([row["value"] for row in points])
     medians_ms = np.array([row["median_ms"] for row in points])
-    slope_ms, start_ms = np.polyfit(directions, medians_ms, 1, w=1 / medians_ms)
-    per_direction = points[0]["n_ranges"] * _BASE["microphones"]
-    points_s = per_direction / (slope_ms / 1e3)
-    written_gb_s = points[0]["n_ranges"] * 4 / (slope_ms / 1e3) / 1e9
+    slope_ms, start_ms = np.polyfit(directions, medians_ms, 1)
+    n_ranges = points[0]["n_ranges"]
+    gop_s = n_ranges * _BASE["microphones"] * OPERATIONS_PER_POINT / slope_ms / 1e6
+    written_gb_s = n_ranges * np.dtype(np.float32).itemsize / slope_ms / 1e6
     return {
+        "precision": precision,
         "us_per_direction": round(float(slope_ms) * 1e3, 3),
         "rest_of_chain_ms": round(float(start_ms), 3),
-        "points_per_s": float(f"{points_s:.3g}"),
-        "gflop_s": round(float(points_s) * FLOPS_PER_POINT / 1e9, 1),
-        "of_multiply_add": round(float(points_s) * FLOPS_PER_POINT / 1e9 / ceiling["multiply_add_gflop_s"], 3),
+        "gop_s": round(float(gop_s), 1),
+        "of_arithmetic": round(float(gop_s) / ceiling[f"{precision}_gop_s"], 3),
         "written_gb_s": round(float(written_gb_s), 2),
         "of_copy": round(float(written_gb_s) * 2 / ceiling["copy_gb_s"], 3),
     }

@@ -36,11 +36,11 @@ def draw_into(
 ) -> AxesImage:
     """Draw levels (direction, range) as a sector with rings, rays and the reflectors."""
     order = np.argsort(azimuth_rad, kind="stable")
-    azimuth_rad = azimuth_rad[order]
+    azimuth_rad, level_db = _fan(azimuth_rad[order], level_db[order])
     extent = _extent(azimuth_rad, range_m)
     left, right, bottom, top = extent
     step_m = max(right - left, top - bottom) / PIXELS
-    rings_m, levels_db = join_ranges(range_m, level_db[order])
+    rings_m, levels_db = join_ranges(range_m, level_db)
     raster = polar_raster(
         levels_db,
         azimuth_rad,
@@ -58,6 +58,16 @@ def draw_into(
     axes.set_ylim(bottom - margin_m, top + margin_m)
     axes.set_axis_off()
     return shown
+
+
+def _fan(
+    azimuth_rad: NDArray[np.float64], level_db: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the directions and levels to draw: what is too thin to be seen becomes two degrees wide."""
+    middle, half_rad = (azimuth_rad[0] + azimuth_rad[-1]) / 2, math.radians(1.0)
+    if azimuth_rad[-1] - azimuth_rad[0] >= half_rad:
+        return azimuth_rad, level_db
+    return np.array([middle - half_rad, middle + half_rad]), np.repeat(level_db.max(axis=0)[None], 2, axis=0)
 
 
 def _place(azimuth_rad: float, range_m: float) -> tuple[float, float]:

@@ -35,7 +35,7 @@ class Demodulate:
         self._taps = taps
         self._scale = np.float32(1 / taps.sum(dtype=np.int64))
         self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
-        self._factor = settings.processing.decimation
+        self._factor = settings.decimation
         self._window = window
         self.shape = (len(self._channels), window.n_fft)
 

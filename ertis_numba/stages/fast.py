@@ -46,7 +46,7 @@ class FastChain:
         taps = whole_taps(
             decimation_taps(
                 pdm_rate_hz=settings.recording.pdm_rate_hz,
-                decimation=settings.processing.decimation,
+                decimation=settings.decimation,
                 pass_hz=matched_band_hz(settings.call)[1],
             )
         )

@@ -47,7 +47,7 @@ class PaperChain:
     def __init__(self, settings: Settings) -> None:
         layout = microphones(settings.array)
         self.grid: Grid = direction_grid(settings.processing)
-        self._n_samples = -(-settings.recording.n_samples // settings.processing.decimation)
+        self._n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, self._window = _range_axis(settings, self._n_samples)
         delays_s = layout.delay_s[layout.enabled] + far_field_delays(
             layout.enabled_positions_m,
@@ -103,7 +103,7 @@ def _range_axis(settings: Settings, n_samples: int) -> tuple[NDArray[np.float64]
     """Return the range axis and which of the record's outputs it holds."""
     first_m, last_m = settings.processing.range_m
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
-    n_outputs = -(-n_samples // settings.processing.output_decimation)
+    n_outputs = -(-n_samples // settings.output_decimation)
     first = math.ceil(first_m / step_m * (1 - 1e-12))
     stop = math.floor(last_m / step_m * (1 + 1e-12)) + 1
     if stop > n_outputs:
@@ -144,7 +144,7 @@ class _Demodulate:
         butter = scipy.signal.butter
         self._low_pass = butter(_ORDER, cutoff_hz, fs=settings.recording.pdm_rate_hz, output="sos")
         self._band_pass = butter(_ORDER, band_hz, "bandpass", fs=rate_hz, output="sos")
-        self._decimation = settings.processing.decimation
+        self._decimation = settings.decimation
 
     def __call__(self, signals: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return (…, sample) at the signal rate, in the precision of ``signals``."""
@@ -180,7 +180,7 @@ class _LowPass:
         n_taps, beta = scipy.signal.kaiserord(_STOP_BAND_DB, cutoff_hz / (rate_hz / 2))
         self._taps = scipy.signal.firwin(n_taps | 1, cutoff_hz, window=("kaiser", beta), fs=rate_hz)
         self._half = len(self._taps) // 2
-        self._factor = settings.processing.output_decimation
+        self._factor = settings.output_decimation
         self._n_samples = n_samples
         # Output i of a block weighs the samples from i · factor on: those of its own block and of the next.
         in_block = max(_BLOCK, -(-len(self._taps) // self._factor))

@@ -74,9 +74,9 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int) -> T
     stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
     spanned_s = stop_s - start_s + settings.call.duration_s + 2 * guard_s
     n_outputs = scipy.fft.next_fast_len(math.ceil(spanned_s * output_rate_hz))
-    n_fft = n_outputs * settings.processing.output_decimation
+    n_fft = n_outputs * settings.output_decimation
     rate_hz = settings.signal_rate_hz
-    decimation = settings.processing.decimation
+    decimation = settings.decimation
     before = n_taps // 2 // decimation
     after = (settings.recording.n_samples - 1 + n_taps // 2) // decimation
     first_sample = max(-before, math.floor((start_s - guard_s) * rate_hz))

@@ -210,4 +210,5 @@ def _plain(value: object) -> object:
 
 
 def _reason(error: BaseException) -> str:
-    return str(error).strip("'\"").splitlines()[0] if str(error) else type(error).__name__
+    text = str(error.args[0]) if error.args else ""  # str() of a KeyError is quoted
+    return text.partition("\n")[0] or type(error).__name__

@@ -26,6 +26,7 @@ from ertis_numba.storage.schema import (
     Variable,
     content_sha256,
     date_created,
+    describe,
     sensor_path,
     software_versions,
 )
@@ -130,8 +131,9 @@ class Writer(ABC, Generic[Item]):
         group = file[sensor_path(self._sensor)]
         self._complete(group, self._rows)
         content = content_sha256(group, self._table)
-        group.attrs["content_sha256"] = content
-        file.attrs.update(
+        describe(group, {"content_sha256": content})
+        describe(
+            file,
             {
                 "Conventions": CONVENTIONS,
                 "ertis_format": self._kind,
@@ -141,7 +143,7 @@ class Writer(ABC, Generic[Item]):
                 "uuid": str(uuid.UUID(bytes=_as_version_8(bytes.fromhex(content)[:16]))),
                 **self._attributes,
                 **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
-            }
+            },
         )
         return self._rows
 

@@ -14,7 +14,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._writer import Writer, self_contained
 from ertis_numba.storage.recording import RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, Variable, lay_out
+from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
@@ -66,12 +66,15 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._first = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
         lay_out(
-            group, ENERGYSCAPE, sizes={"direction": n_directions, "range": n_ranges}, dtypes={"energy": self._dtype}
+            group,
+            ENERGYSCAPE,
+            sizes={"direction": n_directions, "range": n_ranges},
+            dtypes={"energy": self._dtype},
+            texts={"settings": self_contained(first.settings).to_toml()},
         )
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
-        group["energy"].attrs["coordinates"] = "azimuth elevation"
-        group["settings"][()] = self_contained(first.settings).to_toml()
+        describe(group["energy"], {"coordinates": "azimuth elevation"})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first

@@ -16,7 +16,7 @@ from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer, self_contained
-from ertis_numba.storage.schema import RECORDING, Variable, lay_out
+from ertis_numba.storage.schema import RECORDING, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth, read_truth, write_truth
 from ertis_numba.waveform import call_samples
 
@@ -86,11 +86,16 @@ class RecordingWriter(Writer[Measurement]):
             "call_sample": len(samples),
             **several,
         }
-        lay_out(group, RECORDING, sizes=sizes, dtypes={"pdm": f"<u{layout.word_bits // 8}"})
-        group.attrs.update(_mounting(first.stamp.sensor, settings))
-        group["pdm"].attrs.update({"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
-        group["call"].attrs["sample_rate_hz"] = settings.call.sample_rate_hz
-        group["settings"][()] = settings.to_toml()
+        lay_out(
+            group,
+            RECORDING,
+            sizes=sizes,
+            dtypes={"pdm": f"<u{layout.word_bits // 8}"},
+            texts={"settings": settings.to_toml()},
+        )
+        describe(group, _mounting(first.stamp.sensor, settings))
+        describe(group["pdm"], {"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
+        describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
         group["microphone"][:] = np.arange(len(layout.enabled))
         group["call"][:] = samples
         for name, values in _copies(layout).items():

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -29,6 +29,7 @@ __all__ = [
     "Variable",
     "content_sha256",
     "date_created",
+    "describe",
     "lay_out",
     "sensor_path",
     "software_versions",
@@ -38,6 +39,7 @@ CONVENTIONS: Final = "CF-1.11 ertis-1.0"
 FORMAT_VERSION: Final = 1
 CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
 _TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
+_COLUMN_TEXT_BYTES: Final = 64
 _UNLIMITED: Final = ("time", "gap")
 _SENSOR_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
 
@@ -118,21 +120,33 @@ def lay_out(
     *,
     sizes: Mapping[str, int],
     dtypes: Mapping[str, str] | None = None,
+    texts: Mapping[str, str] | None = None,
 ) -> None:
     """Make the variables of ``table`` in ``group``, with a named scale for each of their axes.
 
-    An axis that ``sizes`` leaves out is left out of every variable, unless it grows with the file.
-    Rows along time are chunks of their own where a row is an array.
+    Parameters
+    ----------
+    group : h5py.Group
+    table : iterable of Variable
+    sizes : mapping of str to int
+        Length of each axis. One that is left out is left out of every variable, unless it is one
+        that grows with the file; rows along time are chunks of their own where a row is an array.
+    dtypes : mapping of str to str, optional
+        Types that the table leaves open.
+    texts : mapping of str to str, optional
+        What the variables that are one text hold.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
     # Coordinates come first, so that the others find the scale of each axis.
     for variable, dims in sorted(variables, key=lambda pair: pair[1] != (pair[0].name,)):
-        dtype = (dtypes or {}).get(variable.name, variable.dtype)
-        dataset = _dataset(group, variable.name, dims, sizes, dtype)
-        dataset.attrs["long_name"] = variable.about
-        if variable.units:
-            dataset.attrs["units"] = variable.units
+        if not dims:
+            text = (texts or {})[variable.name].encode()
+            dataset = group.create_dataset(variable.name, (), _text_type(len(text)), data=text)
+        else:
+            dtype = (dtypes or {}).get(variable.name, variable.dtype)
+            dataset = _dataset(group, variable.name, dims, sizes, dtype)
+        describe(dataset, {"long_name": variable.about} | ({"units": variable.units} if variable.units else {}))
         if dims == (variable.name,):
             dataset.make_scale(variable.name)
             scales[variable.name] = dataset
@@ -148,9 +162,7 @@ def _dims(variable: Variable, sizes: Mapping[str, int]) -> tuple[str, ...]:
 
 
 def _dataset(group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str) -> h5py.Dataset:
-    kind = h5py.string_dtype() if dtype == "str" else np.dtype(dtype)
-    if not dims:
-        return group.create_dataset(name, (), kind)
+    kind = _text_type(_COLUMN_TEXT_BYTES) if dtype == "str" else np.dtype(dtype)
     shape = tuple(sizes.get(dim, 0) for dim in dims)
     if dims[0] not in _UNLIMITED:
         return group.create_dataset(name, shape, kind)
@@ -167,6 +179,24 @@ def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Datase
     return scale
 
 
+def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
+    """Set attributes.
+
+    Texts have a fixed length, as everywhere in these files: HDF5 keeps others in a heap without
+    checksums, where a damaged length can hold up a reader for ever.
+    """
+    for name, value in attributes.items():
+        if isinstance(value, str):
+            owner.attrs.create(name, value.encode(), dtype=_text_type(len(value.encode())))
+        else:
+            owner.attrs[name] = value
+
+
+def _text_type(n_bytes: int) -> np.dtype[Any]:
+    made: np.dtype[Any] = h5py.string_dtype("utf-8", max(1, n_bytes))
+    return made
+
+
 def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
     """Return the SHA-256 over the variables of a sensor, in hexadecimal.
 
@@ -177,9 +207,7 @@ def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
     for variable in table:
         if variable.dtype:
             values = np.asarray(group[variable.name][()])
-            text = variable.dtype == "str"
-            digest.update(variable.name.encode())
-            digest.update(b"\0".join(values.ravel().tolist()) if text else values.tobytes())
+            digest.update(variable.name.encode() + values.tobytes())
     return digest.hexdigest()
 
 

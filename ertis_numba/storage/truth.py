@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.storage.schema import TRUTH, lay_out
+from ertis_numba.storage.schema import TRUTH, describe, lay_out
 
 __all__ = ["Truth", "read_truth", "write_truth"]
 
@@ -47,9 +47,9 @@ def write_truth(file: h5py.File, truth: Truth) -> None:
     """Write what the recording should show."""
     n_measurements, n_targets = truth.azimuth_rad.shape
     group = file.create_group("truth", track_order=True)
-    lay_out(group, TRUTH, sizes={"measurement": n_measurements, "target": n_targets})
-    group.attrs["seed"] = truth.seed
-    group["scene"][()] = truth.scene
+    sizes = {"measurement": n_measurements, "target": n_targets}
+    lay_out(group, TRUTH, sizes=sizes, texts={"scene": truth.scene})
+    describe(group, {"seed": truth.seed})
     for name, field in _ARRAYS.items():
         group[name][:] = getattr(truth, field)
 

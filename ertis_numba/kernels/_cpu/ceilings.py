@@ -1,6 +1,6 @@
 # What Numba compiles has no annotations.
 # mypy: ignore-errors
-"""What this machine can do at most: memory bandwidth and arithmetic, measured by kernels that do nothing else.
+"""What this machine can do at most: memory bandwidth and arithmetic, by kernels that do nothing else.
 
 Only benchmarks use these; they are no part of the signal chain.
 """
@@ -11,12 +11,15 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-__all__ = ["FLOPS_PER_TURN", "copy", "multiply_add", "triad"]
+__all__ = ["DOT_16_OPERATIONS", "MULTIPLY_ADD_OPERATIONS", "copy", "dot_16", "multiply_add", "triad"]
 
-_LANES = 16 if binding.get_host_cpu_features().get("avx512f", False) else 8
+_FEATURES = binding.get_host_cpu_features()
+_LANES = 16 if _FEATURES.get("avx512f") else 8
 _SUMS = 12  # independent sums: two units with a latency of four want at least eight
-FLOPS_PER_TURN = 2 * _LANES * _SUMS
-"""Floating-point operations of one turn of `multiply_add` on one thread."""
+_DOT_LANES = 16 if _FEATURES.get("avx512vnni") else 8
+MULTIPLY_ADD_OPERATIONS = 2 * _LANES * _SUMS
+DOT_16_OPERATIONS = 4 * _DOT_LANES * _SUMS
+"""Operations of one turn on one strand; a multiplication and an addition are two."""
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -39,33 +42,61 @@ def _multiply_add(typing_context, turns, factor, addend):
     signature = types.float32(turns, factor, addend)
 
     def codegen(context, builder, signature, arguments):
-        turns, factor, addend = arguments
+        turns, *numbers = arguments
         vector = ir.VectorType(ir.FloatType(), _LANES)
-        blank = ir.Constant(vector, ir.Undefined)
-        lane_0 = ir.Constant(ir.IntType(32), 0)
-        all_lanes_0 = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
+        x, y = (_splat(builder, number, vector) for number in numbers)
 
-        def splat(value):
-            return builder.shuffle_vector(builder.insert_element(blank, value, lane_0), blank, all_lanes_0)
+        def turn(total):
+            product = builder.fmul(builder.load(total), x, flags=("contract",))
+            builder.store(builder.fadd(product, y, flags=("contract",)), total)
 
-        x, y = splat(factor), splat(addend)
-        sums = [cgutils.alloca_once(builder, vector) for _ in range(_SUMS)]
-        for k, total in enumerate(sums):
-            builder.store(ir.Constant(vector, [float(k)] * _LANES), total)
-        with cgutils.for_range(builder, turns):
-            for total in sums:
-                product = builder.fmul(builder.load(total), x, flags=("contract",))
-                builder.store(builder.fadd(product, y, flags=("contract",)), total)
-        whole = builder.load(sums[0])
-        for total in sums[1:]:
-            whole = builder.fadd(whole, builder.load(total))
-        lanes = [builder.extract_element(whole, ir.Constant(ir.IntType(32), k)) for k in range(_LANES)]
-        result = lanes[0]
-        for lane in lanes[1:]:
-            result = builder.fadd(result, lane)
-        return result
+        total = _run(builder, turns, vector, turn, builder.fadd)
+        return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
 
     return signature, codegen
+
+
+@intrinsic
+def _dot_16(typing_context, turns, factor, addend):
+    """Return the total of independent sums of 16-bit dot products, two products per lane and turn."""
+    signature = types.int32(turns, factor, addend)
+
+    def codegen(context, builder, signature, arguments):
+        turns, *numbers = arguments
+        vector = ir.VectorType(ir.IntType(32), _DOT_LANES)
+        pairs = ir.VectorType(ir.IntType(16), 2 * _DOT_LANES)
+        x, y = (builder.bitcast(_splat(builder, number, vector), pairs) for number in numbers)
+        dot_type = ir.FunctionType(vector, [vector, pairs, pairs])
+        dot = cgutils.get_or_insert_function(builder.module, dot_type, f"llvm.x86.avx512.vpdpwssd.{32 * _DOT_LANES}")
+
+        def turn(total):
+            builder.store(builder.call(dot, [builder.load(total), x, y]), total)
+
+        total = _run(builder, turns, vector, turn, builder.add)
+        return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
+
+    return signature, codegen
+
+
+def _splat(builder, number, vector):
+    """Return a vector of one number."""
+    blank, lane = ir.Constant(vector, ir.Undefined), ir.IntType(32)
+    first = builder.insert_element(blank, number, ir.Constant(lane, 0))
+    return builder.shuffle_vector(first, blank, ir.Constant(ir.VectorType(lane, vector.count), [0] * vector.count))
+
+
+def _run(builder, turns, vector, turn, add):
+    """Take ``turn`` on each of the sums, ``turns`` times, and return the sum of the sums."""
+    sums = [cgutils.alloca_once(builder, vector) for _ in range(_SUMS)]
+    for k, total in enumerate(sums):
+        builder.store(ir.Constant(vector, [k] * vector.count), total)
+    with cgutils.for_range(builder, turns):
+        for total in sums:
+            turn(total)
+    whole = builder.load(sums[0])
+    for total in sums[1:]:
+        whole = add(whole, builder.load(total))
+    return whole
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -73,3 +104,10 @@ def multiply_add(turns, out):
     """Run float32 multiply-adds in registers, one strand per element of ``out``, (strand,) float32."""
     for strand in prange(len(out)):
         out[strand] = _multiply_add(turns, np.float32(0.5), np.float32(1.0))
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def dot_16(turns, out):
+    """Run 16-bit dot products in registers, one strand per element of ``out``, (strand,) int32."""
+    for strand in prange(len(out)):
+        out[strand] = _dot_16(turns, np.int32(0x00010001), np.int32(0x00010001))

@@ -1,0 +1,81 @@
+"""Raw files become measurements, or are refused in a line."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop import open_raw
+from ertis_numba.settings import Array, Recording, Settings
+from tests.files import line, noise
+
+SHORT = Settings.from_preset("short_25_50")
+N_BYTES = 4 * 65_536
+
+
+def test_measurements_come_in_the_order_of_the_files(tmp_path):
+    words = [measurement.words for measurement in noise(SHORT)]
+    (tmp_path / "one.bin").write_bytes(words[0].tobytes())
+    (tmp_path / "two.bin").write_bytes(words[1].tobytes() + words[2].tobytes())
+    raw = open_raw([tmp_path / "one.bin", str(tmp_path / "two.bin")], SHORT, sensor="left")
+    assert len(raw) == 3
+    for _ in range(2):  # it can be read again
+        for index, (measurement, given) in enumerate(zip(raw, words, strict=True)):
+            assert measurement.words.dtype == np.uint32
+            assert np.array_equal(measurement.words, given)
+            assert measurement.settings is SHORT
+            assert (measurement.stamp.sensor, measurement.stamp.sequence) == ("left", index)
+
+
+@pytest.mark.parametrize("settings", [line(8, 8), line(70, 16), line(64, 64)], ids=["8", "70 in 16", "64"])
+def test_words_of_any_size(tmp_path, settings):
+    (given,) = noise(settings, 1)
+    (tmp_path / "raw.bin").write_bytes(given.words.tobytes())
+    (back,) = open_raw(tmp_path / "raw.bin", settings)
+    assert np.array_equal(back.words, given.words)
+
+
+def test_word_is_little_endian_and_bit_0_is_channel_0(tmp_path):
+    settings = SHORT.replace(recording=Recording(n_samples=1))
+    (tmp_path / "raw.bin").write_bytes(b"\x01\x00\x00\x80")
+    (measurement,) = open_raw(tmp_path / "raw.bin", settings)
+    assert measurement.words.tolist() == [0x80000001]
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "message"),
+    [
+        (0, r"raw.bin is empty, wanted a multiple of 262144 \(65536 words of 4 bytes\); record it again"),
+        (N_BYTES - 1, r"raw.bin has 262143 bytes, which are no whole words, wanted a multiple of 262144"),
+        (N_BYTES - 4, r"raw.bin has 262140 bytes, wanted a multiple of 262144 .*; it is cut short: copy it again"),
+        (N_BYTES + 4, r"raw.bin has 262148 bytes, wanted a multiple of 262144"),
+        (
+            4 * 163_840,
+            r"raw.bin has 655360 bytes, wanted a multiple of 262144 .*; its length fits the presets default_…",
+        ),
+    ],
+)
+def test_lengths_that_are_refused(tmp_path, n_bytes, message):
+    (tmp_path / "raw.bin").write_bytes(bytes(n_bytes))
+    with pytest.raises(DataError, match=message):
+        open_raw(tmp_path / "raw.bin", SHORT)
+
+
+def test_places_that_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"none.bin: No such file or directory; give a file of raw words"):
+        open_raw(tmp_path / "none.bin", SHORT)
+    with pytest.raises(DataError, match="is a folder; give a file of raw words"):
+        open_raw(tmp_path, SHORT)
+    with pytest.raises(ArgumentError, match="no raw file is given; give at least one"):
+        open_raw([], SHORT)
+    with pytest.raises(ArgumentError, match="layout 'nothing' is unknown"):
+        open_raw(tmp_path, SHORT.replace(array=Array(layout="nothing")))
+
+
+def test_a_file_that_shrinks_meanwhile(tmp_path):
+    path = tmp_path / "raw.bin"
+    path.write_bytes(bytes(2 * N_BYTES))
+    raw = iter(open_raw(path, SHORT))
+    next(raw)
+    path.write_bytes(bytes(N_BYTES))
+    with pytest.raises(DataError, match="became shorter while it was read; copy it again"):
+        next(raw)
