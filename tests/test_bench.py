@@ -39,8 +39,12 @@ def test_summary_is_mean_deviation_and_median():
 def test_paper_command_reports_and_updates(tmp_path):
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("paper"), "utf-8")
-    result = CliRunner().invoke(cli, ["bench", "paper", "--count", "1", "--json", "--update", str(target)])
+    other = tmp_path / "other.md"
+    other.write_text(MARKED.format("paper"), "utf-8")
+    files = ["--update", str(target), "--update", str(other)]
+    result = CliRunner().invoke(cli, ["bench", "paper", "--count", "1", "--json", *files])
     assert result.exit_code == 0, result.output
+    assert other.read_text("utf-8") == target.read_text("utf-8")
     report = json.loads(result.stdout)
     assert {"cpu", "cores", "python", "numpy", "numba"} <= report["machine"].keys()
     assert [(row["backend"], row["directions"]) for row in report["rows"]] == [

@@ -90,10 +90,11 @@ def _checked(report: dict[str, Any]) -> str:
 def _conditions(report: dict[str, Any]) -> str:
     first_m, last_m = report["range_m"]
     return (
-        f"{report['count']} measurements each, in one process, the backends in turns of five: {report['words']:,} "
-        f"words of 32 microphones ({report['source']}) to an energyscape of {first_m:g}–{last_m:g} m. Included: "
-        "everything from the words in memory to the image in memory. Not included: reading the file, making the "
-        "pipeline, compilation, and three calls of each to warm up; images go to one array that is used again. "
+        f"The same measurement {report['count']} times, in one process, the backends in turns of five: "
+        f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+        f"{first_m:g}–{last_m:g} m. Included: everything from the words in memory to the image in memory. Not "
+        "included: reading the file, making the pipeline, compilation, and three calls of each to warm up; images go "
+        "to one array that is used again. "
         "`scipy` runs on one thread, as its filters and sums do anyhow, and over the whole record, as the paper does; "
         "`numpy` and `cpu` compute the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
         "The paper does not state the length of its records."

@@ -29,10 +29,11 @@ def _count(default: int) -> Callable[..., Any]:
 
 _update = click.option(
     "--update",
-    "target",
+    "targets",
+    multiple=True,
     type=click.Path(path_type=Path, dir_okay=False, exists=True, writable=True),
     metavar="FILE",
-    help="Replace the table between the markers of a Markdown file.",
+    help="Replace the table between the markers of a Markdown file; may be given again.",
 )
 
 
@@ -65,16 +66,18 @@ def scaling(**given: Any) -> None:
     _run("scaling", benchmark, **given)
 
 
-def _run(name: str, benchmark: ModuleType, *, count: int, target: Path | None, quiet: bool, as_json: bool) -> None:
+def _run(
+    name: str, benchmark: ModuleType, *, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool
+) -> None:
     from ertis_bench import tables
 
-    if target is not None:
+    for target in targets:
         tables.around(target, name)  # refused now rather than after minutes
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
     table: str = getattr(tables, name)(report)
-    if target is not None:
+    for target in targets:
         tables.update(target, name, table)
     if as_json:
         options.print_json(report)
-    elif target is None:
+    elif not targets:
         click.echo(table)

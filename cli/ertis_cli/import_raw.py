@@ -50,6 +50,6 @@ def import_raw(
     target = target or raw[0].with_suffix(".h5")
     with options.progress(measurements, length=len(measurements), label="importing", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=", ".join(path.name for path in raw))
-    options.say(f"{target}: {len(measurements)} measurements", quiet=quiet)
+    options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements)})

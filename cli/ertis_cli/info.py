@@ -82,4 +82,7 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
 
 def _iso(time_ns: int) -> str | None:
     """Return a time as ISO 8601; none is known where the record says 0."""
-    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat() if time_ns else None
+    if not time_ns:
+        return None
+    second = datetime.fromtimestamp(time_ns // 10**9, UTC)
+    return f"{second:%Y-%m-%dT%H:%M:%S}.{time_ns % 10**9:09d}Z"

@@ -15,7 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
-    "bench": ("ertis_cli.bench:bench", "Measure this machine."),
+    "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
@@ -43,23 +43,39 @@ class _Commands(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, COMMANDS[name][1]) for name in sorted(COMMANDS)])
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,  # noqa: FBT001, FBT002  as click has it
+        **extra: Any,
+    ) -> Any:
         """Run, and leave with an exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
-        extra["standalone_mode"] = False
         try:
-            code = super().main(args, prog_name or "ertis", **extra)
-        except click.UsageError as error:
-            path = error.ctx.command_path if error.ctx else "ertis"
-            _leave(_USAGE, f"{error.format_message().rstrip('.')}; see '{path} --help'")
-        except click.ClickException as error:
-            _leave(_FAILED, error.format_message())
-        except click.Abort:
-            _leave(_INTERRUPTED, "interrupted")
+            code = super().main(args, prog_name or "ertis", complete_var, standalone_mode=False, **extra)
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+            sys.exit(_USAGE)
         except Exception as error:
-            if not _is_expected(error):
+            if not standalone_mode:
                 raise
-            _leave(_FAILED, str(error))
+            _leave(*_told(error))
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def _told(error: Exception) -> tuple[int, str]:
+    """Return the exit code of an error and the line to tell it; raise again what is a mistake in the program."""
+    if isinstance(error, click.UsageError):
+        path = error.ctx.command_path if error.ctx else "ertis"
+        return _USAGE, f"{error.format_message().rstrip('.')}; see '{path} --help'"
+    if isinstance(error, click.ClickException):
+        return _FAILED, error.format_message()
+    if isinstance(error, click.Abort):
+        return _INTERRUPTED, "interrupted"
+    if _is_expected(error):
+        return _FAILED, str(error) or type(error).__name__
+    raise error
 
 
 def _is_expected(error: Exception) -> bool:
@@ -82,7 +98,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
         ctx.exit()
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group("ertis", cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option(
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the version."
 )
@@ -94,7 +110,7 @@ def cli() -> None:
     """
 
 
-def main() -> NoReturn:
+def main() -> None:
     """Run the command line."""
     cli.main()
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "INTERVAL",
     "as_json",
+    "counted",
     "device",
     "force",
     "input_file",
@@ -38,10 +39,9 @@ __all__ = [
 
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-_SLOW_S = 1.0
 
 
-class _Interval(click.ParamType):
+class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     name = "A:B"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
@@ -140,6 +140,11 @@ def say(text: str, *, quiet: bool) -> None:
         click.echo(text, err=True)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things in words."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def print_json(report: dict[str, Any]) -> None:
     """Print one object on stdout."""
     click.echo(json.dumps(report, indent=None, allow_nan=False))
@@ -165,12 +170,12 @@ def require_same_air(measurement: "Measurement", settings: "Settings") -> None:
 
 
 @contextmanager
-def note_when_slow(text: str, *, quiet: bool) -> Iterator[None]:
-    """Print ``text`` if the block takes more than a second."""
-    timer = threading.Timer(_SLOW_S, say, args=(text,), kwargs={"quiet": quiet})
+def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
+    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it."""
+    timer = threading.Timer(after_s, say, args=(text,), kwargs={"quiet": quiet})
     timer.daemon = True
     timer.start()
     try:
-        yield
+        yield timer
     finally:
         timer.cancel()

@@ -8,6 +8,8 @@ from ertis_cli import options
 
 __all__ = ["peaks"]
 
+_ROW = "{measurement:11d}  {azimuth_deg:+11.2f}  {elevation_deg:+13.2f}  {range_m:7.3f}  {level_db:8.1f}"
+
 
 @click.command()
 @options.input_file("IMG.h5")
@@ -41,10 +43,6 @@ def peaks(*, path: Path, top: int, min_level: float, measurement: int | None, as
     if as_json:
         options.print_json({"peaks": rows})
         return
-    click.echo("measurement  azimuth °  elevation °  range m  level dB")
+    click.echo("measurement  azimuth_deg  elevation_deg  range_m  level_db")
     for row in rows:
-        click.echo(
-            "{measurement:11d}  {azimuth_deg:+9.2f}  {elevation_deg:+11.2f}  {range_m:7.3f}  {level_db:8.1f}".format(
-                **row
-            )
-        )
+        click.echo(_ROW.format(**row))

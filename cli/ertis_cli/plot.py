@@ -22,7 +22,7 @@ _FORMATS = (".pdf", ".png", ".svg")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
-@click.option("--theme", type=click.Choice(["dark", "light"]), default="dark", show_default=True)
+@click.option("--theme", type=click.Choice(["dark", "light"]), default="dark", show_default=True, help="Colours.")
 @click.option(
     "--peaks", "top", type=click.IntRange(min=0), default=5, show_default=True, metavar="N", help="Reflectors to mark."
 )

@@ -79,17 +79,18 @@ def process(
                 image = pipeline.process(measurement)
                 times_ms.append(1000 * (time.perf_counter() - start_s))
                 writer.write(image)
+    median_ms = statistics.median(times_ms)
     report = {
         "output": str(target),
         "measurements": len(times_ms),
         "directions": len(pipeline.grid),
         "ranges": len(pipeline.range_m),
         "device": pipeline.device,
-        "median_ms": round(statistics.median(times_ms), 3),
+        "median_ms": round(median_ms, 3),
     }
     options.say(
-        "{output}: {measurements} measurements, {directions} directions × {ranges} ranges on {device}, "
-        "{median_ms:.1f} ms each (median)".format(**report),
+        f"{target}: {options.counted(len(times_ms), 'measurement')}, {len(pipeline.grid)} directions × "
+        f"{len(pipeline.range_m)} ranges on {pipeline.device}, {median_ms:.1f} ms each (median)",
         quiet=quiet,
     )
     if as_json:

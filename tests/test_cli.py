@@ -1,0 +1,309 @@
+"""The commands do what they say, on stdout, on stderr and with their exit codes."""
+
+import ast
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli import options
+from ertis_cli.main import COMMANDS, cli
+
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.settings import PRESETS, Air
+from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
+from tests.files import SMALL, image, noise
+
+MODULE = [sys.executable, "-m", "ertis_cli"]
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+LAYOUT = ["--layout", "eRTIS_v3D1", "--preset", "short_25_50"]
+FAST = ["--range", "0.5:1.2", "--directions", "2d:9"]
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+def report(*arguments):
+    return json.loads(run(*arguments, "--json").stdout)
+
+
+@pytest.fixture
+def raw(tmp_path):
+    path = tmp_path / "raw.bin"
+    path.write_bytes(np.random.default_rng(3).integers(0, 2**32, 2 * 65_536, dtype="<u4").tobytes())
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "rec.h5", noise())
+
+
+@pytest.fixture
+def images(tmp_path):
+    return write_energyscapes(tmp_path / "img.h5", [image(), image(seed=2)])
+
+
+def test_from_raw_words_to_a_picture(tmp_path, raw):
+    rec, img, picture = (tmp_path / name for name in ("rec.h5", "img.h5", "picture.png"))
+    assert report("import", raw, "-o", rec, *LAYOUT, "--temperature", 12.5, "--humidity", 80)["measurements"] == 2
+    made = report("process", rec, "-o", img, *FAST)
+    assert (made["measurements"], made["directions"], made["device"]) == (2, 9, "cpu")
+    assert made["median_ms"] > 0
+    found = report("peaks", img, "--top", 2)["peaks"]
+    assert [peak["measurement"] for peak in found] == [0, 0, 1, 1]
+    assert set(found[0]) == {"measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"}
+    run("plot", img, "-o", picture, "-m", 1)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    with open_recording(rec) as back:
+        assert back.settings.air == Air(temperature_c=12.5, humidity_percent=80.0)
+        assert np.array_equal(np.concatenate([m.words for m in back]), np.fromfile(raw, "<u4"))
+    with open_energyscapes(img) as back:
+        assert back.range_m[-1] <= 1.2
+        assert back.attributes["source"] == "rec.h5"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["img.h5", "picture.png", "raw.bin", "rec.h5"]
+
+
+def test_default_outputs_stand_beside_the_input(tmp_path, raw):
+    run("import", raw, *LAYOUT)
+    run("process", tmp_path / "raw.h5", *FAST)
+    run("plot", tmp_path / "raw.energy.h5")
+    names = sorted(item.name for item in tmp_path.iterdir())
+    assert names == ["raw.bin", "raw.energy.h5", "raw.energy.png", "raw.h5"]
+
+
+def test_several_raw_files(tmp_path, raw):
+    run("import", raw, raw, "-o", tmp_path / "rec.h5", *LAYOUT, "--sensor", "left")
+    with open_recording(tmp_path / "rec.h5") as back:
+        assert [m.stamp.sequence for m in back] == [0, 1, 2, 3]
+        assert back.sensor == "left"
+
+
+def test_json_is_one_object_and_all_of_stdout(recording, images, tmp_path):
+    for arguments in (
+        ["process", recording, "-o", tmp_path / "p.h5", *FAST],
+        ["info", recording],
+        ["info", images],
+        ["peaks", images],
+        ["plot", images],
+    ):
+        done = run(*arguments, "--json")
+        assert done.stdout.count("\n") == 1
+        assert isinstance(json.loads(done.stdout), dict)
+
+
+def test_words_for_people_go_to_stderr_and_can_be_silenced(recording, tmp_path):
+    done = run("process", recording, "-o", tmp_path / "a.h5", *FAST)
+    assert done.stdout == ""
+    assert "3 measurements, 9 directions" in done.stderr
+    done = run("process", recording, "-o", tmp_path / "b.h5", *FAST, "--quiet")
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_info(recording, images):
+    held = report("info", recording)
+    assert (held["kind"], held["measurements"], held["samples"], held["microphones"]) == ("recording", 3, 40_960, 32)
+    assert held["first"] == "2023-11-14T22:13:20.123456789Z"
+    assert held["simulated"] is False
+    held = report("info", images)
+    assert (held["kind"], held["measurements"], held["directions"], held["ranges"]) == ("energyscape", 2, 37, 400)
+    assert ["directions", "37"] in [line.split() for line in run("info", images).stdout.splitlines()]
+
+
+def test_info_of_unknown_times(tmp_path):
+    write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].words, SMALL)])
+    assert report("info", tmp_path / "rec.h5")["first"] is None
+
+
+def test_peaks_table(images):
+    lines = run("peaks", images, "-m", 1, "--top", 1).stdout.splitlines()
+    assert lines[0].split() == ["measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"]
+    assert lines[1].split()[0] == "1"
+    assert len(lines) == 2
+
+
+def test_threads_and_methods_and_types(recording, tmp_path):
+    energies = {}
+    for name, extra in {
+        "one": ["--threads", 1],
+        "two": ["--threads", 2],
+        "numpy": ["--device", "numpy"],
+        "paper": ["--method", "paper"],
+        "half": ["--dtype", "float16"],
+    }.items():
+        run("process", recording, "-o", tmp_path / f"{name}.h5", *FAST, *extra)
+        with open_energyscapes(tmp_path / f"{name}.h5") as back:
+            energies[name] = back[0].energy
+    assert np.array_equal(energies["one"], energies["two"])
+    np.testing.assert_allclose(energies["half"], energies["one"], rtol=2**-10, atol=1e-7)
+    np.testing.assert_allclose(energies["numpy"], energies["one"], atol=0.01 * energies["one"].max())
+    assert not np.array_equal(energies["paper"], energies["one"])
+
+
+def test_limits_of_a_grid(recording, tmp_path):
+    run("process", recording, "-o", tmp_path / "img.h5", "--directions", "2d:3", "--azimuth", "-40:20", *FAST[:2])
+    with open_energyscapes(tmp_path / "img.h5") as back:
+        np.testing.assert_allclose(np.degrees(back.azimuth_rad), [-40, -10, 20])
+
+
+def test_settings_file_changes_what_it_holds(recording, tmp_path):
+    (tmp_path / "some.toml").write_text('[air]\ntemperature_c = 0.0\n[processing]\ndirections = "2d:5"\n')
+    run("process", recording, "-o", tmp_path / "img.h5", "--settings", tmp_path / "some.toml", *FAST[:2])
+    with open_energyscapes(tmp_path / "img.h5") as back:
+        assert back.settings.air == SMALL.air.replace(temperature_c=0.0)
+        assert back.settings.processing.directions == "2d:5"
+        assert back.settings.processing.oversampling == SMALL.processing.oversampling
+        assert len(back.azimuth_rad) == 5
+
+
+def test_settings_file_replaces_an_array_as_a_whole(recording, tmp_path):
+    (tmp_path / "some.toml").write_text('[array]\nlayout = "eRTIS_v2"\n')
+    energies = []
+    for extra in ([], ["--settings", tmp_path / "some.toml"]):
+        run("process", recording, "-o", tmp_path / "img.h5", *FAST, *extra, "--force")
+        with open_energyscapes(tmp_path / "img.h5") as back:
+            energies.append(back[0].energy)
+    assert back.settings.array.layout == "eRTIS_v2"
+    assert not np.allclose(energies[0], energies[1])
+
+
+def test_changing_air_is_refused_unless_one_is_given(tmp_path):
+    warm = SMALL.replace(air=Air(temperature_c=30.0))
+    words = noise()[0].words
+    write_recording(tmp_path / "rec.h5", [Measurement(words, SMALL), Measurement(words, warm, Stamp(sequence=1))])
+    done = run("process", tmp_path / "rec.h5", *FAST, code=1)
+    assert "measurement 1 was taken at 30 °C" in done.stderr
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+    (tmp_path / "air.toml").write_text("[air]\ntemperature_c = 25.0\n")
+    run("process", tmp_path / "rec.h5", *FAST, "--settings", tmp_path / "air.toml")
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_plot_of_a_recording(recording, tmp_path, kind):
+    run("plot", recording, "-o", tmp_path / f"a.{kind}", "--theme", "light", "--dynamic-range", 30, "--peaks", 0)
+    assert (tmp_path / f"a.{kind}").stat().st_size > 10_000
+
+
+def test_force_overwrites(images, tmp_path):
+    (tmp_path / "a.png").write_text("mine")
+    assert "exists" in run("plot", images, "-o", tmp_path / "a.png", code=1).stderr
+    assert (tmp_path / "a.png").read_text() == "mine"
+    run("plot", images, "-o", tmp_path / "a.png", "--force")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_every_command_is_documented():
+    context = click.Context(cli)
+    for name, (_, about) in COMMANDS.items():
+        command = cli.get_command(context, name)
+        assert command.name == name
+        assert command.help.splitlines()[0] == about
+        assert run(name, "--help").stdout.startswith("Usage: ")
+        members = command.commands.values() if isinstance(command, click.Group) else [command]
+        for member in members:
+            assert all(option.help for option in member.params if isinstance(option, click.Option)), member.name
+
+
+def test_help_names_all_commands():
+    text = run("--help").stdout
+    for name, (_, about) in COMMANDS.items():
+        assert name in text
+        assert about in text
+
+
+def test_no_command_shows_the_help():
+    done = run(code=2)
+    assert done.stdout == ""
+    assert done.stderr.startswith("Usage: ertis [OPTIONS] COMMAND")
+
+
+def test_a_reader_that_stops(images):
+    """As ``ertis peaks | head -1``: whoever reads no further is no error to tell."""
+    process = subprocess.Popen(
+        [*MODULE, "peaks", images], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    process.wait(timeout=60)
+    process.stderr.close()
+
+
+def test_help_names_all_presets():
+    text = run("import", "--help").stdout
+    for preset in PRESETS:
+        length, _, band = preset.partition("_")
+        assert f"{length}_" in text
+        assert band in text
+
+
+def test_commands_load_their_libraries_inside():
+    """Only click and the standard library may load with a command, so that help comes at once."""
+    allowed = {*sys.stdlib_module_names, "click", "ertis_cli"}
+    for path in Path(options.__file__).parent.glob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) else []
+            assert {name.partition(".")[0] for name in names} <= allowed, path
+
+
+def test_help_loads_nothing_heavy():
+    code = "import sys; from ertis_cli.main import cli; cli.main(['--help'])"
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True
+    )
+    loaded = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
+    assert "click" in loaded
+    assert not loaded & {"numba", "numpy", "scipy", "h5py", "matplotlib", "msgspec"}
+
+
+def test_import_of_the_package_loads_nothing_heavy():
+    code = "import sys, ertis_numba; ertis_numba.ErtisError, ertis_numba.__version__; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert not {"numba", "numpy", "scipy", "h5py", "matplotlib", "msgspec"} & set(done.stdout.split())
+
+
+def test_version():
+    done = subprocess.run([*MODULE, "--version"], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("ertis ")
+
+
+def test_failure_in_a_process_of_its_own(images):
+    done = subprocess.run([*MODULE, "process", images], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("ertis: error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_interrupted(tmp_path):
+    with (tmp_path / "long.bin").open("wb") as file:
+        file.truncate(4 * 65_536 * 8000)  # a sparse file, 2 GB of silence
+    command = [*MODULE, "import", tmp_path / "long.bin", "-o", tmp_path / "rec.h5", *LAYOUT]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + 60
+    while not list(tmp_path.glob("*.part")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline_s
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors.strip() == "ertis: error: interrupted"
+    assert [item.name for item in tmp_path.iterdir()] == ["long.bin"]
+
+
+def test_slow_work_is_explained(capsys):
+    with options.note_when_slow("still working", after_s=0.0, quiet=False) as note:
+        note.join()
+    assert capsys.readouterr().err == "still working\n"
+    with options.note_when_slow("still working", quiet=False):
+        pass
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,161 @@
+"""Bad input ends in one line that says what came, what was wanted and what to do: nothing else."""
+
+import os
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.storage import write_energyscapes, write_recording
+from tests.files import image, noise
+
+N_BYTES = 4 * 65_536
+RAW = "import {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
+CASES = {
+    # raw words
+    "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
+    "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty, wanted a multiple of 262144"),
+    "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which are no whole words"),
+    "truncated raw file": (RAW.format("cut.bin"), 1, "cut.bin has 262140 bytes, wanted a multiple of 262144"),
+    "one good, one bad": (RAW.format("good.bin odd.bin"), 1, "odd.bin has 262143 bytes"),
+    "folder for raw file": (RAW.format("folder"), 1, "folder is a folder; give a file of raw words"),
+    "unknown layout": (
+        "import good.bin -o out.h5 --layout eRTIS_v3D --preset short_25_50",
+        1,
+        "layout 'eRTIS_v3D' is unknown (did you mean 'eRTIS_v3D1'?); known are eRTIS_v2",
+    ),
+    "missing layout file": (
+        "import good.bin -o out.h5 --layout none.csv --preset short_25_50",
+        1,
+        "layout none.csv: [Errno 2] No such file or directory",
+    ),
+    "NaN in layout": (
+        "import good.bin -o out.h5 --layout nan.csv --preset short_25_50",
+        1,
+        "layout nan.csv: positions_mm holds nan at [1, 2]; give finite numbers",
+    ),
+    "unknown preset": (
+        "import good.bin -o out.h5 --layout eRTIS_v2 --preset short_30_50",
+        1,
+        "preset 'short_30_50' is unknown (did you mean 'short_25_50'?); known are short_20_80",
+    ),
+    "no layout": ("import good.bin -o out.h5 --preset short_25_50", 2, "Missing option '--layout'"),
+    "no raw file": ("import --layout eRTIS_v2 --preset short_25_50", 2, "Missing argument 'RAW.bin...'"),
+    "temperature": (
+        RAW.format("good.bin") + " --temperature nan",
+        1,
+        "air.temperature_c is nan; give a finite number",
+    ),
+    "sensor name": (RAW.format("good.bin") + " --sensor a/b", 1, "sensor name 'a/b' cannot stand in a file; give"),
+    # recordings
+    "missing recording": ("process none.h5 -o out.h5", 1, "none.h5: No such file or directory; give a recording"),
+    "empty recording": ("process empty.h5 -o out.h5", 1, "empty.h5 is empty; give a recording"),
+    "not HDF5": ("process good.bin -o out.h5", 1, "good.bin is not an HDF5 file; give a recording"),
+    "HDF5 of others": ("process other.h5 -o out.h5", 1, "other.h5 is HDF5, but not of this package; give a recording"),
+    "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; give"),
+    "recording instead": ("peaks rec.h5", 1, "rec.h5 is a recording, wanted an energyscape file; process it first"),
+    "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged, it has"),
+    "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, this package reads up to 1; update"),
+    "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
+    "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, the settings"),
+    "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
+    # processing
+    "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 1, "count of directions '2d:0' is 0; give a whole"),
+    "empty directions": ("process rec.h5 -o out.h5 --directions 3d:", 1, "directions '3d:' has no count; give for"),
+    "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 1, "directions '4d:3' is no grid; give 90"),
+    "empty CSV": ("process rec.h5 -o out.h5 --directions empty.csv", 1, "directions empty.csv has not two numbers"),
+    "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: [Errno 2] No such file"),
+    "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "processing.range_m ends at 50 m, but the record"),
+    "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 1, "processing.range_m runs from 3 to 1; give the"),
+    "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 1, "processing.range_m is nan; give a finite number"),
+    "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is no interval, give two numbers as in 0.5:5"),
+    "limits of a paper grid": (
+        "process rec.h5 -o out.h5 --directions 90 --azimuth -9:9",
+        2,
+        "directions 90 have limits of their own; give 2d:N or 3d:N with limits; see 'ertis process --help'",
+    ),
+    "unknown device": ("process rec.h5 -o out.h5 --device cuda", 2, "'cuda' is not one of 'auto', 'cpu', 'numpy'"),
+    "unknown method": ("process rec.h5 -o out.h5 --method quick", 2, "'quick' is not one of 'fast', 'paper'"),
+    "no threads": ("process rec.h5 -o out.h5 --threads 0", 1, "threads is 0; give a whole number from 1"),
+    "unknown key": ("process rec.h5 -o out.h5 --settings key.toml", 1, "key.toml: unknown key `tempreature_c`"),
+    "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv: "),
+    "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: [Errno 2] No such file"),
+    "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "make the pipeline from the recording's own"),
+    # outputs
+    "output exists": ("process rec.h5 -o img.h5", 1, "output img.h5 exists; give another name, or ask to overwrite it"),
+    "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
+    "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: there is no folder none; make it"),
+    "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the recording itself; give"),
+    # looking
+    "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
+    "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
+    "no peaks": ("peaks img.h5 --top 0", 1, "top is 0; give a whole number of at least 1"),
+    "peaks above": ("peaks img.h5 --min-level 3", 1, "min_level_db is 3; give a number from -1000 to 0"),
+    "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
+    "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "dynamic_range_db is -5; give a number above 0"),
+    # usage
+    "unknown command": ("prozess", 2, "No such command 'prozess'"),
+    "unknown option": ("info rec.h5 --jsno", 2, "No such option"),
+    "no command": ("--verbose", 2, "No such option"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """All the files that the cases name, good and bad."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "folder").mkdir()
+    for name, n_bytes in {"good": N_BYTES, "empty": 0, "odd": N_BYTES - 1, "cut": N_BYTES - 4}.items():
+        (folder / f"{name}.bin").write_bytes(bytes(n_bytes))
+    (folder / "empty.h5").touch()
+    (folder / "empty.csv").touch()
+    (folder / "nan.csv").write_text("0, 0\n1, nan\n2, 0\n")
+    (folder / "key.toml").write_text("[air]\ntempreature_c = 3.0\n")
+    (folder / "long.toml").write_text("[recording]\nn_samples = 163840\n")
+    write_recording(folder / "rec.h5", noise())
+    write_energyscapes(folder / "img.h5", [image()])
+    for name in ("cut", "newer", "damaged", "nan"):
+        shutil.copy(folder / "rec.h5", folder / f"{name}.h5")
+    os.truncate(folder / "cut.h5", 100_000)
+    with h5py.File(folder / "other.h5", "w") as file:
+        file["x"] = 1
+    with h5py.File(folder / "newer.h5", "r+") as file:
+        file.attrs["ertis_format_version"] = 9
+    with h5py.File(folder / "damaged.h5", "r+") as file:
+        file["sensors/eRTIS-7/pdm"][1, 5] ^= 1
+    with h5py.File(folder / "nan.h5", "r+") as file:
+        file["sensors/eRTIS-7/calibration_gain"][3] = np.nan
+    return folder
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_line_and_nothing_left(folder, monkeypatch, name):
+    command, code, message = CASES[name]
+    monkeypatch.chdir(folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    done = CliRunner().invoke(cli, command.split())
+    assert done.exit_code == code, done.output
+    assert done.stdout == ""
+    assert done.stderr.startswith("ertis: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, folder):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    tmp_path.chmod(0o555)
+    done = CliRunner().invoke(cli, ["process", str(folder / "rec.h5"), "-o", str(tmp_path / "out.h5")])
+    assert done.exit_code == 1
+    assert "Permission denied" in done.stderr
+
+
+def test_mistakes_of_the_program_keep_their_traceback(monkeypatch):
+    monkeypatch.setattr("ertis_cli.info.options.print_json", None)
+    monkeypatch.setattr("ertis_numba.storage.file_kind", None)
+    done = CliRunner().invoke(cli, ["info", "x"])
+    assert isinstance(done.exception, TypeError)
