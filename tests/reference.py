@@ -93,23 +93,22 @@ def paper(words, settings: Settings, directions):
         settings.call, np.arange(int(padded_s * settings.recording.pdm_rate_hz)) / settings.recording.pdm_rate_hz
     )
     call = _paper_filters(emitted, settings)
-    taps = _paper_low_pass(settings)
+    low_pass, late = _paper_low_pass(settings)
     pulse = np.abs(np.correlate(call, call, "full"))
-    peak = np.convolve(pulse, taps, "same")[len(call) - 1]
+    peak = scipy.signal.sosfilt(low_pass, np.append(pulse, np.zeros(late)))[len(call) - 1 + late]
     n_samples = -(-signals.shape[1] // settings.decimation)
-    at = np.arange(n_samples)
-    image = np.zeros((len(directions), len(at[::step])))
+    at = np.arange(n_samples + late)
+    outputs = np.arange(0, n_samples, step)
+    image = np.zeros((len(directions), len(outputs)))
     matched = [np.correlate(_paper_filters(signal, settings), call, "full") for signal in signals]
     for index, direction in enumerate(directions):
         delay_s = -(layout.enabled_positions_m @ direction) / speed_m_s + layout.delay_s[layout.enabled]
-        beam = np.zeros(n_samples)
+        beam = np.zeros(len(at))
         for row, delay in zip(matched, np.rint(delay_s * rate_hz).astype(int), strict=True):
             place = at + delay + len(call) - 1  # lag 0 of a full correlation
             beam += np.where(place < len(row), row[np.clip(place, 0, len(row) - 1)], 0)
-        image[index] = np.convolve(np.abs(beam) / (peak * len(matched)), taps, "full")[len(taps) // 2 :][
-            :n_samples:step
-        ]
-    range_m = at[::step] * speed_m_s / (2 * rate_hz)
+        image[index] = scipy.signal.sosfilt(low_pass, np.abs(beam) / (peak * len(matched)))[outputs + late]
+    range_m = outputs * speed_m_s / (2 * rate_hz)
     first_m, last_m = settings.processing.range_m
     inside = (range_m > first_m - 1e-9) & (range_m < last_m + 1e-9)
     return image[:, inside], range_m[inside]
@@ -127,12 +126,11 @@ def _paper_filters(signal, settings):
 
 
 def _paper_low_pass(settings):
-    """The envelope's low pass: -6 dB at half of the output rate or the call's lowest frequency."""
-    cutoff = min(settings.output_rate_hz / 2, settings.call.low_frequency_hz) / settings.signal_rate_hz
-    n_taps, beta = scipy.signal.kaiserord(60, 2 * cutoff)
-    at = np.arange(-(n_taps // 2), n_taps // 2 + 1)
-    taps = np.sinc(2 * cutoff * at) * np.kaiser(len(at), beta)
-    return taps / taps.sum()
+    """The envelope's low pass, Butterworth as well, and by how many samples it is late."""
+    cutoff_hz = min(settings.output_rate_hz / 2, settings.call.low_frequency_hz)
+    sections = scipy.signal.butter(6, cutoff_hz, fs=settings.signal_rate_hz, output="sos")
+    impulse = scipy.signal.sosfilt(sections, np.eye(1, 100_000)[0])
+    return sections, round(float(np.arange(len(impulse)) @ impulse / impulse.sum()))  # delay of its centre of mass
 
 
 def unpack_bits(words, channels):

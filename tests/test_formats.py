@@ -1,0 +1,54 @@
+"""The page on file formats and the tables in the code say the same."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.settings import PRESETS, Settings
+from ertis_numba.storage.schema import CONVENTIONS, ENERGYSCAPE, FORMAT_VERSION, RECORDING, STAMPS, TRUTH
+
+PAGE = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+SHARED = [*STAMPS, *(variable for variable in RECORDING if variable.name == "settings")]
+
+
+def rows(first):
+    """The variables of the table that begins with ``first``: name, axes, types, unit."""
+    table = PAGE[PAGE.index(f"| `{first}` |") :].split("\n\n", 1)[0]
+    for line in table.splitlines():
+        name, axes, kinds, unit = (cell.strip() for cell in line.strip("|").split("|")[:4])
+        yield name.strip("`"), tuple(filter(None, axes.split(", "))), re.split(", | or ", kinds), unit
+
+
+@pytest.mark.parametrize(
+    ("first", "table"),
+    [
+        ("time", SHARED),
+        ("temperature", [variable for variable in RECORDING if variable not in SHARED]),
+        ("scene", TRUTH),
+        ("energy", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
+    ],
+)
+def test_tables(first, table):
+    told = list(rows(first))
+    assert [row[0] for row in told] == [variable.name for variable in table]
+    for (_, axes, kinds, unit), variable in zip(told, table, strict=True):
+        assert (axes, unit) == (variable.dims, variable.units)
+        if variable.dtype:
+            assert kinds == ["text" if variable.dtype == "str" else np.dtype(variable.dtype).name]
+        else:
+            assert len(kinds) > 1
+
+
+def test_names_and_versions():
+    assert f"`{CONVENTIONS}`" in PAGE
+    assert f"`ertis_format_version` ({FORMAT_VERSION})" in PAGE
+
+
+def test_presets():
+    for preset in PRESETS:
+        line = next(line for line in PAGE.splitlines() if f"`{preset}`" in line)
+        words = Settings.from_preset(preset).recording.n_samples
+        assert f"{words:,}" in line
+        assert f"{4 * words:,}" in line
