@@ -32,6 +32,8 @@ __all__ = [
     "unit_vectors",
 ]
 
+_CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
+
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
     "1850": ("3d:1850", (-45.0, 45.0), (-45.0, 45.0)),
@@ -201,7 +203,11 @@ def microphones(array: Array) -> Layout:
         return load_layout(array.layout)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
     enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
-    centred_m = np.where(enabled[:, None], positions_m - positions_m[enabled].mean(axis=0), 0.0)
+    centre_m = positions_m[enabled].mean(axis=0)
+    # Positions that are centred already stay as they are to the last bit, so that a layout read from
+    # a recording gives the image that the named one gave.
+    centre_m[np.abs(centre_m) < _CENTRED_M] = 0.0
+    centred_m = np.where(enabled[:, None], positions_m - centre_m, 0.0)
     return Layout(
         name=array.layout,
         positions_m=centred_m,

@@ -16,7 +16,7 @@ def real() -> None:
     raw = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     settings = ertis.Settings.from_preset("default_25_50")
     settings = settings.replace(processing=settings.processing.replace(directions="2d:181", range_m=(0.8, 5.0)))
-    (measurement,) = ertis.open_raw(str(raw), settings)
+    (measurement,) = ertis.open_raw(str(raw), settings, sensor="eRTIS")
     image = ertis.Pipeline(settings).process(measurement)
     ertis.plot(image, peaks=ertis.find_peaks(image, top=5)).savefig(HERE / "real.png")
 

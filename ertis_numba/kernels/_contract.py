@@ -202,7 +202,7 @@ class DelayAndSumEnvelopeInt16(Protocol):
     Parameters
     ----------
     tiles, scales, starts
-        As in `QuantiseTiles`. Tiles may overlap; where the image has fewer ranges than a tile there is one.
+        As in `QuantiseTiles`, ``tile_ranges`` apart; of the last tile only the ranges of the image are written.
     offsets : (direction, mic) int32
         Into one tile, in complex samples.
     weights : (direction, mic, 2, 2) int16

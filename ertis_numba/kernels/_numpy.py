@@ -137,8 +137,8 @@ def delay_and_sum_envelope_int16(
     tiles: Short, scales: Real, starts: Index, offsets: Index, weights: Short, weight_scale: np.float32, out: Real
 ) -> None:
     """See `DelayAndSumEnvelopeInt16`."""
-    n_ranges = min(_TILE_RANGES, out.shape[1])
     for tile, start in enumerate(starts):
+        n_ranges = min(_TILE_RANGES, out.shape[1] - start)
         flat = tiles[tile].reshape(-1, 2).astype(np.int32)
         for direction, places in enumerate(offsets):
             samples = flat[places[:, None] + np.arange(n_ranges)]  # (mic, range, 2)

@@ -157,8 +157,7 @@ class BeamformInt16:
         width = kernels.tile_ranges + int(table.samples.max()) + 1
         self._offsets = table.offsets(n_phases, width)
         n_tiles = -(-n_ranges // kernels.tile_ranges)
-        starts = np.arange(n_tiles) * kernels.tile_ranges
-        self._starts = np.minimum(starts, max(0, n_ranges - kernels.tile_ranges)).astype(np.int32)
+        self._starts = np.arange(n_tiles, dtype=np.int32) * np.int32(kernels.tile_ranges)
         self._shape = (n_tiles, n_mics, n_phases, width, 2)
         self._quantise = kernels.quantise_tiles
         self._kernel = kernels.delay_and_sum_envelope_int16

@@ -100,9 +100,9 @@ def delay_and_sum_envelope_int16(tiles, scales, starts, offsets, weights, weight
         scale = scales[tile] * weight_scale
         short = np.empty((1, RANGES), np.float32)
         for direction in range(begin, min(begin + block, n_directions)):
-            if n_ranges < RANGES:
+            if starts[tile] + RANGES > n_ranges:
                 _beam_tile(tiles, tile, offsets, weights, direction, scale, short, 0)
-                out[direction] = short[0, :n_ranges]
+                out[direction, starts[tile] :] = short[0, : n_ranges - starts[tile]]
             else:
                 place = direction * n_ranges + starts[tile]
                 _beam_tile(tiles, tile, offsets, weights, direction, scale, out, place)

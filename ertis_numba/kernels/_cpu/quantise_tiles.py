@@ -20,9 +20,9 @@ def _largest(signals, begin, end):
     largest = np.int32(0)
     for mic in range(n_mics):
         for phase in range(n_phases):
-            row = bits[mic, phase]
-            for k in range(2 * begin, 2 * end):
-                largest = max(largest, row[k] & _MAGNITUDE)
+            part = bits[mic, phase, 2 * begin : 2 * end]
+            for k in range(part.size):
+                largest = max(largest, part[k] & _MAGNITUDE)
     return largest
 
 
@@ -38,13 +38,14 @@ def quantise_tiles(signals, starts, limit, tiles, scales):
     for tile in range(n_tiles):
         scales[tile] = largest[tile] / limit
     parts = signals.view(np.float32)
+    targets = tiles.reshape(n_tiles, n_mics, n_phases, 2 * width)
     for row in prange(n_tiles * n_mics):
         tile, mic = row // n_mics, row % n_mics
         factor = np.float32(0) if largest[tile] == 0 else limit / largest[tile]
         inside = 2 * (min(starts[tile] + width, n_samples) - starts[tile])
         for phase in range(n_phases):
             source = parts[mic, phase, 2 * starts[tile] : 2 * starts[tile] + inside]
-            target = tiles[tile, mic, phase].reshape(-1)
+            target = targets[tile, mic, phase]
             for k in range(inside):
                 target[k] = np.int16(np.rint(source[k] * factor))
             target[inside:] = np.int16(0)
