@@ -32,7 +32,7 @@ pictures: $(VENV)/ready  ## redraw the pictures of the README
 	$(BIN)/python docs/pictures/build.py
 
 bench: $(VENV)/ready  ## measure this machine and write bench/README.md
-	$(BIN)/ertis bench paper --update bench/README.md
+	$(BIN)/ertis bench paper --update bench/README.md --update README.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 
 clean:

@@ -10,7 +10,13 @@ __all__ = ["describe", "sentence"]
 
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
 _FLAGS = ("fma", "avx2", "avx512f", "avx512_vnni", "avx_vnni", "asimd")  # what the kernels can make use of
-_ENVIRONMENT = ("OPENBLAS_NUM_THREADS", "OMP_WAIT_POLICY", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
+_ENVIRONMENT = (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_WAIT_POLICY",
+    "GOMP_SPINCOUNT",
+    "NUMBA_NUM_THREADS",
+    "NUMBA_THREADING_LAYER",
+)
 
 
 def describe() -> dict[str, Any]:

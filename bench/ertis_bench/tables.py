@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ertis_bench import timing
 from ertis_bench.machine import sentence
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_numba.errors import ArgumentError
@@ -90,7 +91,7 @@ def _checked(report: dict[str, Any]) -> str:
 def _conditions(report: dict[str, Any]) -> str:
     first_m, last_m = report["range_m"]
     return (
-        f"The same measurement {report['count']} times, in one process, the backends in turns of five: "
+        f"The same measurement {report['count']} times, in one process, the backends in turns of {timing.BURST}: "
         f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
         f"{first_m:g}–{last_m:g} m. Included: everything from the words in memory to the image in memory. Not "
         "included: reading the file, making the pipeline, compilation, and three calls of each to warm up; images go "
@@ -122,8 +123,8 @@ def scaling(report: dict[str, Any]) -> str:
     parts += [_reached(**reached) for reached in report["delay_and_sum"]]
     parts.append(f"Measured on {sentence(report['machine'])}")
     parts.append(
-        f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of five. "
-        "What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, where none is named, "
+        f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
+        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, where none is named, "
         "the precision that is the fastest here. Every image was checked against the exact one before it was timed; "
         "three calls to warm up are not counted. Ceilings are the best of as many runs, over arrays of 64 MiB and in "
         "registers; a multiplication and an addition are two operations."

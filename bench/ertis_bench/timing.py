@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["round_robin", "summary"]
+__all__ = ["BURST", "round_robin", "summary"]
 
 _WARM_UP = 3
-_BURST = 5  # calls in a row: as in a stream, and still many rounds that spread a drift over all
+BURST = 25  # calls in a row, with warm caches as in a stream; the rounds spread a drift over all
 
 
 def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> dict[str, NDArray[np.float64]]:
@@ -26,9 +26,9 @@ def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> 
     collecting = gc.isenabled()
     gc.disable()
     try:
-        for begin in range(0, count, _BURST):
+        for begin in range(0, count, BURST):
             for name, subject in subjects.items():
-                for _ in range(begin, min(begin + _BURST, count)):
+                for _ in range(begin, min(begin + BURST, count)):
                     start_ns = time.perf_counter_ns()
                     subject()
                     times_ms[name].append((time.perf_counter_ns() - start_ns) / 1e6)

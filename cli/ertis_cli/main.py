@@ -1,16 +1,11 @@
 """The ``ertis`` command: finds its commands by name, and turns errors into one line and an exit code."""
 
 import importlib
-import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import click
-
-# libgomp reads this when Numba loads it: its idle threads otherwise spin on the cores that the
-# transforms between two kernels need.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __all__ = ["COMMANDS", "cli", "main"]
 
