@@ -124,8 +124,9 @@ def scaling(report: dict[str, Any]) -> str:
     parts.append(f"Measured on {sentence(report['machine'])}")
     parts.append(
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
-        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, where "
-        "none is named, the precision that is the fastest here. Every image was checked against the exact one before it was timed; "
+        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, "
+        "where none is named, the precision that is the fastest here. Every image was checked against the exact one "
+        "before it was timed; "
         "three calls to warm up are not counted. Ceilings are the best of as many runs, over arrays of 64 MiB and in "
         "registers; a multiplication and an addition are two operations."
     )
