@@ -11,11 +11,11 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Array, Processing
 
@@ -42,14 +42,14 @@ PAPER_GRIDS = {
 """The three grids of the paper: kind, azimuth limits and elevation limits in degrees."""
 
 
-class _LayoutFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _LayoutFile(Document, frozen=True, kw_only=True):
     """What a layout file may hold."""
 
     positions_mm: list[list[float]]
     name: str = ""
     source: str = ""
     word_bits: int = 32
-    disabled: list[int] = []
+    disabled: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +137,7 @@ def load_layout(name: str | Path) -> Layout:
     if path.suffix.lower() not in {".toml", ".csv"}:
         checks.choice("layout", name, layout_names())
         text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
-        return _layout(str(name), text)
+        return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
     try:
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -146,7 +146,7 @@ def load_layout(name: str | Path) -> Layout:
         ) from error
     if path.suffix.lower() == ".csv":
         return _placed(str(name), _LayoutFile(name=path.stem, positions_mm=_csv_rows(f"layout {name}", text)))
-    return _layout(str(name), text)
+    return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
 
 
 def _csv_rows(source: str, text: str) -> list[list[float]]:
@@ -157,14 +157,6 @@ def _csv_rows(source: str, text: str) -> list[list[float]]:
         raise ArgumentError(
             f"{source}: {error}; give rows of numbers parted by commas, and comments after #"
         ) from error
-
-
-def _layout(source: str, text: str) -> Layout:
-    try:
-        return _placed(source, msgspec.toml.decode(text, type=_LayoutFile))
-    except msgspec.DecodeError as error:  # ValidationError is one, too
-        reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
-        raise ArgumentError(f"layout {source}: {reason}; correct it or take it out") from error
 
 
 def _placed(source: str, file: _LayoutFile) -> Layout:

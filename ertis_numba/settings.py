@@ -6,12 +6,9 @@ recording presets.
 """
 
 import math
-from pathlib import Path
 from typing import Any, Literal, Self
 
-import msgspec
 import numpy as np
-import tomli_w
 
 from ertis_numba import checks
 from ertis_numba.constants import (
@@ -22,7 +19,8 @@ from ertis_numba.constants import (
     STANDARD_TEMPERATURE_C,
     WORD_BITS,
 )
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.documents import Document, Table
+from ertis_numba.errors import ArgumentError
 
 __all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settings"]
 
@@ -34,18 +32,7 @@ PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
 
 
-class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a settings file."""
-
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked again."""
-        unknown = set(changes) - set(self.__struct_fields__)
-        if unknown:
-            checks.choice(f"{type(self).__name__} field", min(unknown), self.__struct_fields__)
-        return msgspec.structs.replace(self, **changes)
-
-
-class Array(_Section, frozen=True):
+class Array(Table, frozen=True, kw_only=True):
     """Where the microphones are and how their bits lie in a word.
 
     Attributes
@@ -99,7 +86,7 @@ class Array(_Section, frozen=True):
                 checks.between(f"array.{name}[{channel}]", value, low, high)
 
 
-class Call(_Section, frozen=True):
+class Call(Table, frozen=True, kw_only=True):
     """The emitted sweep: hyperbolic frequency modulation with a Hann ramp at both ends.
 
     Attributes
@@ -146,7 +133,7 @@ class Call(_Section, frozen=True):
         return max(self.start_frequency_hz, self.stop_frequency_hz)
 
 
-class Recording(_Section, frozen=True):
+class Recording(Table, frozen=True, kw_only=True):
     """How much is recorded: PDM clock and number of samples of one measurement."""
 
     pdm_rate_hz: float = ERTIS_PDM_RATE_HZ
@@ -162,7 +149,7 @@ class Recording(_Section, frozen=True):
         return self.n_samples / self.pdm_rate_hz
 
 
-class Air(_Section, frozen=True):
+class Air(Table, frozen=True, kw_only=True):
     """The medium, which sets the speed of sound."""
 
     temperature_c: float = STANDARD_TEMPERATURE_C
@@ -175,7 +162,7 @@ class Air(_Section, frozen=True):
         checks.between("air.pressure_pa", self.pressure_pa, 10_000.0, 200_000.0)
 
 
-class Processing(_Section, frozen=True):
+class Processing(Table, frozen=True, kw_only=True):
     """How a measurement becomes an energyscape.
 
     Attributes
@@ -228,7 +215,7 @@ class Processing(_Section, frozen=True):
         checks.choice("processing.precision", self.precision, ("auto", "float32", "int16"))
 
 
-class Settings(_Section, frozen=True):
+class Settings(Document, frozen=True, kw_only=True):
     """All settings of one sensor: the whole content of a settings file."""
 
     array: Array = Array()
@@ -268,43 +255,6 @@ class Settings(_Section, frozen=True):
         if band == "20_80":
             processing = processing.replace(range_decimation=40, oversampling=6)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
-
-    @classmethod
-    def from_toml(cls, text: str, source: str = "settings") -> Self:
-        """Read settings from TOML; ``source`` names them in errors.
-
-        Raises
-        ------
-        SettingsError
-            The text is not TOML, has unknown keys, or a value cannot be used.
-        """
-        try:
-            return msgspec.toml.decode(text, type=cls)
-        except msgspec.DecodeError as error:  # ValidationError is one, too
-            reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
-            raise SettingsError(f"{source}: {reason}; correct it or take it out") from error
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a settings file.
-
-        Raises
-        ------
-        SettingsError
-            The file cannot be read or used.
-        """
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(f"{path}: {error}; give a readable settings file") from error
-        return cls.from_toml(text, str(path))
-
-    def to_toml(self) -> str:
-        """Return the settings as TOML text that `from_toml` reads back to an equal structure."""
-        tables = msgspec.to_builtins(self)
-        return tomli_w.dumps(
-            {name: {key: value for key, value in table.items() if value is not None} for name, table in tables.items()}
-        )
 
     @property
     def decimation(self) -> int:

@@ -5,13 +5,9 @@ keep all PDM bits at one value.
 """
 
 from pathlib import Path
-from typing import Any, Self
-
-import msgspec
-import tomli_w
 
 from ertis_numba import checks
-from ertis_numba.errors import SettingsError
+from ertis_numba.documents import Document, Table
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Settings
 
@@ -20,18 +16,7 @@ __all__ = ["DirectSound", "Electronics", "Point", "Scene", "load_scene"]
 _HIGHEST_STRENGTH_DB = 120.0  # far beyond any overload; the bound catches amplitudes given for levels
 
 
-class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a scene file."""
-
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked again."""
-        unknown = set(changes) - set(self.__struct_fields__)
-        if unknown:
-            checks.choice(f"{type(self).__name__} field", min(unknown), self.__struct_fields__)
-        return msgspec.structs.replace(self, **changes)
-
-
-class Point(_Part, frozen=True, kw_only=True):
+class Point(Table, frozen=True, kw_only=True):
     """A reflector so small that it sends the call back alike in all directions.
 
     Attributes
@@ -57,7 +42,7 @@ class Point(_Part, frozen=True, kw_only=True):
         checks.between("point.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
 
 
-class DirectSound(_Part, frozen=True, kw_only=True):
+class DirectSound(Table, frozen=True, kw_only=True):
     """What the microphones hear of the emitter beside them.
 
     Attributes
@@ -72,7 +57,7 @@ class DirectSound(_Part, frozen=True, kw_only=True):
         checks.between("direct_sound.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
 
 
-class Electronics(_Part, frozen=True, kw_only=True):
+class Electronics(Table, frozen=True, kw_only=True):
     """What the microphones add.
 
     Attributes
@@ -97,7 +82,7 @@ class Electronics(_Part, frozen=True, kw_only=True):
         checks.between("electronics.dither", self.dither, 0.0, 2.0)
 
 
-class Scene(_Part, frozen=True, kw_only=True):
+class Scene(Document, frozen=True, kw_only=True):
     """A sensor and what it hears: the whole content of a scene file.
 
     Attributes
@@ -124,25 +109,6 @@ class Scene(_Part, frozen=True, kw_only=True):
         checks.whole("seed", self.seed, 0)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
 
-    @classmethod
-    def from_toml(cls, text: str, source: str = "scene") -> Self:
-        """Read a scene from TOML; ``source`` names it in errors.
-
-        Raises
-        ------
-        SettingsError
-            The text is not TOML, has unknown keys, or a value cannot be used.
-        """
-        try:
-            return msgspec.toml.decode(text, type=cls)
-        except msgspec.DecodeError as error:  # ValidationError is one, too
-            reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
-            raise SettingsError(f"{source}: {reason}; correct it or take it out") from error
-
-    def to_toml(self) -> str:
-        """Return the scene as TOML text that `from_toml` reads back to an equal structure."""
-        return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
-
 
 def load_scene(path: str | Path) -> Scene:
     """Read a scene file.
@@ -158,22 +124,9 @@ def load_scene(path: str | Path) -> Scene:
         Its layout file cannot be read or used.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: {error}; give a readable scene file") from error
-    scene = Scene.from_toml(text, str(path))
+    scene = Scene.load(path)
     layout = scene.sensor.array.layout
     if scene.sensor.array.positions_m is None and Path(layout).suffix.lower() in {".toml", ".csv"}:
         array = load_layout(path.parent / layout).to_array()
         scene = scene.replace(sensor=scene.sensor.replace(array=array))
     return scene
-
-
-def _without_none(table: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no null: what is not given is left out."""
-    return {
-        key: _without_none(value) if isinstance(value, dict) else value
-        for key, value in table.items()
-        if value is not None
-    }
