@@ -4,7 +4,6 @@ from typing import Final
 
 __all__ = [
     "ERTIS_PDM_RATE_HZ",
-    "ERTIS_WORDS_MULTIPLE",
     "MAX_MICROPHONES",
     "STANDARD_HUMIDITY_PERCENT",
     "STANDARD_PRESSURE_PA",
@@ -17,7 +16,6 @@ STANDARD_HUMIDITY_PERCENT: Final = 50.0
 STANDARD_PRESSURE_PA: Final = 101_325.0  # ISO 9613-1, reference pressure
 
 ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
-ERTIS_WORDS_MULTIPLE: Final = 32_768  # the device records whole multiples of this many words
 
 MAX_MICROPHONES: Final = 1024
 WORD_BITS: Final = (8, 16, 32, 64)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Array, Settings
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
 
@@ -26,7 +26,8 @@ class Pipeline:
     ----------
     settings : Settings
     device : {"auto", "cpu", "numpy"}
-        ``numpy`` runs the same algorithm without compiled kernels, for comparison.
+        ``numpy`` runs the same algorithm without compiled kernels, for comparison. The paper's method
+        has no compiled kernels.
     threads : int, optional
         Threads of one `process`; all cores by default. The result does not depend on it.
 
@@ -45,13 +46,14 @@ class Pipeline:
     """
 
     def __init__(self, settings: Settings, device: str = "auto", threads: int | None = None) -> None:
-        kernel_set = kernels.load(device)
+        kernel_set = kernels.load(_device_for(settings, device))
         threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(threads):  # refuses a number that cannot be had
             pass
         self.settings = settings
         self.device = kernel_set.device
         layout = microphones(settings.array)
+        self._accepted = settings
         self._words_shape = (settings.recording.n_samples, layout.n_words)
         self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
         self._chain = _chain(settings, kernel_set, threads)
@@ -66,15 +68,17 @@ class Pipeline:
         ----------
         measurement : Measurement
         out : (direction, range) float32, optional
-            Where the energy goes; a new array by default, which is the only large one made.
+            Where the energy goes; a new array by default. Besides it, only the spectra are allocated anew.
 
         Raises
         ------
         DataError
-            The words are not those of the pipeline's settings.
+            The measurement's array, call, record or air, or its words, are not those of the pipeline's
+            settings.
         ArgumentError
             ``out`` has another shape or type.
         """
+        self._require_same_sensor(measurement.settings)
         words = self._checked_words(measurement.words)
         energy = self._new_energy() if out is None else self._checked_out(out)
         self._chain.process(words, energy)
@@ -100,6 +104,21 @@ class Pipeline:
     def _new_energy(self) -> NDArray[np.float32]:
         return np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
 
+    def _require_same_sensor(self, settings: Settings) -> None:
+        """Refuse what the tables were not made for: only how to process may differ."""
+        if settings is self._accepted:
+            return
+        for name in ("call", "recording", "air"):
+            came, wanted = getattr(settings, name), getattr(self.settings, name)
+            if came != wanted:
+                raise DataError(f"measurement has {came}, the pipeline {wanted}; make a pipeline from its settings")
+        if settings.array != self.settings.array and not _same_layout(settings.array, self.settings.array):
+            raise DataError(
+                f"measurement has array {settings.array.layout!r}, the pipeline another, "
+                f"{self.settings.array.layout!r}; make a pipeline from its settings"
+            )
+        self._accepted = settings
+
     def _checked_words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
         n_samples, n_words = self._words_shape
         wanted = self._words_shape if n_words > 1 else (n_samples,)
@@ -108,13 +127,40 @@ class Pipeline:
                 f"measurement holds {words.dtype} words of shape {words.shape}; the settings want "
                 f"{self._words_dtype} of shape {wanted}: make the pipeline from the recording's own settings"
             )
-        return np.ascontiguousarray(words).reshape(self._words_shape)
+        # Read-only or unaligned arrays would each be a type of their own to compile the kernels for.
+        return np.require(words, requirements=["C", "A", "W"]).reshape(self._words_shape)
 
     def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = (len(self.grid), len(self.range_m))
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
         return out
+
+
+def _device_for(settings: Settings, device: str) -> str:
+    """Return the device to load; the paper's method has NumPy only.
+
+    Raises
+    ------
+    DeviceError
+        Another one is asked for by name.
+    """
+    if settings.processing.method == "fast" or device not in {"auto", *kernels.DEVICES}:
+        return device
+    if device not in {"auto", "numpy"}:
+        raise DeviceError(
+            f"processing.method 'paper' has no kernels for device {device!r}; use device 'numpy' or 'auto'"
+        )
+    return "numpy"
+
+
+def _same_layout(array: Array, other: Array) -> bool:
+    """Whether two arrays are the same microphones, one named and one written out, say."""
+    came, wanted = microphones(array), microphones(other)
+    return came.word_bits == wanted.word_bits and all(
+        np.array_equal(getattr(came, name), getattr(wanted, name))
+        for name in ("positions_m", "enabled", "gain", "delay_s")
+    )
 
 
 def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int) -> Chain:

@@ -25,8 +25,11 @@ from ertis_numba.errors import ArgumentError
 __all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settings"]
 
 _WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
+_MOST_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
 _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
+_MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
+_WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
 _LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
@@ -141,7 +144,7 @@ class Recording(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         checks.positive("recording.pdm_rate_hz", self.pdm_rate_hz)
-        checks.whole("recording.n_samples", self.n_samples, 1)
+        checks.whole("recording.n_samples", self.n_samples, 1, _MOST_SAMPLES)
 
     @property
     def duration_s(self) -> float:
@@ -231,6 +234,13 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
                 f"{self.call.high_frequency_hz:g} Hz"
             )
+        step = self.processing.range_decimation
+        if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
+            raise ArgumentError(
+                f"processing.range_decimation {step} has no divisor near "
+                f"{self._largest_decimation}, the decimation that suits the call; give one that has, such as a "
+                f"multiple of {self._largest_decimation}, or give processing.decimation"
+            )
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:
@@ -267,10 +277,13 @@ class Settings(Document, frozen=True, kw_only=True):
         given = self.processing.decimation
         if given is not None:
             return given
-        least_hz = _LEAST_RATE[self.processing.method] * self.call.high_frequency_hz
-        largest = max(1, math.floor(self.recording.pdm_rate_hz / least_hz))
         step = self.processing.range_decimation
-        return max(divisor for divisor in range(1, min(largest, step) + 1) if step % divisor == 0)
+        return max(divisor for divisor in range(1, min(self._largest_decimation, step) + 1) if step % divisor == 0)
+
+    @property
+    def _largest_decimation(self) -> int:
+        least_hz = _LEAST_RATE[self.processing.method] * self.call.high_frequency_hz
+        return min(max(1, math.floor(self.recording.pdm_rate_hz / least_hz)), _MOST_DECIMATION)
 
     @property
     def output_decimation(self) -> int:

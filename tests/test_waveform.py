@@ -16,6 +16,7 @@ from ertis_numba.waveform import (
     matched_band_hz,
     matched_filter,
     matched_guard_s,
+    whole_taps,
 )
 
 RATE_HZ = 450_000.0
@@ -187,3 +188,22 @@ def test_decimation_that_leaves_too_little_is_refused(decimation):
     rate_hz = 4.5e6 / decimation
     with pytest.raises(ArgumentError, match=f"decimation {decimation} leaves {rate_hz:g} Hz, too little.*lower it"):
         decimation_taps(pdm_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
+
+
+@settings(max_examples=60, deadline=None)
+@given(decimation=st.integers(1, 100), share=st.floats(0.05, 0.5))
+def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
+    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=decimation, pass_hz=share * 4.5e6 / decimation / 2)
+    whole = whole_taps(taps)
+    assert whole.dtype == np.int16
+    assert np.abs(whole.astype(int)).sum() <= 32_767
+    change = np.fft.rfft(whole / whole.sum(dtype=int) - taps, 8 * len(taps))
+    assert 20 * np.log10(np.abs(change).max() + 1e-12) < -49
+
+
+def test_taps_too_many_for_16_bits_are_refused():
+    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=500, pass_hz=0.8 * 4500)
+    with pytest.raises(ArgumentError, match=r"decimation filter of \d+ taps is too long for 16 bits .* smaller"):
+        whole_taps(taps)
+    with pytest.raises(ArgumentError, match="too long for 16 bits"):
+        whole_taps(np.full(70_001, 1 / 70_001))

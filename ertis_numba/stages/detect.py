@@ -19,7 +19,6 @@ _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
 _PULSE_M = 0.04  # length of a compressed pulse down to -40 dB
 _ONE_SIDED = 0.25  # mean offset of neighbours, by their reach, that tells the edge of a grid
-_PSF_BINS = 1024  # transform of the point-spread function: some 80 bins in the band
 
 
 def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float = -30.0) -> list[Peak]:
@@ -51,19 +50,20 @@ def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float 
     places = _local_maxima(image.energy, neighbours, floor)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
     spread = _PointSpread(image.settings)
-    masked = np.zeros(len(places))
     found: list[tuple[NDArray[np.float64], float, float]] = []
+    chosen: list[int] = []
     for k in np.argsort(-levels, kind="stable"):
         if len(found) == top:
             break
-        if levels[k] <= masked[k] * 10 ** (_MARGIN_DB / 20):
+        # Only what comes next in order is compared with what was found: that is few of many candidates.
+        offset_m = image.range_m[places[k, 1]] - image.range_m[places[chosen, 1]]
+        near = np.flatnonzero(np.abs(offset_m) < spread.reach_m)
+        offset = directions[places[k, 0]] - directions[places[chosen, 0]]
+        masked = float(levels[chosen][near] @ spread(offset[near], offset_m[near]))
+        if levels[k] <= masked * 10 ** (_MARGIN_DB / 20):
             continue
+        chosen.append(int(k))
         found.append(_interpolate(image, directions, neighbours, *places[k]))
-        near = np.flatnonzero(np.abs(image.range_m[places[:, 1]] - image.range_m[places[k, 1]]) < spread.reach_m)
-        masked[near] += levels[k] * spread(
-            directions[places[near, 0]] - directions[places[k, 0]],
-            image.range_m[places[near, 1]] - image.range_m[places[k, 1]],
-        )
     found.sort(key=lambda entry: -entry[2])
     return [
         Peak(
@@ -119,15 +119,18 @@ class _PointSpread:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._speed_m_s = sound_speed_m_s(settings.air)
-        matched = matched_filter(settings.call, n_fft=_PSF_BINS, rate_hz=settings.signal_rate_hz)
-        bins = matched.first_bin + np.arange(len(matched.values))
-        self._wave_1_m = 2 * math.pi * bins * settings.signal_rate_hz / _PSF_BINS / self._speed_m_s
-        self._power = np.abs(matched.values) ** 2
-        self._power /= self._power.sum()
+        speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
         self._positions_m = microphones(settings.array).enabled_positions_m
-        aperture_m = float(np.max(np.linalg.norm(self._positions_m, axis=1)))
-        self.reach_m = aperture_m + _PULSE_M
+        self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + _PULSE_M
+        # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
+        spacing_hz = speed_m_s / (6 * self.reach_m)
+        n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
+        matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
+        thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
+        bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]
+        self._wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / speed_m_s
+        self._power = np.abs(matched.values[thinned]) ** 2
+        self._power /= self._power.sum()
 
     def __call__(
         self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64]
@@ -143,10 +146,8 @@ class _PointSpread:
         range_offset_m : (place,) float64
         """
         path_m = 2 * range_offset_m[:, None] - direction_offset @ self._positions_m.T
-        amplitude = np.empty(len(path_m))
-        for place, paths in enumerate(path_m):
-            amplitude[place] = np.abs(self._power @ np.exp(1j * self._wave_1_m[:, None] * paths).mean(axis=1))
-        return amplitude
+        waves = np.exp(1j * self._wave_1_m[:, None, None] * path_m)  # (bin, place, mic)
+        return np.asarray(np.abs(np.tensordot(self._power, waves.mean(axis=2), axes=1)))
 
 
 def _interpolate(

@@ -1,6 +1,7 @@
 """A file appears under its name complete, or not at all."""
 
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,7 +52,7 @@ def require_room(folder: Path, n_bytes: int) -> None:
 def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield the name to write to; when the block ends well, that file becomes ``path``.
 
-    The name ends in ``.part`` and holds the process number, so that two writers never share it. The
+    The name ends in ``.part`` and is nobody else's, so that two writers never share it. The
     file reaches the disk before it takes its name. Whatever ends the block, no ``.part`` is left.
 
     Raises
@@ -60,7 +61,7 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         As `check_target`, before the block and again before the file takes its name.
     """
     check_target(path, overwrite=overwrite)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
         yield part
         _sync(part)

@@ -1,22 +1,22 @@
-# What Numba compiles has no annotations.
-# mypy: ignore-errors
 """What this machine can do at most: memory bandwidth and arithmetic, by kernels that do nothing else.
 
 Only benchmarks use these; they are no part of the signal chain.
 """
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ertis_numba.kernels._cpu.features import target_features
+
 __all__ = ["DOT_16_OPERATIONS", "MULTIPLY_ADD_OPERATIONS", "copy", "dot_16", "multiply_add", "triad"]
 
-_FEATURES = binding.get_host_cpu_features()
-_LANES = 16 if _FEATURES.get("avx512f") else 8
+_FEATURES = target_features()
+_LANES = 16 if "avx512f" in _FEATURES else 8
 _SUMS = 12  # independent sums: two units with a latency of four want at least eight
-_DOT_LANES = 16 if _FEATURES.get("avx512vnni") else 8
+_DOT_LANES = 16 if "avx512vnni" in _FEATURES else 8
 MULTIPLY_ADD_OPERATIONS = 2 * _LANES * _SUMS
 DOT_16_OPERATIONS = 4 * _DOT_LANES * _SUMS
 """Operations of one turn on one strand; a multiplication and an addition are two."""

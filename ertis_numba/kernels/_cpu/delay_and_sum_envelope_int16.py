@@ -7,19 +7,21 @@ point of the float32 kernel; 2.2 times its speed on one Zen 5 core. The sums are
 """
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ertis_numba.kernels._cpu.features import target_features
+
 __all__ = ["HAS_INT16_DOT", "RANGES", "delay_and_sum_envelope_int16"]
 
-_FEATURES = binding.get_host_cpu_features()
-_LANES = 16 if _FEATURES.get("avx512vnni") else 8  # complex samples in a vector
+_FEATURES = target_features()
+_LANES = 16 if "avx512vnni" in _FEATURES else 8  # complex samples in a vector
 _VECTORS = 6  # per sum: 12 chains of additions hide the instruction's latency
 _BLOCK = 512  # directions
 
-HAS_INT16_DOT = bool(_FEATURES.get("avx512vnni") or _FEATURES.get("avxvnni"))
+HAS_INT16_DOT = not _FEATURES.isdisjoint({"avx512vnni", "avxvnni"})
 RANGES = _VECTORS * _LANES  # of one tile
 
 

@@ -66,16 +66,6 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
 
 
 @njit(nogil=True, cache=True)
-def _tap_sum_at_edge(words, word, shift, taps, first):
-    """Sum of taps times ±1 for one output whose taps reach over an end of the record, where x is 0."""
-    total = np.float32(0)
-    for tap in range(max(0, -first), min(taps.size, words.shape[0] - first)):
-        bit = np.int64(words[first + tap, word] >> np.uint64(shift)) & 1
-        total += taps[tap] * np.float32(2 * bit - 1)
-    return total
-
-
-@njit(nogil=True, cache=True)
 def _turn_tile(tile, word, channels, tap_total, scale, begin, end, out):
     """Write the sums of one word's channels, from ``tile`` (sample, bit) to ``out`` (mic, sample)."""
     word_bits = tile.shape[1]

@@ -1,0 +1,24 @@
+"""What the processor that Numba compiles for can do."""
+
+from llvmlite import binding
+from numba.core import config
+
+__all__ = ["target_features"]
+
+
+def target_features() -> frozenset[str]:
+    """Return the names of the target's features, as LLVM writes them.
+
+    Not simply those of this processor: NUMBA_CPU_FEATURES and NUMBA_CPU_NAME compile for another one, such as
+    the oldest of several machines that share a cache, and an instruction that it lacks would abort the
+    compiler.
+    """
+    if config.CPU_FEATURES is not None:
+        flags = str(config.CPU_FEATURES).split(",")
+        return frozenset(flag[1:] for flag in flags if flag.startswith("+"))
+    if config.CPU_NAME == "generic":
+        return frozenset()
+    try:
+        return frozenset(name for name, present in binding.get_host_cpu_features().items() if present)
+    except RuntimeError:  # LLVM does not know this system
+        return frozenset()

@@ -1,0 +1,70 @@
+"""The promised times and sizes, measured on whole processes. The best of a few runs counts: machines are shared."""
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.settings import Processing, Settings
+from tests.cases import noise
+
+ERTIS = [sys.executable, "-m", "ertis_cli"]
+
+
+def seconds(command, *, times, **options):
+    """The quickest of some runs, and what the last one said."""
+    best = np.inf
+    for _ in range(times):
+        start = time.perf_counter()
+        done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=True, **options)
+        best = min(best, time.perf_counter() - start)
+    return best, done.stderr
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """One default measurement."""
+    path = tmp_path_factory.mktemp("figures") / "recording.h5"
+    ertis.write_recording(path, [noise(Settings.from_preset("default_25_50"))])
+    return path
+
+
+def test_help_answers_in_0_3_s():
+    assert seconds([*ERTIS, "--help"], times=5)[0] < 0.3
+
+
+def test_warm_process_of_one_measurement_takes_less_than_1_5_s(recording, tmp_path):
+    command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--force"]
+    assert seconds(command, times=4)[0] < 1.5
+
+
+def test_first_run_takes_less_than_12_s_and_says_why(recording, tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000"]
+    taken_s, said = seconds(command, times=1, env=environment)
+    assert taken_s < 12
+    assert "compiling kernels" in said
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path):
+    """700 measurements are 460 MB; half of that in memory would be too much."""
+    settings = Settings.from_preset("default_25_50").replace(
+        processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
+    )
+    words = noise(settings).words
+    path = tmp_path / "long.h5"
+    ertis.write_recording(path, (Measurement(words, settings, Stamp(sequence=n)) for n in range(700)))
+    code = (
+        "import resource, sys; from ertis_cli.main import cli\n"
+        "try: cli.main(sys.argv[1:])\n"
+        "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", code, "process", str(path), "-o", str(tmp_path / "image.h5"), "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert int(done.stderr.split()[-1]) * unit < 400e6
