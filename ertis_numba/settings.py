@@ -188,7 +188,7 @@ class Processing(Table, frozen=True, kw_only=True):
         Delays are kept in steps of ``1 / oversampling`` of the range spacing.
     precision : {"auto", "float32", "int16"}
         Of the samples that beams are summed from. ``int16`` needs a processor with a 16-bit dot product
-        and errs by about -77 dB; ``auto`` takes the faster one for the device and the number of directions.
+        and errs by about -75 dB; ``auto`` takes the faster one for the device and the number of directions.
     """
 
     method: Literal["fast", "paper"] = "fast"

@@ -23,6 +23,7 @@ CONTRACTS = {
     "delay_and_sum_envelope": _contract.DelayAndSumEnvelope,
     "quantise_tiles": _contract.QuantiseTiles,
     "delay_and_sum_envelope_int16": _contract.DelayAndSumEnvelopeInt16,
+    "modulate_pdm": _contract.ModulatePdm,
 }
 FLOAT32 = 1e-5  # relative to the largest number that goes in
 

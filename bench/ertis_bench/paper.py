@@ -53,7 +53,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         say(f"{n_directions} directions: checking results")
         pipelines = {name: _pipeline(measurement, n_directions, **which) for name, which in BACKENDS.items()}
         errors_db[str(n_directions)] = _check(pipelines, measurement)
-        say(f"{n_directions} directions: timing {count} measurements on {', '.join(pipelines)}")
+        say(f"{n_directions} directions: timing {count} of each on {', '.join(pipelines)}")
         subjects = {name: _into_one_array(pipeline, measurement) for name, pipeline in pipelines.items()}
         for name, times_ms in timing.round_robin(subjects, count=count).items():
             rows.append({"backend": name, "directions": n_directions, **timing.summary(times_ms)})

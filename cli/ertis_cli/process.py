@@ -20,13 +20,20 @@ __all__ = ["process"]
 @click.option("--elevation", type=options.INTERVAL, help="Limits of 3d:N in °.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="The recording's own choice by default.")
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Changes.")
+@click.option(
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="TOML whose keys replace the recording's.",
+)
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help="float16 halves the file and keeps three digits; netCDF programs cannot read it.",
+    help="float16 halves the file; it keeps three digits down to -84 dB of full scale, fewer below, and netCDF "
+    "programs cannot read it.",
 )
 @options.device
 @options.threads

@@ -47,7 +47,9 @@ def simulate(
     rest = (render(scene, index) if index else first for index in range(count))
     with options.progress(rest, length=count, label="simulating", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=path.name, truth=_truth(scene, peaks, count))
-    options.say(f"{target}: {count} measurements, {len(peaks)} reflectors", quiet=quiet)
+    options.say(
+        f"{target}: {options.counted(count, 'measurement')}, {options.counted(len(peaks), 'reflector')}", quiet=quiet
+    )
     if as_json:
         reflectors = [{name: getattr(peak, name) for name in peak.__slots__} for peak in peaks]
         options.print_json({"output": str(target), "measurements": count, "seed": scene.seed, "reflectors": reflectors})

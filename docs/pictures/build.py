@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 
 
 def real() -> None:
-    """Draw the real measurement in 181 directions with its ten strongest reflectors."""
+    """Draw the real measurement in 181 directions with its five strongest reflectors."""
     raw = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     settings = ertis.Settings.from_preset("default_25_50")
     settings = settings.replace(processing=settings.processing.replace(directions="2d:181", range_m=(0.8, 5.0)))

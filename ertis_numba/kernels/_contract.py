@@ -224,6 +224,48 @@ class DelayAndSumEnvelopeInt16(Protocol):
     ) -> None: ...
 
 
+class ModulatePdm(Protocol):
+    """Modulate a block of signals with a loop of up to four integrators.
+
+    Per sample, with the quantiser's output v = ±1 and the error d = u − v::
+
+        v  = sign(u + s1 + s2 + s3 + s4 + dither)
+        s1 += c1 d − r1 s2,  s2 += c2 s1,  s3 += c3 s2 − r2 s4,  s4 += c4 s3
+
+    Every integrator stops at ±limit, which is what lets the loop return from overload.
+
+    Parameters
+    ----------
+    signals : (mic, sample) float64
+        Full scale 1.
+    keys : (mic,) uint64
+        Seed of each microphone's dither.
+    states : (mic, 4) float64
+        The integrators s1 to s4, carried from block to block.
+    gains : (6,) float64
+        c1, c2, c3, c4, r1, r2.
+    first : int
+        Number of the block's first sample.
+    dither : float
+        Width of the uniform dither, full scale 1.
+    limit : float
+    out : (mic, sample) uint8
+        1 where v is +1, else 0.
+    """
+
+    def __call__(
+        self,
+        signals: NDArray[np.float64],
+        keys: NDArray[np.uint64],
+        states: NDArray[np.float64],
+        gains: NDArray[np.float64],
+        first: int,
+        dither: float,
+        limit: float,
+        out: NDArray[np.uint8],
+    ) -> None: ...
+
+
 class Threads(Protocol):
     """Run the enclosed kernels of this Python thread on ``count`` threads.
 
@@ -265,3 +307,4 @@ class KernelSet:
     delay_and_sum_envelope: DelayAndSumEnvelope
     quantise_tiles: QuantiseTiles
     delay_and_sum_envelope_int16: DelayAndSumEnvelopeInt16
+    modulate_pdm: ModulatePdm

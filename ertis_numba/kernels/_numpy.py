@@ -147,6 +147,41 @@ def delay_and_sum_envelope_int16(
             out[direction, start : start + n_ranges] = level * (scales[tile] * weight_scale)
 
 
+def modulate_pdm(
+    signals: NDArray[np.float64],
+    keys: NDArray[np.uint64],
+    states: NDArray[np.float64],
+    gains: NDArray[np.float64],
+    first: int,
+    dither: float,
+    limit: float,
+    out: NDArray[np.uint8],
+) -> None:
+    """See `ModulatePdm`; microphones side by side, samples one after the other."""
+    c1, c2, c3, c4, r1, r2 = gains
+    s1, s2, s3, s4 = states.T.copy()
+    for sample, u in enumerate(signals.T):
+        noise = _dither(keys, first + sample)
+        above = (u + dither * noise) + ((s1 + s2) + (s3 + s4)) >= 0
+        out[:, sample] = above
+        d = u - np.where(above, 1.0, -1.0)
+        s1 = np.clip(s1 + (c1 * d - r1 * s2), -limit, limit)
+        s2 = np.clip(s2 + c2 * s1, -limit, limit)
+        s3 = np.clip(s3 + (c3 * s2 - r2 * s4), -limit, limit)
+        s4 = np.clip(s4 + c4 * s3, -limit, limit)
+    states[:] = np.stack([s1, s2, s3, s4], axis=1)
+
+
+def _dither(keys: NDArray[np.uint64], sample: int) -> NDArray[np.float64]:
+    """Return SplitMix64 of key and sample as numbers in [−½, ½): (mic,) float64."""
+    step = np.uint64(sample * 0x9E3779B97F4A7C15 % 2**64)
+    z = keys + step
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z ^= z >> np.uint64(31)
+    return np.asarray((z >> np.uint64(11)) * 2.0**-53 - 0.5, dtype=np.float64)
+
+
 KERNELS = KernelSet(
     device="numpy",
     max_threads=1,
@@ -164,4 +199,5 @@ KERNELS = KernelSet(
     delay_and_sum_envelope=delay_and_sum_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    modulate_pdm=modulate_pdm,
 )

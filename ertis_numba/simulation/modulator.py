@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.kernels._cpu.modulate import modulate_pdm
 
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]
 
@@ -57,7 +56,9 @@ class Modulator:
         """
         bits = np.empty(signals.shape, dtype=np.uint8)
         with self._kernels.threads(self._threads):
-            modulate_pdm(signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits)
+            self._kernels.modulate_pdm(
+                signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits
+            )
         self._first += signals.shape[1]
         return bits
 

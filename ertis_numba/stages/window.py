@@ -49,8 +49,8 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int) -> T
     ``n_taps`` is the length of the decimation filter, which lets the record reach over its ends.
 
     An echo at time t needs the samples from t on for as long as the call lasts, and the matched
-    filter's ringing on both sides. The transform is a little longer than that, so what wraps around in
-    it falls outside of the samples that are read: the convolution is linear.
+    filter's ringing on both sides, until it is 60 dB down. The transform is a little longer than that, so
+    what wraps around in it falls outside of the samples that are read: the convolution is linear.
 
     Raises
     ------

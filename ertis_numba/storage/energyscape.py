@@ -30,7 +30,8 @@ class EnergyscapeWriter(Writer[Energyscape]):
     recording : RecordingReader, optional
         What they were made from; the file keeps its uuid and SHA-256.
     dtype : {"float32", "float16"}
-        float16 halves the file and keeps three digits; netCDF programs cannot read it.
+        float16 halves the file; it keeps three digits down to -84 dB of full scale and fewer below, and
+        netCDF programs cannot read it.
     overwrite : bool
         Replace a file of this name.
     """

@@ -25,6 +25,7 @@ from ertis_numba.kernels._cpu.delay_and_sum_envelope_int16 import (
 )
 from ertis_numba.kernels._cpu.demodulate_words import demodulate_words
 from ertis_numba.kernels._cpu.envelope import envelope
+from ertis_numba.kernels._cpu.modulate_pdm import modulate_pdm
 from ertis_numba.kernels._cpu.multiply_and_fold import multiply_and_fold
 from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
 from ertis_numba.kernels._cpu.quantise_tiles import quantise_tiles
@@ -79,4 +80,5 @@ KERNELS = KernelSet(
     delay_and_sum_envelope=delay_and_sum_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    modulate_pdm=modulate_pdm,
 )

@@ -30,33 +30,7 @@ def _dither(key, sample):
 
 @njit(parallel=True, nogil=True, cache=True)
 def modulate_pdm(signals, keys, states, gains, first, dither, limit, out):
-    """Modulate a block of signals with a loop of up to four integrators.
-
-    Per sample, with the quantiser's output v = ±1 and the error d = u − v::
-
-        v  = sign(u + s1 + s2 + s3 + s4 + dither)
-        s1 += c1 d − r1 s2,  s2 += c2 s1,  s3 += c3 s2 − r2 s4,  s4 += c4 s3
-
-    Every integrator stops at ±limit, which is what lets the loop return from overload.
-
-    Parameters
-    ----------
-    signals : (mic, sample) float64
-        Full scale 1.
-    keys : (mic,) uint64
-        Seed of each microphone's dither.
-    states : (mic, 4) float64
-        The integrators s1 to s4, carried from block to block.
-    gains : (6,) float64
-        c1, c2, c3, c4, r1, r2.
-    first : int
-        Number of the block's first sample.
-    dither : float
-        Width of the uniform dither, full scale 1.
-    limit : float
-    out : (mic, sample) uint8
-        1 where v is +1, else 0.
-    """
+    """See `ModulatePdm`."""
     c1, c2, c3, c4, r1, r2 = gains[0], gains[1], gains[2], gains[3], gains[4], gains[5]
     for mic in prange(signals.shape[0]):
         s1, s2, s3, s4 = states[mic, 0], states[mic, 1], states[mic, 2], states[mic, 3]
