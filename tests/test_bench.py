@@ -26,9 +26,9 @@ def image():
 def test_subjects_take_turns_in_bursts_after_warming_up():
     calls = []
     subjects = {name: lambda name=name: calls.append(name) for name in "ab"}
-    times_ms = timing.round_robin(subjects, count=7)
-    assert "".join(calls) == "aaabbb" + "aaaaabbbbb" + "aabb"
-    assert [len(times) for times in times_ms.values()] == [7, 7]
+    times_ms = timing.round_robin(subjects, count=timing.BURST + 2)
+    assert "".join(calls) == "aaabbb" + "a" * timing.BURST + "b" * timing.BURST + "aabb"
+    assert [len(times) for times in times_ms.values()] == [timing.BURST + 2] * 2
     assert min(times.min() for times in times_ms.values()) >= 0
 
 
@@ -58,7 +58,7 @@ def test_paper_command_reports_and_updates(tmp_path):
     assert "old" not in text
     assert "| `cuda` | not measured | not measured | not measured |" in text
     assert "| GPU GTX 1080 Ti | 5.93 ± 0.66 | 51.58 ± 6.38 | 77.02 ± 7.81 |" in text
-    assert "timing 1 measurements" in result.stderr
+    assert "timing 1 of each" in result.stderr
 
 
 def test_scaling_measures_every_series(monkeypatch):

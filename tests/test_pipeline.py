@@ -16,7 +16,7 @@ from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Settings
 from tests import cases, reference
@@ -194,3 +194,42 @@ def test_refuses_out_of_another_shape(out):
 def test_the_tests_are_these():
     """Rtisdev's wheel brings a top-level package of the same name."""
     assert Path(cases.__file__).parent == Path(__file__).parent == Path(reference.__file__).parent
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        (
+            SHORT.replace(air=SHORT.air.replace(temperature_c=-10.0)),
+            r"has Air\(temperature_c=-10.0.*, the pipeline Air",
+        ),
+        (SHORT.replace(call=SHORT.call.replace(duration_s=1e-3)), r"has Call\(.*duration_s=0.001.*, the pipeline Call"),
+        (SHORT.replace(array=Array(layout="eRTIS_v2")), "has array 'eRTIS_v2', the pipeline another, 'eRTIS_v3D1'"),
+    ],
+)
+def test_refuses_measurements_it_was_not_made_for(settings, match):
+    with pytest.raises(DataError, match=match):
+        Pipeline(SHORT).process(noise(settings))
+
+
+def test_a_named_layout_and_the_same_written_out_are_one():
+    written_out = SHORT.replace(array=microphones(SHORT.array).to_array())
+    named, other = Pipeline(SHORT), Pipeline(written_out)
+    assert named.process(noise(written_out)).energy.tobytes() == other.process(noise(SHORT)).energy.tobytes()
+
+
+def test_paper_method_runs_on_numpy_and_says_so():
+    paper = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
+    assert Pipeline(paper).device == "numpy"
+    with pytest.raises(DeviceError, match="method 'paper' has no kernels for device 'cpu'; use device 'numpy'"):
+        Pipeline(paper, device="cpu")
+
+
+def test_read_only_words_do_not_compile_anything_anew():
+    pipeline = Pipeline(SHORT)
+    compiled = kernels.load("cpu").demodulate_words.signatures
+    before = len(compiled)
+    words = np.frombuffer(noise(SHORT).words.tobytes(), dtype=np.uint32)
+    image = pipeline.process(Measurement(words, SHORT))
+    assert image.energy.tobytes() == pipeline.process(noise(SHORT)).energy.tobytes()
+    assert len(kernels.load("cpu").demodulate_words.signatures) == before

@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -82,8 +83,10 @@ def process(
             for measurement in shown:
                 if settings.air == recording.settings.air:
                     options.require_same_air(measurement, settings)
+                # A settings file may know better than the recording what array, call or air it was.
+                known = replace(measurement, settings=settings)
                 start_s = time.perf_counter()
-                image = pipeline.process(measurement)
+                image = pipeline.process(known)
                 times_ms.append(1000 * (time.perf_counter() - start_s))
                 writer.write(image)
     median_ms = statistics.median(times_ms)
