@@ -22,7 +22,7 @@ from ertis_numba.storage import (
     write_energyscapes,
     write_recording,
 )
-from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, TRUTH
+from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, TRUTH, lay_out
 from tests.files import SMALL, image, line, noise
 
 
@@ -349,3 +349,10 @@ def test_truth_of_another_shape():
 def truth_fields():
     made = truth()
     return {name: getattr(made, name) for name in made.__slots__}
+
+
+def test_image_too_large_for_one_piece_is_refused(tmp_path):
+    with h5py.File(tmp_path / "large.h5", "w") as file:
+        sizes = {"direction": 1_000_000, "range": 1_178}
+        with pytest.raises(ArgumentError, match="energy of 1000000 directions × 1178 ranges exceeds the 4 GiB"):
+            lay_out(file, ENERGYSCAPE, sizes=sizes, dtypes={"energy": "<f4"})

@@ -5,6 +5,7 @@ and MATLAB show the same names. One group ``/sensors/<name>`` holds one sensor.
 """
 
 import hashlib
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -40,6 +41,7 @@ FORMAT_VERSION: Final = 1
 CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
 _TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
 _COLUMN_TEXT_BYTES: Final = 64
+_MOST_CHUNK_BYTES: Final = 2**32 - 1
 _UNLIMITED: Final = ("time", "gap")
 _SENSOR_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
 
@@ -168,6 +170,9 @@ def _dataset(group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping
         return group.create_dataset(name, shape, kind)
     rows = _TIME_CHUNK_ROWS if name == "time" else CHUNK_ROWS
     chunks = (rows,) if len(dims) == 1 else (1, *shape[1:])
+    if math.prod(chunks) * np.dtype(kind).itemsize > _MOST_CHUNK_BYTES:
+        wanted = " × ".join(f"{size} {dim}s" for dim, size in zip(dims[1:], shape[1:], strict=True))
+        raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB that HDF5 can hold in one piece; give fewer")
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
 
 
