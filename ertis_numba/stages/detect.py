@@ -51,18 +51,18 @@ def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float 
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
     spread = _PointSpread(image.settings)
     found: list[tuple[NDArray[np.float64], float, float]] = []
-    chosen: list[int] = []
     for k in np.argsort(-levels, kind="stable"):
         if len(found) == top:
             break
-        # Only what comes next in order is compared with what was found: that is few of many candidates.
-        offset_m = image.range_m[places[k, 1]] - image.range_m[places[chosen, 1]]
-        near = np.flatnonzero(np.abs(offset_m) < spread.reach_m)
-        offset = directions[places[k, 0]] - directions[places[chosen, 0]]
-        masked = float(levels[chosen][near] @ spread(offset[near], offset_m[near]))
-        if levels[k] <= masked * 10 ** (_MARGIN_DB / 20):
-            continue
-        chosen.append(int(k))
+        direction, range_m = directions[places[k, 0]], image.range_m[places[k, 1]]
+        # Only what comes next in order is compared with what was found, which is few of many candidates, and
+        # with where that really lies: a side lobe is several decibels off when its reflector is half a bin off.
+        near = [entry for entry in found if abs(range_m - entry[1]) < spread.reach_m]
+        if near:
+            sources, ranges_m, amplitudes = (np.array(column) for column in zip(*near, strict=True))
+            masked = float(amplitudes @ spread(direction - sources, range_m - ranges_m))
+            if levels[k] <= masked * 10 ** (_MARGIN_DB / 20):
+                continue
         found.append(_interpolate(image, directions, neighbours, *places[k]))
     found.sort(key=lambda entry: -entry[2])
     return [
