@@ -139,7 +139,7 @@ def load_layout(name: str | Path) -> Layout:
         text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
         return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ArgumentError(
             f"layout {name}: {error}; give a readable file or one of {', '.join(layout_names())}"
@@ -274,7 +274,7 @@ def _csv_grid(path: str) -> Grid:
     if Path(path).suffix.lower() != ".csv":
         raise ArgumentError(f"directions {path!r} is no grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file")
     try:
-        text = Path(path).read_text("utf-8")
+        text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ArgumentError(
             f"directions {path}: {error}; give a readable CSV of azimuth, elevation in degrees"

@@ -25,6 +25,7 @@ from ertis_numba.errors import ArgumentError
 __all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settings"]
 
 _WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
+_FARTHEST_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
 _MOST_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
 _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
@@ -73,6 +74,9 @@ class Array(Table, frozen=True, kw_only=True):
         for channel, position_m in enumerate(self.positions_m):
             checks.shape(f"array.positions_m[{channel}]", np.shape(position_m), (3,))
         checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
+        for channel, position in enumerate(self.positions_m):
+            for coordinate_m in position:
+                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_FARTHEST_M, _FARTHEST_M)
         if self.enabled is not None:
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):

@@ -284,7 +284,8 @@ def test_failure_in_a_process_of_its_own(images):
     assert done.stderr.count("\n") == 1
 
 
-def test_interrupted(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_ended_from_outside(tmp_path, number, code):
     with (tmp_path / "long.bin").open("wb") as file:
         file.truncate(4 * 65_536 * 8000)  # a sparse file, 2 GB of silence
     command = [*MODULE, "import", tmp_path / "long.bin", "-o", tmp_path / "rec.h5", *LAYOUT]
@@ -293,11 +294,45 @@ def test_interrupted(tmp_path):
     while not list(tmp_path.glob("*.part")):
         assert process.poll() is None
         assert time.monotonic() < deadline_s
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert errors.strip() == "ertis: error: interrupted"
+    assert process.returncode == code
+    assert errors.strip() == ("ertis: error: interrupted" if number == signal.SIGINT else "")
     assert [item.name for item in tmp_path.iterdir()] == ["long.bin"]
+
+
+def test_interrupt_waits_for_the_compiler():
+    done = []
+
+    def work():
+        with options.interrupt_later():
+            signal.raise_signal(signal.SIGINT)
+            done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("command", ["import", "simulate"])
+def test_input_is_never_overwritten(tmp_path, command):
+    path = tmp_path / "input.toml"
+    path.write_bytes(b"\xaa" * 4 * 65_536 if command == "import" else b"seed = 1\n")
+    before = path.read_bytes()
+    arguments = [command, path, "-o", path, "--force", *(LAYOUT if command == "import" else [])]
+    done = subprocess.run([*MODULE, *arguments], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "is the input itself; give another name" in done.stderr
+    assert path.read_bytes() == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are text elsewhere")
+def test_file_name_that_is_no_text(tmp_path):
+    raw = os.fsencode(tmp_path) + b"/b\xff.bin"
+    Path(os.fsdecode(raw)).write_bytes(b"\xaa" * 4 * 65_536)
+    command = [*MODULE, "import", raw, "-o", tmp_path / "rec.h5", *LAYOUT]
+    subprocess.run(command, env=ENVIRONMENT, capture_output=True, check=True)
 
 
 def test_slow_work_is_explained(capsys):

@@ -88,7 +88,7 @@ CASES = {
     "output exists": ("process rec.h5 -o img.h5", 1, "output img.h5 exists; give another name, or ask to overwrite it"),
     "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
     "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: there is no folder none; make it"),
-    "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the recording itself; give"),
+    "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
     # looking
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
     "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),

@@ -235,3 +235,8 @@ def test_decimation_suits_method_and_band(preset, method, decimation):
 def test_range_decimation_without_a_useful_divisor_is_refused():
     with pytest.raises(ArgumentError, match=r"range_decimation 101 has no divisor near 20, .*; give one that has"):
         Settings(processing=Processing(range_decimation=101))
+
+
+def test_microphones_far_away_are_refused():
+    with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 40; give a number from -10 to 10"):
+        Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))

@@ -330,7 +330,7 @@ def test_writer_is_used_in_a_with_statement(tmp_path):
 
 def test_result_does_not_replace_its_recording(tmp_path):
     path = write_recording(tmp_path / "rec.h5", noise())
-    with open_recording(path) as recording, pytest.raises(ArgumentError, match="is the recording itself"):
+    with open_recording(path) as recording, pytest.raises(ArgumentError, match="is the input itself"):
         EnergyscapeWriter(path, recording=recording, overwrite=True)
 
 

@@ -144,6 +144,32 @@ def test_closed(path):
         recording[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("ertis_format_version", "abc", "not of this package"),
+        ("ertis_format_version", np.array([1, 1]), "not of this package"),
+        ("ertis_format", np.array([1, 1]), "not of this package"),
+    ],
+)
+def test_odd_attributes_are_refused(tmp_path, name, value, match):
+    path = write_recording(tmp_path / "rec.h5", [noise()])
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+    with pytest.raises(DataError, match=match):
+        open_recording(path)
+
+
+def test_scalar_words_are_refused(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", [noise()])
+    with h5py.File(path, "r+") as file:
+        (group,) = file["sensors"].values()
+        del group["pdm"]
+        group["pdm"] = 1
+    with pytest.raises(DataError, match="damaged or cut short"):
+        open_recording(path)
+
+
 def test_several_sensors(path):
     with h5py.File(path, "r+") as file:
         file.copy(GROUP, file["sensors"], name="other")

@@ -41,13 +41,14 @@ def import_raw(
     """
     from ertis_numba.interop import open_raw
     from ertis_numba.settings import Air, Array, Settings
-    from ertis_numba.storage import write_recording
+    from ertis_numba.storage import check_target, write_recording
 
     given = {"temperature_c": temperature, "humidity_percent": humidity}
     air = Air(**{name: value for name, value in given.items() if value is not None})
     settings = Settings.from_preset(preset, array=Array(layout=layout), air=air)
     measurements = open_raw(raw, settings, sensor=sensor)
     target = target or raw[0].with_suffix(".h5")
+    check_target(target, overwrite=force, sources=raw)
     with options.progress(measurements, length=len(measurements), label="importing", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=", ".join(path.name for path in raw))
     options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)

@@ -1,6 +1,7 @@
 """The ``ertis`` command: finds its commands by name, and turns errors into one line and an exit code."""
 
 import importlib
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -107,7 +108,15 @@ def cli() -> None:
 
 def main() -> None:
     """Run the command line."""
+    # A polite end unwinds like Ctrl-C does, so that no half-written file is left behind.
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), _end)
     cli.main()
+
+
+def _end(number: int, _: object) -> NoReturn:
+    sys.exit(128 + number)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Options and reports that several commands share."""
 
 import json
+import signal
 import sys
 import threading
 import tomllib
@@ -23,6 +24,7 @@ __all__ = [
     "device",
     "force",
     "input_file",
+    "interrupt_later",
     "measurement",
     "note_when_slow",
     "output",
@@ -128,7 +130,7 @@ def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
     """Return a pipeline, and tell who waits for it why."""
-    with note_when_slow("compiling kernels (first run only) ...", quiet=quiet):
+    with note_when_slow("compiling kernels (first run only) ...", quiet=quiet), interrupt_later():
         from ertis_numba.pipeline import Pipeline
 
         return Pipeline(settings, device=device, threads=threads)
@@ -167,6 +169,19 @@ def require_same_air(measurement: "Measurement", settings: "Settings") -> None:
             f"{came.humidity_percent:g} %, {came.pressure_pa:g} Pa, others at {wanted.temperature_c:g} °C, "
             f"{wanted.humidity_percent:g} %, {wanted.pressure_pa:g} Pa; give one air for all with --settings"
         )
+
+
+@contextmanager
+def interrupt_later() -> Iterator[None]:
+    """Keep Ctrl-C until the block ends: the compiler's callbacks would swallow it, or break over it."""
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -99,8 +99,9 @@ def process(
         "median_ms": round(median_ms, 3),
     }
     options.say(
-        f"{target}: {options.counted(len(times_ms), 'measurement')}, {len(pipeline.grid)} directions × "
-        f"{len(pipeline.range_m)} ranges on {pipeline.device}, {median_ms:.1f} ms each (median)",
+        f"{target}: {options.counted(len(times_ms), 'measurement')}, "
+        f"{options.counted(len(pipeline.grid), 'direction')} × {options.counted(len(pipeline.range_m), 'range')} "
+        f"on {pipeline.device}, {median_ms:.1f} ms each (median)",
         quiet=quiet,
     )
     if as_json:

@@ -38,9 +38,9 @@ def simulate(
     if seed is not None:
         scene = scene.replace(seed=seed)
     target = target or path.with_suffix(".h5")
-    check_target(target, overwrite=force)
+    check_target(target, overwrite=force, sources=[path])
     peaks = true_peaks(scene)
-    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet):
+    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
         from ertis_numba.simulation.render import render
 
         first = render(scene)

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import ClassVar, Generic, Self, TypeVar
 
 import h5py
+import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError, SettingsError
 from ertis_numba.settings import Settings
@@ -19,6 +20,7 @@ from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
 __all__ = ["Reader", "file_kind"]
 
 Item = TypeVar("Item")
+_UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -129,7 +131,9 @@ class Reader(ABC, Generic[Item]):
             raise type(error)(named) from error
         except SettingsError as error:
             raise DataError(str(error)) from error
-        except (OSError, RuntimeError, KeyError, AttributeError, UnicodeDecodeError, TypeError) as error:
+        except ArgumentError:
+            raise
+        except _UNREADABLE as error:
             if not self._file:
                 raise DataError(f"{self.path} is closed; open it again") from error
             raise DataError(f"{self.path} is damaged or cut short ({_reason(error)}); copy it again") from error
@@ -193,9 +197,9 @@ def _open(path: Path) -> h5py.File:
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     kind = _plain(file.attrs.get("ertis_format", ""))
-    if kind not in _A:
+    version = _plain(file.attrs.get("ertis_format_version", 0))
+    if not isinstance(kind, str) or kind not in _A or not isinstance(version, int):
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
-    version = int(file.attrs.get("ertis_format_version", 0))
     if version > FORMAT_VERSION:
         raise FormatVersionError(
             f"{path} has format version {version}, this package reads up to {FORMAT_VERSION}; update ertis-numba"
@@ -205,8 +209,8 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
 
 def _plain(value: object) -> object:
     if isinstance(value, bytes):
-        return value.decode()
-    return value.item() if hasattr(value, "item") else value
+        return value.decode(errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _reason(error: BaseException) -> str:

@@ -3,7 +3,7 @@
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,18 +16,28 @@ __all__ = ["check_target", "replacing", "require_room"]
 _SPARE_BYTES = 8_000_000
 
 
-def check_target(path: Path, *, overwrite: bool) -> None:
+def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
     """Refuse a path where no file can be put.
+
+    Parameters
+    ----------
+    path : Path
+    overwrite : bool
+    sources : iterable of Path
+        Files that are read from, which are not overwritten whatever is asked for.
 
     Raises
     ------
     ArgumentError
-        The folder is missing, the path is a folder, or a file is there and may not be replaced.
+        The folder is missing, the path is a folder or a source, or a file is there and may not be
+        replaced.
     """
     if path.is_dir():
         raise ArgumentError(f"output {path} is a folder; give the name of a file")
     if not path.parent.is_dir():
         raise ArgumentError(f"output {path}: there is no folder {path.parent}; make it or give another")
+    if path.exists() and any(source.exists() and source.samefile(path) for source in sources):
+        raise ArgumentError(f"output {path} is the input itself; give another name")
     if path.exists() and not overwrite:
         raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
 

@@ -13,6 +13,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._writer import Writer, self_contained
+from ertis_numba.storage.atomic import check_target
 from ertis_numba.storage.recording import RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
 
@@ -51,8 +52,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         checks.choice("dtype", dtype, ("float32", "float16"))
         origin = {"source": "", "history": ""}
         if recording is not None:
-            if Path(path).exists() and recording.path.samefile(path):
-                raise ArgumentError(f"output {path} is the recording itself; give another name")
+            check_target(Path(path), overwrite=overwrite, sources=[recording.path])
             origin = {
                 "source": recording.path.name,
                 "history": f"processed from recording {recording.uuid}",

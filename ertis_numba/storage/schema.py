@@ -192,7 +192,8 @@ def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[s
     """
     for name, value in attributes.items():
         if isinstance(value, str):
-            owner.attrs.create(name, value.encode(), dtype=_text_type(len(value.encode())))
+            text = value.encode("utf-8", "backslashreplace")  # file names may be no text at all
+            owner.attrs.create(name, text, dtype=_text_type(len(text)))
         else:
             owner.attrs[name] = value
 
