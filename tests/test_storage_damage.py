@@ -153,7 +153,7 @@ def test_closed(path):
     ],
 )
 def test_odd_attributes_are_refused(tmp_path, name, value, match):
-    path = write_recording(tmp_path / "rec.h5", [noise()])
+    path = write_recording(tmp_path / "rec.h5", noise())
     with h5py.File(path, "r+") as file:
         file.attrs[name] = value
     with pytest.raises(DataError, match=match):
@@ -161,7 +161,7 @@ def test_odd_attributes_are_refused(tmp_path, name, value, match):
 
 
 def test_scalar_words_are_refused(tmp_path):
-    path = write_recording(tmp_path / "rec.h5", [noise()])
+    path = write_recording(tmp_path / "rec.h5", noise())
     with h5py.File(path, "r+") as file:
         (group,) = file["sensors"].values()
         del group["pdm"]
