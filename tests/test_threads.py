@@ -1,6 +1,7 @@
 """Bits do not depend on the number of threads: the whole chain, in a process that has four."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +41,13 @@ def test_layer_without_reentrance_gives_the_same_bits():
     """Numba falls back to its workqueue where there is neither OpenMP nor TBB."""
     usual = digests("float32", NUMBA_NUM_THREADS="4")
     assert digests("float32", NUMBA_NUM_THREADS="4", NUMBA_THREADING_LAYER="workqueue") == usual
+
+
+def test_what_numba_cannot_do_is_said_in_a_line():
+    code = "from ertis_numba import kernels; kernels.load('cpu')"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert re.search("DeviceError: NUMBA_DISABLE_JIT is set, .* use device 'numpy'", done.stderr.splitlines()[-1])
 
 
 def test_processor_with_fewer_features_is_served(tmp_path):

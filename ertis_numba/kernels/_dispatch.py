@@ -34,5 +34,12 @@ def load(device: str = "auto") -> KernelSet:
     if device == "auto":
         _LOG.info("device 'auto' is 'cpu'")
         return load("cpu")
-    kernels: KernelSet = importlib.import_module(DEVICES[device]).KERNELS
+    try:
+        kernels: KernelSet = importlib.import_module(DEVICES[device]).KERNELS
+    except DeviceError:
+        raise
+    except RuntimeError as error:  # Numba's, where it can write its cache nowhere
+        raise DeviceError(
+            f"device {device!r} cannot be set up ({error}); set NUMBA_CACHE_DIR to a folder that can be written"
+        ) from error
     return kernels

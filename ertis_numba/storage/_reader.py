@@ -1,6 +1,7 @@
 """What the readers of both kinds of file share: opening, refusing, and taking rows one by one."""
 
 import hashlib
+import operator
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -101,6 +102,7 @@ class Reader(ABC, Generic[Item]):
         return len(self._rows)
 
     def __getitem__(self, index: int) -> Item:
+        index = operator.index(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path} has no measurement {index}; it has {len(self)}, counted from 0")
         with self._reading():

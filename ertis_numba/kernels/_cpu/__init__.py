@@ -14,6 +14,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 import numba
 
 from ertis_numba import checks
+from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract import KernelSet
 from ertis_numba.kernels._cpu.decimate import decimate
 from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
@@ -33,6 +34,11 @@ from ertis_numba.kernels._cpu.remove_group_delay import remove_group_delay
 from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
 
 __all__ = ["KERNELS"]
+
+if numba.config.DISABLE_JIT:
+    raise DeviceError(
+        "NUMBA_DISABLE_JIT is set, and device 'cpu' is what Numba compiles; unset it or use device 'numpy'"
+    )
 
 _MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
 _ONE_AT_A_TIME = threading.RLock()
