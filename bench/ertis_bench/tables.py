@@ -94,8 +94,8 @@ def _conditions(report: dict[str, Any]) -> str:
         f"The same measurement {report['count']} times, in one process, the backends in turns of {timing.BURST}: "
         f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
         f"{first_m:g}–{last_m:g} m. Included: everything from the words in memory to the image in memory. Not "
-        "included: reading the file, making the pipeline, compilation, and three calls of each to warm up; images go "
-        "to one array that is used again. "
+        "included: reading the file, making the pipeline, compilation, and calls for a fifth of a second, three at "
+        "least, to warm up before each turn; images go to one array that is used again. "
         "`scipy` runs on one thread, as its filters and sums do anyhow, and over the whole record, as the paper does; "
         "`numpy` and `cpu` compute the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
         "The paper does not state the length of its records."
@@ -127,7 +127,8 @@ def scaling(report: dict[str, Any]) -> str:
         f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, "
         "where none is named, the precision that is the fastest here. Every image was checked against the exact one "
         "before it was timed; "
-        "three calls to warm up are not counted. Ceilings are the best of as many runs, over arrays of 64 MiB and in "
+        "calls for a fifth of a second to warm up are not counted. "
+        "Ceilings are the best of as many runs, over arrays of 64 MiB and in "
         "registers; a multiplication and an addition are two operations."
     )
     return "\n\n".join(parts)

@@ -9,25 +9,24 @@ from numpy.typing import NDArray
 
 __all__ = ["BURST", "round_robin", "summary"]
 
-_WARM_UP = 3
-BURST = 25  # calls in a row, with warm caches as in a stream; the rounds spread a drift over all
+_WARM_UP = 3  # calls at least …
+_WARM_UP_S = 0.2  # … and so long: after other work it takes a hundred short calls until threads lie on cores for good
+BURST = 100  # calls in a row, as in a stream
 
 
 def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> dict[str, NDArray[np.float64]]:
     """Return the times of ``count`` calls of each subject in milliseconds: (call,) float64 each.
 
     Subjects take turns, so that whatever slows the machine for a while hits all of them. The first
-    calls of each are not counted, and the garbage collector is off.
+    calls of each turn are not counted, and the garbage collector is off.
     """
-    for subject in subjects.values():
-        for _ in range(_WARM_UP):
-            subject()
     times_ms: dict[str, list[float]] = {name: [] for name in subjects}
     collecting = gc.isenabled()
     gc.disable()
     try:
         for begin in range(0, count, BURST):
             for name, subject in subjects.items():
+                _warm_up(subject)
                 for _ in range(begin, min(begin + BURST, count)):
                     start_ns = time.perf_counter_ns()
                     subject()
@@ -36,6 +35,14 @@ def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> 
         if collecting:
             gc.enable()
     return {name: np.asarray(times) for name, times in times_ms.items()}
+
+
+def _warm_up(subject: Callable[[], object]) -> None:
+    end_s = time.perf_counter() + _WARM_UP_S
+    done = 0
+    while done < _WARM_UP or time.perf_counter() < end_s:
+        subject()
+        done += 1
 
 
 def summary(times_ms: NDArray[np.float64]) -> dict[str, float]:
