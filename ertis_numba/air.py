@@ -17,11 +17,19 @@ _VAPOUR_HEAT_RATIO = 1.330
 
 
 def sound_speed_m_s(air: Air) -> float:
-    """Return the speed of sound in humid air.
+    """Return the speed of sound in humid air in m/s.
 
     An ideal mixture of dry air and water vapour: ``c = sqrt(γ R T / M)``, with the molar mass and
     the heat capacity of the mixture and the saturation pressure of ISO 9613-1, annex B. Dry air at
     0 °C gives 331.3 m/s; humidity adds up to about 0.4 % at room temperature.
+
+    Parameters
+    ----------
+    air : Air
+
+    Returns
+    -------
+    float
     """
     kelvin = _ZERO_C_K + air.temperature_c
     saturation = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)

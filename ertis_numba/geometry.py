@@ -128,6 +128,15 @@ def load_layout(name: str | Path) -> Layout:
 
     A CSV has one row per channel, ``y, z`` or ``x, y, z`` in millimetres, in the order of the bits.
 
+    Parameters
+    ----------
+    name : str or Path
+        One of `layout_names`, or a path.
+
+    Returns
+    -------
+    Layout
+
     Raises
     ------
     ArgumentError
@@ -186,6 +195,15 @@ def _placed(source: str, file: _LayoutFile) -> Layout:
 def microphones(array: Array) -> Layout:
     """Return the microphones that array settings describe, by position or by name.
 
+    Parameters
+    ----------
+    array : Array
+
+    Returns
+    -------
+    Layout
+        Positions from the centroid of the enabled microphones.
+
     Raises
     ------
     ArgumentError
@@ -216,6 +234,14 @@ def direction_grid(processing: Processing) -> Grid:
     ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal
     plane, both limits included. ``3d:N`` is N cells of equal area between the limits, in rows of
     equal elevation. Anything else is the path of a CSV file of azimuth, elevation in degrees.
+
+    Parameters
+    ----------
+    processing : Processing
+
+    Returns
+    -------
+    Grid
 
     Raises
     ------
@@ -291,7 +317,16 @@ def _csv_grid(path: str) -> Grid:
 
 
 def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the directions as (direction, axis) unit vectors in the sensor frame."""
+    """Return directions as unit vectors in the sensor frame.
+
+    Parameters
+    ----------
+    azimuth_rad, elevation_rad : (direction,) float64
+
+    Returns
+    -------
+    (direction, axis) float64
+    """
     level = np.cos(elevation_rad)
     return np.stack([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1)
 
@@ -325,7 +360,21 @@ def spherical_delays(
 ) -> NDArray[np.float64]:
     """Return when the echo of a point reaches each microphone, after it would reach the centroid.
 
-    As `far_field_delays`, for a point at ``range_m``: ``(‖r u − p‖ − r) / c`` in seconds.
+    As `far_field_delays`, for a point at ``range_m``: ``(‖r u − p‖ − r) / c``.
+
+    Parameters
+    ----------
+    positions_m : (mic, axis) float64
+    directions : (direction, axis) float64
+        Unit vectors towards the point.
+    range_m : float
+        Distance of the point from the centroid.
+    sound_speed_m_s : float
+
+    Returns
+    -------
+    (direction, mic) float64
+        Seconds.
     """
     points_m = range_m * directions[:, None, :] - positions_m[None, :, :]
     return np.asarray((np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s)

@@ -93,6 +93,17 @@ def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
     ``H(f) = g conj(S(f)) W(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
     window that is 1 over the call's band and falls to 0 outside it as a raised cosine, and g such
     that the call itself gives an analytic signal with an envelope of 1 at its peak.
+
+    Parameters
+    ----------
+    call : Call
+    n_fft : int
+        Even or odd, at least as long as the call.
+    rate_hz : float
+
+    Returns
+    -------
+    MatchedFilter
     """
     low_hz, high_hz = matched_band_hz(call)
     bins = np.arange(math.ceil(low_hz * n_fft / rate_hz), math.floor(high_hz * n_fft / rate_hz) + 1)
@@ -114,6 +125,17 @@ def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> N
     A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
     damped by 60 dB, by 59.5 dB at the worst. The length is ``2 k · decimation + 1``, so that the group delay is k
     samples of the decimated signal exactly.
+
+    Parameters
+    ----------
+    pdm_rate_hz : float
+    decimation : int
+    pass_hz : float
+        Upper edge of the band that must stay clean.
+
+    Returns
+    -------
+    (tap,) float64
 
     Raises
     ------
@@ -151,6 +173,14 @@ def whole_taps(taps: NDArray[np.float64]) -> NDArray[np.int16]:
 
     It is a filter of its own rather than an approximation at every sum: rounding the taps changes the
     response by -65 dB or less for some hundred taps, and everything after is exact.
+
+    Parameters
+    ----------
+    taps : (tap,) float64
+
+    Returns
+    -------
+    (tap,) int16
 
     Raises
     ------
