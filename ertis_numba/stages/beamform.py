@@ -12,10 +12,13 @@ from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "DelayTable", "beamform"]
+__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "DelayTable", "beamform"]
 
 _DIRECTIONS_PER_PHASE = 30  # from here on 16 bits save more time than it takes to make them
 _WEIGHT_BITS = 12  # leave the samples 13 bits with 32 microphones: both err by about -85 dB then
+
+Buffers = tuple[NDArray[np.int16], NDArray[np.float32]]
+"""What a call writes to on its way: tiles and their scales, empty where samples stay in float32."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,14 +77,14 @@ class DelayTable:
 class Beamform(Protocol):
     """Analytic signals to the energy of every direction and range."""
 
-    def new_buffers(self) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+    def new_buffers(self) -> Buffers:
         """Return what one call needs to write to."""
         ...
 
     def __call__(
         self,
         analytic: NDArray[np.complex64],
-        buffers: tuple[NDArray[np.int16], NDArray[np.float32]],
+        buffers: Buffers,
         out: NDArray[np.float32],
     ) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
@@ -120,14 +123,14 @@ class BeamformFloat32:
         self._weights = table.weights.astype(np.complex64)
         self._kernel = kernels.delay_and_sum_envelope
 
-    def new_buffers(self) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+    def new_buffers(self) -> Buffers:
         """See `Beamform`."""
         return np.empty(0, dtype=np.int16), np.empty(0, dtype=np.float32)
 
     def __call__(
         self,
         analytic: NDArray[np.complex64],
-        buffers: tuple[NDArray[np.int16], NDArray[np.float32]],  # noqa: ARG002
+        buffers: Buffers,  # noqa: ARG002
         out: NDArray[np.float32],
     ) -> None:
         """See `Beamform`."""
@@ -162,14 +165,14 @@ class BeamformInt16:
         self._quantise = kernels.quantise_tiles
         self._kernel = kernels.delay_and_sum_envelope_int16
 
-    def new_buffers(self) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+    def new_buffers(self) -> Buffers:
         """See `Beamform`."""
         return np.zeros(self._shape, dtype=np.int16), np.zeros(self._shape[0], dtype=np.float32)
 
     def __call__(
         self,
         analytic: NDArray[np.complex64],
-        buffers: tuple[NDArray[np.int16], NDArray[np.float32]],
+        buffers: Buffers,
         out: NDArray[np.float32],
     ) -> None:
         """See `Beamform`."""

@@ -11,7 +11,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, direction_grid, far_field_delays, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beamform import Beamform, DelayTable, beamform
+from ertis_numba.stages.beamform import Beamform, Buffers, DelayTable, beamform
 from ertis_numba.stages.demodulate import Demodulate
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.window import time_window
@@ -23,7 +23,7 @@ __all__ = ["FastChain"]
 class _Buffers(NamedTuple):
     signals: NDArray[np.float32]
     analytic: NDArray[np.complex64]
-    beamform: tuple[NDArray[np.int16], NDArray[np.float32]]
+    beamform: Buffers
 
 
 class FastChain:
