@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import Settings
 
-__all__ = ["Energyscape", "Measurement", "Peak", "Stamp"]
+__all__ = ["Energyscape", "Measurement", "Peak", "Reflector", "Stamp"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,6 +84,30 @@ class Energyscape:
     def is_planar(self) -> bool:
         """Whether all directions lie in the horizontal plane."""
         return not np.any(self.elevation_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reflector:
+    """What an image ought to show at one place: the truth of a simulated measurement.
+
+    Attributes
+    ----------
+    name : str
+        What it is in the scene, such as ``points[2]``, or by which walls the sound came.
+    azimuth_deg, elevation_deg, range_m : float
+        In the sensor frame, when the emission began.
+    level_db : float
+        Level of its echo below the strongest of the same measurement, so at most 0.
+    velocity_m_s : (x, y, z)
+        In the sensor frame, relative to the sensor.
+    """
+
+    name: str
+    azimuth_deg: float
+    elevation_deg: float
+    range_m: float
+    level_db: float
+    velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
