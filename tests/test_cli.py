@@ -62,7 +62,7 @@ def test_from_raw_words_to_a_picture(tmp_path, raw):
     assert made["median_ms"] > 0
     found = report("peaks", img, "--top", 2)["peaks"]
     assert [peak["measurement"] for peak in found] == [0, 0, 1, 1]
-    assert set(found[0]) == {"measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"}
+    assert set(found[0]) == {"sensor", "measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"}
     run("plot", img, "-o", picture, "-m", 1)
     assert picture.read_bytes().startswith(b"\x89PNG")
     with open_recording(rec) as back:
@@ -127,8 +127,8 @@ def test_info_of_unknown_times(tmp_path):
 
 def test_peaks_table(images):
     lines = run("peaks", images, "-m", 1, "--top", 1).stdout.splitlines()
-    assert lines[0].split() == ["measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"]
-    assert lines[1].split()[0] == "1"
+    assert lines[0].split() == ["sensor", "measurement", "azimuth_deg", "elevation_deg", "range_m", "level_db"]
+    assert lines[1].split()[:2] == ["sensor", "1"]
     assert len(lines) == 2
 
 

@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.storage import write_energyscapes, write_recording
+from ertis_numba.frames import Stamp
+from ertis_numba.storage import Truth, write_energyscapes, write_recording
 from tests.files import image, noise
 
 N_BYTES = 4 * 65_536
@@ -94,8 +95,35 @@ CASES = {
     "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
     "no peaks": ("peaks img.h5 --top 0", 1, "top is 0; give a whole number of at least 1"),
     "peaks above": ("peaks img.h5 --min-level 3", 1, "min_level_db is 3; give a number from -1000 to 0"),
+    "nothing at that level": ("compare truth.h5 --min-level 3", 1, "min_level_db is 3; give a number from -1000 to 0"),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "dynamic_range_db is -5; give a number above 0"),
+    # sensors and truth
+    "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 holds 2 sensors; choose one of left, right (--sensor)"),
+    "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
+    "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),
+    "no such sensor to list": ("peaks two.h5 --sensor x", 1, "two.h5 has no sensor 'x'; choose one of left, right"),
+    "no such sensor to compare": ("compare two.h5 --sensor x", 1, "has no sensor 'x'; choose one of left, right"),
+    "recording to compare": (
+        "compare rec.h5",
+        1,
+        "rec.h5 is a recording, wanted an energyscape file; process it first",
+    ),
+    "no truth": (
+        "compare img.h5",
+        1,
+        "img.h5: sensor sensor holds no truth; simulate a scene to get one, and process that recording",
+    ),
+    "no truth to list": (
+        "peaks img.h5 --truth",
+        1,
+        "img.h5: sensor sensor holds no truth; simulate a scene to get one",
+    ),
+    "part of the truth": (
+        "peaks truth.h5 --truth --top 3",
+        2,
+        "--top leaves out what --truth asks for; give one of them; see 'ertis peaks --help'",
+    ),
     # usage
     "unknown command": ("prozess", 2, "No such command 'prozess'"),
     "unknown option": ("info rec.h5 --jsno", 2, "No such option"),
@@ -117,6 +145,9 @@ def folder(tmp_path_factory):
     (folder / "long.toml").write_text("[recording]\nn_samples = 163840\n")
     write_recording(folder / "rec.h5", noise())
     write_energyscapes(folder / "img.h5", [image()])
+    truth = Truth(scene="", seed=1, reflectors=((),))
+    write_energyscapes(folder / "truth.h5", [image()], truth={"sensor": truth})
+    write_energyscapes(folder / "two.h5", [image().replace(stamp=Stamp(sensor=name)) for name in ("left", "right")])
     for name in ("cut", "newer", "damaged", "nan"):
         shutil.copy(folder / "rec.h5", folder / f"{name}.h5")
     os.truncate(folder / "cut.h5", 100_000)

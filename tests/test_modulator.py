@@ -1,5 +1,7 @@
 """The sigma-delta modulators against their own equations, and what they keep of the band."""
 
+import math
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -7,24 +9,29 @@ from scipy.signal import lfilter
 
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import Layout
 from ertis_numba.simulation.modulator import Modulator, loop_gains, noise_transfer
 
 RATE_HZ = 4_500_000.0
 BAND = 80_000 / RATE_HZ
 MASK = 2**64 - 1
+COMPARATOR = np.zeros(8)  # without integrators and dither, bits are the signs of signal and noise
 
 
-def modulate_plainly(signal, key, gains, dither, limit):
+def modulate_plainly(signal, key, gains, dither, limit, noise_rms=0.0):
     """Step through `modulate_pdm` for one microphone with Python's own numbers; return bits and what was quantised."""
     c1, c2, c3, c4, r1, r2 = gains
     s1 = s2 = s3 = s4 = 0.0
+    scale = noise_rms * (1 / math.sqrt((2**24 - 1) / 3))
     bits, quantised = [], []
-    for sample, u in enumerate(signal.tolist()):
+    for sample, x in enumerate(signal.tolist()):
         z = (key + sample * 0x9E3779B97F4A7C15) & MASK
         z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & MASK
         z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & MASK
-        noise = ((z ^ (z >> 31)) >> 11) / 2**53 - 0.5
-        bit = (u + dither * noise) + ((s1 + s2) + (s3 + s4)) >= 0
+        z ^= z >> 31
+        noise = sum(z >> shift & 0xFFF for shift in (0, 12, 24, 36)) - 8190
+        u = round((x + scale * noise) * 2**20) / 2**20
+        bit = (u + dither * (((z >> 48) + 0.5) / 2**16 - 0.5)) + ((s1 + s2) + (s3 + s4)) >= 0
         bits.append(int(bit))
         quantised.append(u + ((s1 + s2) + (s3 + s4)))
         d = u - (1 if bit else -1)
@@ -35,9 +42,45 @@ def modulate_plainly(signal, key, gains, dither, limit):
     return bits, np.array(quantised)
 
 
-def modulated(signals, order=4, dither=0.5, band=BAND):
-    keys = np.random.default_rng(3).integers(0, 2**64, len(signals), dtype=np.uint64)
-    return Modulator(keys, order=order, dither=dither, band=band).process(signals)
+def keys_of(n_mics):
+    return np.random.default_rng(3).integers(0, 2**64, n_mics, dtype=np.uint64)
+
+
+def layout_of(enabled, word_bits=8):
+    n = len(enabled)
+    return Layout("test", np.zeros((n, 3)), np.array(enabled, dtype=bool), np.ones(n), np.zeros(n), word_bits)
+
+
+def mics_of(n_mics):
+    mics = np.full(-(-n_mics // 8) * 8, -1, dtype=np.int32)
+    mics[:n_mics] = np.arange(n_mics)
+    return mics.reshape(-1, 8)
+
+
+def bits_of(octets, n_mics):
+    """Return the bits of the first channels: (mic, sample)."""
+    return np.unpackbits(octets, axis=1, bitorder="little").T[:n_mics]
+
+
+def modulated(signals, order=4, dither=0.5, noise_rms=0.0):
+    n_mics, n_samples = signals.shape
+    modulator = Modulator(
+        layout_of(np.ones(n_mics)), keys_of(n_mics), np.full(n_mics, noise_rms), order=order, dither=dither, band=BAND
+    )
+    words = np.empty((n_samples, -(-n_mics // 8)), dtype=np.uint8)
+    modulator.process(signals, out=words)
+    return bits_of(words, n_mics)
+
+
+def compared(signals, keys, noise_rms, dither=0.0):
+    """Return ±1, the signs of signal, noise and dither: (mic, sample)."""
+    out = np.empty((signals.shape[1], -(-len(signals) // 8)), dtype=np.uint8)
+    loop = COMPARATOR.copy()
+    loop[6] = dither
+    kernels.load("cpu").modulate_pdm(
+        signals, mics_of(len(signals)), keys, noise_rms, np.zeros((len(signals), 4)), loop, 0, out
+    )
+    return 2.0 * bits_of(out, len(signals)) - 1
 
 
 def tone(amplitude, n_samples=131_072, frequency_hz=41_234.5):
@@ -56,21 +99,105 @@ def in_band_snr_db(bits, signal, low_hz=20_000, high_hz=80_000):
 @pytest.mark.parametrize("device", kernels.DEVICES)
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_modulator_does_what_its_equations_say(order, device):
-    signals = np.stack([tone(0.4, 3000), np.zeros(3000), np.full(3000, 0.3)])
+    ties = np.random.default_rng(1).integers(-(2**19), 2**19, 3000) * 2.0**-21  # half of them between two steps
+    signals = np.stack([tone(0.4, 3000), np.zeros(3000), np.full(3000, 0.3), ties])
     signals[0, 1000:1200] = 5.0  # overload, to reach the limits
-    keys = np.array([0, 1, 2**64 - 1], dtype=np.uint64)
+    signals[2, 1000:1200] = -1e9
+    keys = np.array([0, 1, 2**64 - 1, 3], dtype=np.uint64)
+    noise_rms = np.array([0.001, 0.0, 0.1, 0.0])
+    mics = np.array([[-1, 2, -1, 0, 1, -1, -1, -1], [-1] * 8, [-1, -1, -1, -1, -1, -1, -1, 3]], dtype=np.int32)
     gains = loop_gains(order, BAND)
-    bits = np.empty(signals.shape, dtype=np.uint8)
-    states = np.zeros((3, 4))
+    states = np.zeros((4, 4))
     modulate_pdm = kernels.load(device).modulate_pdm
     parts = []
-    for block in (slice(0, 1000), slice(1000, 3000)):  # the state goes on from block to block
-        part = bits[:, block].copy()
-        modulate_pdm(signals[:, block].copy(), keys, states, np.asarray(gains), block.start, 0.5, 2.0, part)
+    for block in (slice(0, 1003), slice(1003, 3000)):  # the state goes on from block to block
+        part = np.full((block.stop - block.start, 3), 255, dtype=np.uint8)
+        loop = np.array([*gains, 0.5, 2.0])
+        modulate_pdm(signals[:, block].copy(), mics, keys, noise_rms, states, loop, block.start, part)
         parts.append(part)
-    bits = np.concatenate(parts, axis=1)
-    for mic in range(3):
-        assert bits[mic].tolist() == modulate_plainly(signals[mic], int(keys[mic]), gains, 0.5, 2.0)[0]
+    bits = np.unpackbits(np.concatenate(parts), axis=1, bitorder="little").T
+    for channel, mic in enumerate(mics.ravel()):
+        if mic < 0:
+            assert not bits[channel].any()
+        else:
+            wanted, _ = modulate_plainly(signals[mic], int(keys[mic]), gains, 0.5, 2.0, noise_rms[mic])
+            assert bits[channel].tolist() == wanted
+
+
+@pytest.mark.parametrize("word_bits", [8, 16, 32, 64])
+@pytest.mark.parametrize("n_mics", [1, 7, 8, 9, 33, 1024])
+def test_every_array_gives_the_same_bits_on_every_device(n_mics, word_bits):
+    random = np.random.default_rng(n_mics)
+    enabled = random.random(n_mics) < 0.8
+    enabled[-1] = True
+    layout = layout_of(enabled, word_bits)
+    n_enabled = int(enabled.sum())
+    keys, noise_rms = keys_of(n_enabled), np.where(np.arange(n_enabled) < n_enabled // 2, 0.0, 0.01)
+    signals = random.uniform(-0.5, 0.5, (n_enabled, 300))
+    words = random.integers(0, 255, (300, layout.n_words)).astype(f"u{word_bits // 8}")
+    modulator = Modulator(layout, keys, noise_rms, order=4, dither=0.5, band=BAND)
+    for block in np.split(np.arange(300), [1, 258, 265]):
+        modulator.process(signals[:, block], out=words[block[0] : block[-1] + 1])
+
+    octets = np.empty((300, -(-n_enabled // 8)), dtype=np.uint8)
+    loop, states = np.array([*loop_gains(4, BAND), 0.5, 2.0]), np.zeros((n_enabled, 4))
+    kernels.load("numpy").modulate_pdm(signals, mics_of(n_enabled), keys, noise_rms, states, loop, 0, octets)
+    channels = np.zeros((layout.n_words * word_bits, 300), dtype=np.uint8)
+    channels[:n_mics][enabled] = bits_of(octets, n_enabled)
+    for channel, bits in enumerate(channels):
+        word = words[:, channel // word_bits].astype(np.uint64)
+        assert_array_equal(word >> np.uint64(channel % word_bits) & np.uint64(1), bits)
+
+
+def test_array_without_microphones_gives_zeros():
+    words = np.full((100, 1), 7, dtype=np.uint32)
+    empty = np.empty(0)
+    modulator = Modulator(layout_of([False] * 5, 32), empty.astype(np.uint64), empty, order=4, dither=0.5, band=BAND)
+    modulator.process(np.empty((0, 100)), out=words)
+    assert not words.any()
+
+
+@pytest.mark.parametrize("rms", [0.003, 0.2])
+def test_noise_is_gaussian_nearly_and_has_its_rms(rms):
+    """Signs of noise on a constant tell its distribution: their mean is 1 − 2 P(noise < −constant)."""
+    constants = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0])
+    signals = np.repeat(rms * constants[:, None], 200_000, axis=1)
+    means = compared(signals, keys_of(7), np.full(7, rms)).mean(axis=1)
+    wanted = [math.erf(constant / math.sqrt(2)) for constant in constants]
+    assert_allclose(means, wanted, atol=0.02)  # a sum of four numbers differs by up to 0.015 from the normal law
+    within = compared(np.full((1, 200_000), 3.47 * rms), keys_of(1), np.array([rms]))
+    assert within.min() == 1  # the sum cannot be larger
+
+
+def test_noise_has_the_power_stated():
+    """In the band the modulator adds little of its own, so what is in the bits there is the noise."""
+    n = 131_072
+    bits = modulated(np.zeros((32, n)), noise_rms=0.02)
+    spectrum = np.abs(np.fft.rfft((2.0 * bits - 1) * np.hanning(n))) ** 2 / np.sum(np.hanning(n) ** 2)
+    low, middle, high = n // 300, n // 112, n // 65  # 15, 40 and 69 kHz
+    for band in (slice(low, middle), slice(middle, high)):
+        assert spectrum[:, band].mean() == pytest.approx(0.02**2, rel=0.03)
+
+
+def test_noise_and_dither_are_white_and_independent():
+    n_mics, n = 9, 100_000
+    silence, no_noise = np.zeros((n_mics, n)), np.zeros(n_mics)
+    noise = compared(silence, keys_of(n_mics), np.ones(n_mics))
+    dither = compared(silence, keys_of(n_mics), no_noise, dither=1.0)
+    rows = np.concatenate([noise, dither])
+    rows = np.concatenate([rows, np.roll(rows, 1, axis=1), np.roll(rows, 10, axis=1)])
+    correlation = rows @ rows.T / n
+    assert np.abs(correlation - np.eye(len(rows))).max() < 5 / math.sqrt(n)
+
+
+def test_noise_of_one_microphone_does_not_touch_another():
+    signals = np.stack([tone(0.3, 2000)] * 3)
+    keys, gains = keys_of(3), np.array([*loop_gains(4, BAND), 0.5, 2.0])
+    octets = np.empty((2, 2000, 1), dtype=np.uint8)
+    for out, rms in zip(octets, ([0.0, 0.0, 0.0], [0.0, 0.01, 0.0]), strict=True):
+        kernels.load("cpu").modulate_pdm(signals, mics_of(3), keys, np.array(rms), np.zeros((3, 4)), gains, 0, out)
+    changed = (bits_of(octets[0], 3) != bits_of(octets[1], 3)).any(axis=1)
+    assert changed.tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(("order", "least_db"), [(1, 28), (2, 49), (3, 54), (4, 62)])
@@ -118,13 +245,37 @@ def test_modulator_recovers_from_overload(overload):
 
 
 def test_modulator_is_the_same_for_any_threads_and_blocks():
-    signals = np.stack([tone(0.5, 5000, 30_000 + 1000 * mic) for mic in range(5)])
-    keys = np.arange(5, dtype=np.uint64)
-    whole = Modulator(keys, order=4, dither=0.5, band=BAND).process(signals)
-    for count in (1, kernels.load("cpu").max_threads):
-        modulator = Modulator(keys, order=4, dither=0.5, band=BAND, threads=count)
-        parts = [modulator.process(part) for part in np.split(signals, [1, 777, 778, 4000], axis=1)]
-        assert_array_equal(np.concatenate(parts, axis=1), whole)
+    signals = np.stack([tone(0.5, 5000, 30_000 + 1000 * mic) for mic in range(37)])
+    noise_rms = np.linspace(0, 0.01, 37)
+    found = set()
+    for count in range(1, kernels.load("cpu").max_threads + 1):
+        for cuts in ([], [1, 777, 778, 4000]):
+            words = np.empty((5000, 2), dtype=np.uint32)
+            layout = layout_of(np.ones(37), 32)
+            modulator = Modulator(layout, keys_of(37), noise_rms, order=4, dither=0.5, band=BAND, threads=count)
+            for block in np.split(np.arange(5000), cuts):
+                modulator.process(signals[:, block], out=words[block[0] : block[-1] + 1])
+            found.add(words.tobytes())
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "message"),
+    [
+        ({"keys": keys_of(4)}, r"keys has shape \(4,\); give shape \(3,\)"),
+        ({"noise_rms": np.zeros(1)}, r"noise_rms has shape \(1,\); give shape \(3,\)"),
+        ({"signals": np.zeros((3, 11))}, r"signals has shape \(3, 11\); give shape \(3, 10\)"),
+        ({"out": np.zeros((10, 1), np.uint16)}, r"out, in bytes, has shape \(10, 2\); give shape \(10, 1\)"),
+    ],
+)
+def test_modulator_refuses_wrong_shapes(spoiled, message):
+    valid = {"keys": keys_of(3), "noise_rms": np.zeros(3), "signals": np.zeros((3, 10)), "out": np.zeros((10, 1), "u1")}
+    given = valid | spoiled
+    layout = layout_of([True, False, True, True])
+    with pytest.raises(ArgumentError, match=message):
+        Modulator(layout, given["keys"], given["noise_rms"], order=4, dither=0.5, band=BAND).process(
+            given["signals"], out=given["out"]
+        )
 
 
 def test_modulator_refuses_other_orders():

@@ -15,22 +15,14 @@ from ertis_numba.storage import (
     EnergyscapeWriter,
     Gap,
     RecordingWriter,
-    Truth,
     file_kind,
     open_energyscapes,
     open_recording,
     write_energyscapes,
     write_recording,
 )
-from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, TRUTH, lay_out
+from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, lay_out
 from tests.files import SMALL, image, line, noise
-
-
-def truth(n_measurements=3):
-    values = np.arange(2.0 * n_measurements).reshape(n_measurements, 2)
-    return Truth(
-        scene='name = "two"\n', seed=7, azimuth_rad=values, elevation_rad=-values, range_m=values + 1, level_db=-values
-    )
 
 
 @pytest.mark.parametrize(
@@ -108,17 +100,8 @@ def test_calibration_is_kept(tmp_path):
         assert group["microphone_enabled"][:].tolist() == [1] * 7 + [0]
 
 
-def test_truth_is_kept(tmp_path):
-    write_recording(tmp_path / "rec.h5", noise(), truth=truth())
-    with open_recording(tmp_path / "rec.h5") as recording:
-        assert recording.truth.scene == truth().scene
-        assert recording.truth.seed == 7
-        for field in ("azimuth_rad", "elevation_rad", "range_m", "level_db"):
-            assert np.array_equal(getattr(recording.truth, field), getattr(truth(), field))
-
-
 def test_xarray_shows_named_axes(tmp_path):
-    write_recording(tmp_path / "rec.h5", noise(), truth=truth())
+    write_recording(tmp_path / "rec.h5", noise())
     write_energyscapes(tmp_path / "img.h5", [image()])
     with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
         assert data["pdm"].dims == ("time", "sample")
@@ -126,9 +109,6 @@ def test_xarray_shows_named_axes(tmp_path):
         assert data["microphone_position"].dims == ("microphone", "axis")
         assert data["time"].values[0] == np.datetime64(1_700_000_000_123_456_789, "ns")
         assert set(data.variables) == {variable.name for variable in RECORDING}
-    with xarray.open_dataset(tmp_path / "rec.h5", group="/truth", engine="netcdf4") as data:
-        assert data["range"].dims == ("measurement", "target")
-        assert set(data.variables) == {variable.name for variable in TRUTH}
     with xarray.open_dataset(tmp_path / "img.h5", group="/sensors/sensor", engine="netcdf4") as data:
         assert data["energy"].dims == ("time", "direction", "range")
         assert {"azimuth", "elevation", "range", "time"} == set(data.coords)
@@ -191,9 +171,9 @@ def test_replay_gives_the_same_bits_for_any_number_of_threads(tmp_path, directio
 
 def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    first = write_recording(tmp_path / "a.h5", noise(), truth=truth())
-    second = write_recording(tmp_path / "b.h5", noise(), truth=truth())
-    other = write_recording(tmp_path / "c.h5", noise(seed=2), truth=truth())
+    first = write_recording(tmp_path / "a.h5", noise())
+    second = write_recording(tmp_path / "b.h5", noise())
+    other = write_recording(tmp_path / "c.h5", noise(seed=2))
     assert first.read_bytes() == second.read_bytes()
     with open_recording(first) as a, open_recording(other) as c:
         assert a.attributes["date_created"] == "2023-11-14T22:13:20Z"
@@ -274,10 +254,6 @@ def spoilt(**settings):
         (spoilt(array=Array(layout="eRTIS_v2")), "other array settings"),
         (spoilt(call=Call(duration_s=2e-3)), "other call settings"),
         (spoilt(recording=Recording(n_samples=50_000)), "other recording settings"),
-        (
-            [Measurement(m.words, SMALL, Stamp(sensor=s)) for m, s in zip(noise(count=2), "ab", strict=True)],
-            "measurement 1 is of sensor 'b', the ones before it of 'a'; write one file per sensor",
-        ),
         ([Measurement(noise()[0].words, SMALL, Stamp(sensor="a/b"))], "sensor name 'a/b' cannot stand in a file"),
         ([Measurement(noise()[0].words[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
         (
@@ -337,18 +313,6 @@ def test_result_does_not_replace_its_recording(tmp_path):
 def test_unknown_dtype(tmp_path):
     with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
         EnergyscapeWriter(tmp_path / "img.h5", dtype="float64")
-
-
-def test_truth_of_another_shape():
-    with pytest.raises(ArgumentError, match=r"range_m has shape \(2, 2\); give shape \(3, 2\)"):
-        Truth(**{**truth_fields(), "range_m": np.zeros((2, 2))})
-    with pytest.raises(ArgumentError, match=r"azimuth_rad has shape \(3,\); give \(measurement, target\)"):
-        Truth(**{**truth_fields(), "azimuth_rad": np.zeros(3)})
-
-
-def truth_fields():
-    made = truth()
-    return {name: getattr(made, name) for name in made.__slots__}
 
 
 def test_image_too_large_for_one_piece_is_refused(tmp_path):

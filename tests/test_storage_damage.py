@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
 from ertis_numba.storage import (
+    Truth,
     atomic,
     file_kind,
     open_energyscapes,
@@ -184,7 +186,11 @@ def test_several_sensors(path):
 def test_one_damaged_bit_never_passes(tmp_path):
     """Wherever it is, reading gives what was written or a `DataError` of one line."""
     given = noise(line(8, 8).replace(recording=Recording(n_samples=512)), 2)
-    path = write_recording(tmp_path / "rec.h5", given)
+    wall = Reflector(name="wall", azimuth_deg=10.0, elevation_deg=20.0, range_m=1.5, level_db=0.0)
+    told = Truth(scene="", seed=1, reflectors=((), (wall,)))
+    path = write_recording(tmp_path / "rec.h5", given, truth={"eRTIS-7": told})
+    with open_recording(path) as recording:
+        told = recording.truth
     whole = path.read_bytes()
     rng = np.random.default_rng(5)
     refusals = []
@@ -194,6 +200,7 @@ def test_one_damaged_bit_never_passes(tmp_path):
         path.write_bytes(spoilt)
         try:
             with open_recording(path) as recording:
+                assert recording.truth == told
                 for back, measurement in zip(recording, given, strict=True):
                     assert np.array_equal(back.words, measurement.words)
                     assert back.stamp == measurement.stamp

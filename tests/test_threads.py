@@ -19,10 +19,25 @@ for threads in (1, 2, 3, 4):
     print(hashlib.sha256(image.energy.tobytes()).hexdigest())
 """
 
+MODULATE = """
+import hashlib, sys
+import numpy as np
+from ertis_numba import kernels
+cpu, random = kernels.load(sys.argv[1]), np.random.default_rng(1)
+signals, keys = random.uniform(-0.6, 0.6, (37, 2000)), random.integers(0, 2**64, 37, np.uint64)
+mics = np.append(np.arange(37, dtype=np.int32), [-1] * 11).astype(np.int32).reshape(6, 8)
+loop = np.array([0.8, 0.4, 0.2, 0.1, 0.02, 0.1, 0.5, 2.0])
+for threads in range(1, cpu.max_threads + 1):
+    octets, states = np.empty((2000, 6), np.uint8), np.zeros((37, 4))
+    with cpu.threads(threads):
+        cpu.modulate_pdm(signals, mics, keys, np.linspace(0, 0.1, 37), states, loop, 0, octets)
+    print(hashlib.sha256(octets.tobytes() + states.tobytes()).hexdigest())
+"""
 
-def digests(precision, **environment):
+
+def digests(argument, code=CODE, **environment):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | environment
-    command = [sys.executable, "-c", CODE, precision]
+    command = [sys.executable, "-c", code, argument]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if "no 16-bit dot product" in done.stderr:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
@@ -54,3 +69,12 @@ def test_processor_with_fewer_features_is_served(tmp_path):
     """Numba may be told to compile for an older processor; what that lacks is not used."""
     older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "4"}
     assert len(set(digests("auto", **older))) == 1
+
+
+def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
+    """Without AVX, fused multiplication or an instruction that rounds; the states agree as well, to the last bit."""
+    older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
+    found = digests("cpu", MODULATE, NUMBA_NUM_THREADS="4")
+    assert len(found) == 4
+    assert set(found) == set(digests("cpu", MODULATE, NUMBA_NUM_THREADS="2", **older))
+    assert set(found) == set(digests("numpy", MODULATE))

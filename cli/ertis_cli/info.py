@@ -18,26 +18,40 @@ __all__ = ["info"]
 @options.input_file("FILE")
 @options.as_json
 def info(*, path: Path, as_json: bool) -> None:
-    """Say what a recording or an energyscape file holds."""
+    """Say what a recording or an energyscape file holds.
+
+    In JSON, "sensors" lists what each sensor has; if there is one only, the same also stands beside
+    what is said of the file.
+    """
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
+    kind = file_kind(path)
+    about: dict[str, Any] = {}
+    sections: list[dict[str, Any]] = []
     reader: RecordingReader | EnergyscapeReader
-    if file_kind(path) == "recording":
-        with open_recording(path) as reader:
-            report = {**_common(reader), **_recording(reader)}
-    else:
-        with open_energyscapes(path) as reader:
-            report = {**_common(reader), **_energyscapes(reader)}
+    for name in options.sensors_of(path, None):
+        if kind == "recording":
+            with open_recording(path, sensor=name) as reader:
+                about = _file(reader)
+                sections.append({**_sensor(reader), **_recording(reader)})
+        else:
+            with open_energyscapes(path, sensor=name) as reader:
+                about = {**_file(reader), **_origin(reader)}
+                sections.append({**_sensor(reader), **_energyscapes(reader)})
+    flat = [{**about, **sections[0]}] if len(sections) == 1 else [about, *sections]
     if as_json:
-        options.print_json(report)
+        options.print_json({**flat[0], "sensors": sections})
         return
-    width = max(map(len, report))
-    for name, value in report.items():
-        click.echo(f"{name.replace('_', ' '):{width}}  {value}")
+    width = max(len(name) for section in flat for name in section)
+    for index, section in enumerate(flat):
+        if index:
+            click.echo()
+        for name, value in section.items():
+            click.echo(f"{name.replace('_', ' '):{width}}  {value}")
 
 
-def _common(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
-    settings, attributes = reader.settings, reader.attributes
+def _file(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+    attributes = reader.attributes
     return {
         "file": str(reader.path),
         "kind": attributes["ertis_format"],
@@ -46,26 +60,38 @@ def _common(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
         "uuid": reader.uuid,
         "date_created": attributes.get("date_created", ""),
         "source": attributes.get("source", ""),
+    }
+
+
+def _origin(reader: "EnergyscapeReader") -> dict[str, Any]:
+    return {name: reader.attributes.get(name, "") for name in ("recording_uuid", "recording_sha256")}
+
+
+def _sensor(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+    settings = reader.settings
+    return {
         "sensor": reader.sensor,
         "measurements": len(reader),
         "layout": settings.array.layout,
         "microphones": sum(settings.array.enabled or ()) or len(settings.array.positions_m or ()),
         "call_khz": [settings.call.start_frequency_hz / 1e3, settings.call.stop_frequency_hz / 1e3],
         "temperature_c": settings.air.temperature_c,
+        "simulated": reader.truth is not None,
     }
 
 
 def _recording(reader: "RecordingReader") -> dict[str, Any]:
-    first_ns, last_ns = (reader[index].stamp.timestamp_ns for index in (0, -1))
+    stamps = reader.stamps()
     recording = reader.settings.recording
     return {
         "samples": recording.n_samples,
         "pdm_rate_hz": recording.pdm_rate_hz,
         "duration_ms": round(1000 * recording.duration_s, 3),
-        "first": _iso(first_ns),
-        "last": _iso(last_ns),
+        "first": _iso(stamps[0].timestamp_ns),
+        "last": _iso(stamps[-1].timestamp_ns),
         "missing": sum(gap.last - gap.first + 1 for gap in reader.gaps),
-        "simulated": reader.truth is not None,
+        "translation_m": reader.translation_m.tolist(),
+        "rotation_xyzw": reader.rotation_xyzw.tolist(),
     }
 
 
@@ -75,8 +101,6 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "ranges": len(reader.range_m),
         "range_m": [round(float(reader.range_m[index]), 4) for index in (0, -1)],
         "method": reader.settings.processing.method,
-        "recording_uuid": reader.attributes.get("recording_uuid", ""),
-        "recording_sha256": reader.attributes.get("recording_sha256", ""),
     }
 
 

@@ -12,6 +12,7 @@ __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
+    "compare": ("ertis_cli.compare:compare", "Say how far an energyscape file is from the truth."),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),

@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -16,25 +16,31 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
+    from ertis_numba.stages.compare import Comparison
 
 __all__ = [
     "INTERVAL",
     "as_json",
+    "comparisons",
     "counted",
     "device",
     "force",
     "input_file",
     "interrupt_later",
     "measurement",
+    "min_level",
     "note_when_slow",
     "output",
     "pipeline",
     "place",
+    "places",
     "print_json",
     "progress",
     "quiet",
     "require_same_air",
     "say",
+    "sensor",
+    "sensors_of",
     "settings_with",
     "threads",
 ]
@@ -83,6 +89,45 @@ def output(text: str) -> Decorator:
 def measurement(text: str) -> Decorator:
     """Return the option that chooses one measurement."""
     return click.option("--measurement", "-m", type=int, metavar="I", help=text)
+
+
+def min_level(text: str) -> Decorator:
+    """Return the option that says what is too weak."""
+    return click.option("--min-level", type=float, default=-30.0, show_default=True, metavar="DB", help=text)
+
+
+def sensor(text: str) -> Decorator:
+    """Return the option that chooses one sensor of a file."""
+    return click.option("--sensor", metavar="NAME", help=text)
+
+
+def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
+    """Return the sensor that was chosen, or all of a file."""
+    from ertis_numba.storage import sensor_names
+
+    return sensor_names(path) if sensor is None else (sensor,)
+
+
+def comparisons(
+    path: Path, sensor: str, min_level_db: float, *, measurement: int | None = None
+) -> "Iterator[tuple[int, Comparison]]":
+    """Yield the number of each measurement, or of one, and how its energyscape compares with the truth."""
+    from ertis_numba.errors import DataError
+    from ertis_numba.stages.compare import compare
+    from ertis_numba.storage import open_energyscapes
+
+    with open_energyscapes(path, sensor=sensor) as images:
+        if images.truth is None:
+            raise DataError(
+                f"{path}: sensor {sensor} holds no truth; simulate a scene to get one, and process that recording"
+            )
+        for index in places(measurement, len(images)):
+            yield index, compare(images[index], images.truth.reflectors[index], min_level_db=min_level_db)
+
+
+def places(index: int | None, count: int) -> Sequence[int]:
+    """Return the place of a measurement in a file of ``count``, or all places where none is chosen."""
+    return range(count) if index is None else [place(index, count)]
 
 
 def place(index: int, count: int) -> int:

@@ -1,48 +1,135 @@
 """``ertis peaks``: the reflectors in an energyscape file."""
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
 
+if TYPE_CHECKING:
+    from ertis_numba.frames import Peak
+    from ertis_numba.stages.compare import Comparison, Match
+
 __all__ = ["peaks"]
 
-_ROW = "{measurement:11d}  {azimuth_deg:+11.2f}  {elevation_deg:+13.2f}  {range_m:7.3f}  {level_db:8.1f}"
+_TOP = 10
+_HEAD = "  measurement  azimuth_deg  elevation_deg  range_m  level_db"
+_ROW = "  {measurement:11d}  {azimuth_deg:+11.2f}  {elevation_deg:+13.2f}  {range_m:7.3f}  {level_db:8.1f}"
+_ERROR_HEAD = "  angle_error_deg  range_error_m  level_error_db  reflector"
+_ERROR = "  {angle_deg:15.3f}  {range_m:+13.4f}  {level_db:+14.2f}  {name}"
+_NO_ERROR = "  {:>15}  {:>13}  {:>14}  {}"
+_DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4}
 
 
 @click.command()
 @options.input_file("IMG.h5")
-@click.option("--top", type=int, default=10, show_default=True, metavar="N", help="At most so many per measurement.")
+@options.sensor("One sensor only; all of the file by default.")
 @click.option(
-    "--min-level", type=float, default=-30.0, show_default=True, metavar="DB", help="Leave out what is weaker."
+    "--top", type=int, metavar="N", help=f"At most so many per measurement; {_TOP} by default, all with --truth."
 )
+@options.min_level("Leave out what is weaker, below the strongest.")
 @options.measurement("One measurement only, counted from 0.")
+@click.option("--truth", is_flag=True, help="Compare with the truth, which the file of a simulated recording holds.")
 @options.as_json
-def peaks(*, path: Path, top: int, min_level: float, measurement: int | None, as_json: bool) -> None:
+def peaks(
+    *,
+    path: Path,
+    sensor: str | None,
+    top: int | None,
+    min_level: float,
+    measurement: int | None,
+    truth: bool,
+    as_json: bool,
+) -> None:
     """List the reflectors in an energyscape file.
 
     One entry per reflector, the strongest of each measurement first; levels are in dB below it.
+
+    With --truth, each true reflector comes first, with the errors of the peak that shows it or as
+    missed; then come the peaks that no reflector explains, as false, and those of reflectors that do
+    not count, as explained (see 'ertis compare --help'). In JSON, each peak has its true reflector or
+    null as "truth", and is "false" or not; "missed" lists the rest.
     """
+    if truth and top is not None:
+        raise click.UsageError("--top leaves out what --truth asks for; give one of them", click.get_current_context())
+    sensors = options.sensors_of(path, sensor)
+    width = max(map(len, (*sensors, "sensor")))
+    if truth:
+        compared: list[tuple[dict[str, Any], Comparison]] = [
+            ({"sensor": name, "measurement": index}, comparison)
+            for name in sensors
+            for index, comparison in options.comparisons(path, name, min_level, measurement=measurement)
+        ]
+        report = {
+            "peaks": [row for place, comparison in compared for row in _compared(place, comparison)],
+            "missed": [place | _rounded(item) for place, comparison in compared for item in comparison.missed],
+        }
+        lines = (
+            place["sensor"].ljust(width) + line for place, comparison in compared for line in _lines(place, comparison)
+        )
+        head = _HEAD + _ERROR_HEAD
+    else:
+        rows = [
+            row for name in sensors for row in _found(path, name, _TOP if top is None else top, min_level, measurement)
+        ]
+        report = {"peaks": rows}
+        lines = (row["sensor"].ljust(width) + _ROW.format(**row) for row in rows)
+        head = _HEAD
+    if as_json:
+        options.print_json(report)
+        return
+    click.echo("sensor".ljust(width) + head)
+    for line in lines:
+        click.echo(line)
+
+
+def _found(path: Path, sensor: str, top: int, min_level: float, measurement: int | None) -> list[dict[str, Any]]:
+    """Return a row for each peak of a sensor."""
     from ertis_numba.stages.detect import find_peaks
     from ertis_numba.storage import open_energyscapes
 
-    with open_energyscapes(path) as images:
-        chosen = range(len(images)) if measurement is None else [options.place(measurement, len(images))]
-        rows = [
-            {
-                "measurement": index,
-                "azimuth_deg": round(peak.azimuth_deg, 4),
-                "elevation_deg": round(peak.elevation_deg, 4),
-                "range_m": round(peak.range_m, 6),
-                "level_db": round(peak.level_db, 4),
-            }
-            for index in chosen
+    with open_energyscapes(path, sensor=sensor) as images:
+        return [
+            {"sensor": sensor, "measurement": index, **_rounded(peak)}
+            for index in options.places(measurement, len(images))
             for peak in find_peaks(images[index], top=top, min_level_db=min_level)
         ]
-    if as_json:
-        options.print_json({"peaks": rows})
-        return
-    click.echo("measurement  azimuth_deg  elevation_deg  range_m  level_db")
-    for row in rows:
-        click.echo(_ROW.format(**row))
+
+
+def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[str, Any]]:
+    """Yield a row for each peak of a measurement, the strongest first."""
+    shown: list[tuple[Peak, Match | None, bool]] = [(match.peak, match, False) for match in comparison.matched]
+    shown += [(peak, None, True) for peak in comparison.false]
+    shown += [(peak, None, False) for peak in comparison.explained]
+    for peak, match, is_false in sorted(shown, key=lambda entry: -entry[0].level_db):
+        yield {
+            **place,
+            **_rounded(peak),
+            "false": is_false,
+            "truth": _rounded(match.reflector) if match else None,
+            "error": _error(match) if match else None,
+        }
+
+
+def _lines(place: dict[str, Any], comparison: "Comparison") -> Iterator[str]:
+    """Yield a line for each true reflector of a measurement, then for the other peaks."""
+    for match in comparison.matched:
+        told = _ERROR.format(**_error(match), name=match.reflector.name)
+        yield _ROW.format(**place, **_rounded(match.reflector)) + told
+    for reflector in comparison.missed:
+        yield _ROW.format(**place, **_rounded(reflector)) + _NO_ERROR.format("missed", "-", "-", reflector.name)
+    for verdict, given in (("false", comparison.false), ("explained", comparison.explained)):
+        for peak in given:
+            yield _ROW.format(**place, **_rounded(peak)) + _NO_ERROR.format(verdict, "-", "-", "-")
+
+
+def _error(match: "Match") -> dict[str, float]:
+    return {name: round(getattr(match, name), _DIGITS[name]) for name in ("angle_deg", "range_m", "level_db")}
+
+
+def _rounded(item: Any) -> dict[str, Any]:
+    """Return the fields of a peak or a reflector, their numbers rounded."""
+    return {name: round(value, _DIGITS[name]) if name in _DIGITS else value for name, value in asdict(item).items()}

@@ -18,6 +18,7 @@ _FORMATS = (".pdf", ".png", ".svg")
 @click.command()
 @options.input_file("IMG.h5|REC.h5")
 @options.output("Picture to write: .png, .svg or .pdf; a .png beside the file by default.")
+@options.sensor("Whose measurement; needed where the file holds several sensors.")
 @options.measurement("Which one, counted from 0; the first by default.")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
@@ -33,6 +34,7 @@ def plot(
     *,
     path: Path,
     target: Path | None,
+    sensor: str | None,
     measurement: int | None,
     dynamic_range: float,
     theme: Literal["dark", "light"],
@@ -52,22 +54,22 @@ def plot(
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)
-    image = _image(path, measurement or 0, quiet=quiet)
+    image = _image(path, sensor, measurement or 0, quiet=quiet)
     found = find_peaks(image, top=top) if top else []
     figure = figures.plot(image, dynamic_range_db=dynamic_range, theme=theme, peaks=found)
     with replacing(target, overwrite=force) as part:
         figure.savefig(part, format=target.suffix.lower().lstrip("."))
     options.say(f"{target}: measurement {measurement or 0} of {path}", quiet=quiet)
     if as_json:
-        options.print_json({"output": str(target), "measurement": measurement or 0})
+        options.print_json({"output": str(target), "sensor": image.stamp.sensor, "measurement": measurement or 0})
 
 
-def _image(path: Path, index: int, *, quiet: bool) -> "Energyscape":
+def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     if file_kind(path) == "energyscape":
-        with open_energyscapes(path) as images:
+        with open_energyscapes(path, sensor=sensor) as images:
             return images[options.place(index, len(images))]
-    with open_recording(path) as recording:
+    with open_recording(path, sensor=sensor) as recording:
         measurement = recording[options.place(index, len(recording))]
     return options.pipeline(measurement.settings, quiet=quiet).process(measurement)

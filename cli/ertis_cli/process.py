@@ -2,13 +2,19 @@
 
 import statistics
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Energyscape, Measurement
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
 
 __all__ = ["process"]
 
@@ -16,6 +22,7 @@ __all__ = ["process"]
 @click.command()
 @options.input_file("REC.h5")
 @options.output("Energyscape file to write; REC.energy.h5 beside the recording by default.")
+@options.sensor("One sensor only; all of the recording by default.")
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Limits of 2d:N and 3d:N in °.")
 @click.option("--elevation", type=options.INTERVAL, help="Limits of 3d:N in °.")
@@ -45,6 +52,7 @@ def process(
     *,
     path: Path,
     target: Path | None,
+    sensor: str | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
     elevation: tuple[float, float] | None,
@@ -61,48 +69,83 @@ def process(
     """Turn a recording into energyscapes.
 
     Settings come from the recording, then from the settings file, then from the options. The same
-    recording gives the same energies, bit by bit, whatever the number of threads.
+    recording gives the same energies, bit by bit, whatever the number of threads. All sensors of a
+    recording go into one file, each with its own settings.
     """
     from ertis_numba.storage import EnergyscapeWriter, open_recording
 
     target = target or path.with_suffix(".energy.h5")
-    with open_recording(path) as recording:
-        settings = options.settings_with(
-            recording.settings,
-            settings_file=settings_file,
-            directions=directions,
-            azimuth_limits_deg=azimuth,
-            elevation_limits_deg=elevation,
-            range_m=range_m,
-            method=method,
+    with ExitStack() as stack:
+        names = options.sensors_of(path, sensor)
+        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]
+        # Every sensor is looked at before the first one is processed, so that what cannot be done is told at once.
+        settings = [
+            options.settings_with(
+                recording.settings,
+                settings_file=settings_file,
+                directions=directions,
+                azimuth_limits_deg=azimuth,
+                elevation_limits_deg=elevation,
+                range_m=range_m,
+                method=method,
+            )
+            for recording in recordings
+        ]
+        writer = EnergyscapeWriter(target, recording=recordings, dtype=dtype, overwrite=force)
+        runs = [_Run(options.pipeline(given, device=device, threads=threads, quiet=quiet)) for given in settings]
+        measurements = (
+            (run, measurement, recording.settings)
+            for run, recording in zip(runs, recordings, strict=True)
+            for measurement in recording
         )
-        writer = EnergyscapeWriter(target, recording=recording, dtype=dtype, overwrite=force)
-        pipeline = options.pipeline(settings, device=device, threads=threads, quiet=quiet)
-        times_ms = []
-        with writer, options.progress(recording, length=len(recording), label="processing", quiet=quiet) as shown:
-            for measurement in shown:
-                if settings.air == recording.settings.air:
-                    options.require_same_air(measurement, settings)
-                # A settings file may know better than the recording what array, call or air it was.
-                known = replace(measurement, settings=settings)
-                start_s = time.perf_counter()
-                image = pipeline.process(known)
-                times_ms.append(1000 * (time.perf_counter() - start_s))
-                writer.write(image)
-    median_ms = statistics.median(times_ms)
+        length = sum(map(len, recordings))
+        with writer, options.progress(measurements, length=length, label="processing", quiet=quiet) as shown:
+            for run, measurement, recorded in shown:
+                writer.write(run(measurement, recorded))
+    rows = [{"sensor": name, **run.report()} for name, run in zip(names, runs, strict=True)]
+    times_ms = [time_ms for run in runs for time_ms in run.times_ms]
     report = {
         "output": str(target),
         "measurements": len(times_ms),
-        "directions": len(pipeline.grid),
-        "ranges": len(pipeline.range_m),
-        "device": pipeline.device,
-        "median_ms": round(median_ms, 3),
+        **({name: rows[0][name] for name in ("directions", "ranges")} if len(rows) == 1 else {}),
+        "device": runs[0].pipeline.device,
+        "median_ms": round(statistics.median(times_ms), 3),
+        "sensors": rows,
     }
-    options.say(
-        f"{target}: {options.counted(len(times_ms), 'measurement')}, "
-        f"{options.counted(len(pipeline.grid), 'direction')} × {options.counted(len(pipeline.range_m), 'range')} "
-        f"on {pipeline.device}, {median_ms:.1f} ms each (median)",
-        quiet=quiet,
-    )
+    for row in rows:
+        of = f" of {row['sensor']}" if len(rows) > 1 else ""
+        options.say(
+            f"{target}: {options.counted(row['measurements'], 'measurement')}{of}, "
+            f"{options.counted(row['directions'], 'direction')} × {options.counted(row['ranges'], 'range')} "
+            f"on {report['device']}, {row['median_ms']:.1f} ms each (median)",
+            quiet=quiet,
+        )
     if as_json:
         options.print_json(report)
+
+
+class _Run:
+    """The pipeline of one sensor, and how long it took for each measurement."""
+
+    def __init__(self, pipeline: "Pipeline") -> None:
+        self.pipeline = pipeline
+        self.times_ms: list[float] = []
+
+    def __call__(self, measurement: "Measurement", recorded: "Settings") -> "Energyscape":
+        settings = self.pipeline.settings
+        if settings.air == recorded.air:
+            options.require_same_air(measurement, settings)
+        # A settings file may know better than the recording what array, call or air it was.
+        known = replace(measurement, settings=settings)
+        start_s = time.perf_counter()
+        image = self.pipeline.process(known)
+        self.times_ms.append(1000 * (time.perf_counter() - start_s))
+        return image
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "measurements": len(self.times_ms),
+            "directions": len(self.pipeline.grid),
+            "ranges": len(self.pipeline.range_m),
+            "median_ms": round(statistics.median(self.times_ms), 3),
+        }

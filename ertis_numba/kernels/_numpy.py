@@ -1,6 +1,7 @@
 """The kernels in plain NumPy: what the compiled ones are compared with in speed."""
 
 import contextlib
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short
 __all__ = ["KERNELS"]
 
 _TILE_RANGES = 96  # as many as the compiled kernel has with AVX-512
+_NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / rms of a sum of four numbers from 0 to 4095
 
 
 @contextlib.contextmanager
@@ -147,39 +149,66 @@ def delay_and_sum_envelope_int16(
             out[direction, start : start + n_ranges] = level * (scales[tile] * weight_scale)
 
 
+def add_paths(
+    call: NDArray[np.complex128],
+    turns: NDArray[np.float64],
+    amplitude: NDArray[np.float64],
+    first_bin: int,
+    nodes_per_bin: float,
+    out: NDArray[np.complex128],
+) -> None:
+    """See `AddPaths`."""
+    bins = first_bin + np.arange(out.shape[1])
+    nodes = np.arange(amplitude.shape[2])
+    for path in range(len(turns)):
+        for mic in range(len(out)):
+            gain = np.interp(bins * nodes_per_bin, nodes, amplitude[path, mic])
+            turned = np.exp(-2j * np.pi * ((turns[path, mic] * bins) % 1.0))
+            out[mic] += gain * call[mic if len(call) > 1 else 0] * turned
+
+
 def modulate_pdm(
     signals: NDArray[np.float64],
+    mics: Index,
     keys: NDArray[np.uint64],
+    noise_rms: NDArray[np.float64],
     states: NDArray[np.float64],
-    gains: NDArray[np.float64],
+    loop: NDArray[np.float64],
     first: int,
-    dither: float,
-    limit: float,
     out: NDArray[np.uint8],
 ) -> None:
     """See `ModulatePdm`; microphones side by side, samples one after the other."""
-    c1, c2, c3, c4, r1, r2 = gains
+    c1, c2, c3, c4, r1, r2, width, limit = loop
+    noise, dither = _noise_and_dither(keys, first, signals.shape[1])
+    grid = 2.0**-20
+    followed = np.rint((signals + noise_rms[:, None] * _NOISE_UNIT * noise) / grid) * grid
+    followed_dithered = followed + width * dither
     s1, s2, s3, s4 = states.T.copy()
-    for sample, u in enumerate(signals.T):
-        noise = _dither(keys, first + sample)
-        above = (u + dither * noise) + ((s1 + s2) + (s3 + s4)) >= 0
-        out[:, sample] = above
-        d = u - np.where(above, 1.0, -1.0)
+    above = np.zeros((len(signals) + 1, signals.shape[1]), dtype=np.bool_)  # the last row is that of no microphone
+    for sample, u in enumerate(followed.T):
+        bits = followed_dithered[:, sample] + ((s1 + s2) + (s3 + s4)) >= 0
+        above[:-1, sample] = bits
+        d = u - np.where(bits, 1.0, -1.0)
         s1 = np.clip(s1 + (c1 * d - r1 * s2), -limit, limit)
         s2 = np.clip(s2 + c2 * s1, -limit, limit)
         s3 = np.clip(s3 + (c3 * s2 - r2 * s4), -limit, limit)
         s4 = np.clip(s4 + c4 * s3, -limit, limit)
     states[:] = np.stack([s1, s2, s3, s4], axis=1)
+    out[:] = np.packbits(above[mics], axis=1, bitorder="little")[:, 0].T
 
 
-def _dither(keys: NDArray[np.uint64], sample: int) -> NDArray[np.float64]:
-    """Return SplitMix64 of key and sample as numbers in [−½, ½): (mic,) float64."""
-    step = np.uint64(sample * 0x9E3779B97F4A7C15 % 2**64)
-    z = keys + step
+def _noise_and_dither(
+    keys: NDArray[np.uint64], first: int, n_samples: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sums of 12-bit fields about 0, and numbers within ±½, from SplitMix64: both (mic, sample) float64."""
+    z = keys[:, None] + np.arange(first, first + n_samples, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z ^= z >> np.uint64(31)
-    return np.asarray((z >> np.uint64(11)) * 2.0**-53 - 0.5, dtype=np.float64)
+    fields = [(z >> np.uint64(shift)) & np.uint64(0xFFF) for shift in (0, 12, 24, 36)]
+    noise = np.sum(fields, axis=0).astype(np.float64) - 8190.0
+    dither = ((z >> np.uint64(48)).astype(np.float64) + 0.5) / 2.0**16 - 0.5
+    return noise, dither
 
 
 KERNELS = KernelSet(
@@ -199,5 +228,6 @@ KERNELS = KernelSet(
     delay_and_sum_envelope=delay_and_sum_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    add_paths=add_paths,
     modulate_pdm=modulate_pdm,
 )

@@ -1,10 +1,26 @@
-"""Scenes with known truth, rendered to the PDM words of a sensor.
+"""Scenes with known truth, rendered to the PDM words of their sensors.
 
-`render` is reached as ``ertis_numba.simulation.render.render``; it brings the compiled kernels in,
+`render` and `Simulator` are reached as ``ertis_numba.simulation.render``; they bring the compiled kernels in,
 which the description of a scene does not need.
 """
 
-from ertis_numba.simulation.arrivals import Arrivals, arrivals, true_peaks
-from ertis_numba.simulation.scene import DirectSound, Electronics, Point, Scene, load_scene
+from ertis_numba.simulation.scene import Scene, load_scene
+from ertis_numba.simulation.sensors import Electronics, Emitter, Sensor
+from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
+from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
 
-__all__ = ["Arrivals", "DirectSound", "Electronics", "Point", "Scene", "arrivals", "load_scene", "true_peaks"]
+__all__ = [
+    "Ambient",
+    "Box",
+    "Electronics",
+    "Emitter",
+    "Noise",
+    "Point",
+    "Scene",
+    "Sensor",
+    "Sonar",
+    "Sphere",
+    "Tone",
+    "Wall",
+    "load_scene",
+]

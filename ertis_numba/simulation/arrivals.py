@@ -1,97 +1,205 @@
-"""When and how strongly every sound of a scene reaches every microphone."""
+"""When, how strongly and how filtered every call of a scene reaches every microphone."""
 
+import importlib
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.frames import Peak
-from ertis_numba.geometry import Layout, microphones, unit_vectors
-from ertis_numba.simulation.scene import Point, Scene
+from ertis_numba.settings import Call
+from ertis_numba.simulation.mirrors import images
+from ertis_numba.simulation.paths import Paths, by_targets, without_target
+from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.stopwatch import Stopwatch
 
-__all__ = ["Arrivals", "arrivals", "true_peaks"]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "gains", "responses"]
 
-_NEAREST_M = 0.01  # emitters, reflectors and microphones have a size: amplitudes stop growing here
+Floats = NDArray[np.float64]
 _TICK_S = 1e-12
+_SPECTRAL = ("target_size", "absorption", "emitter_directivity", "microphone_directivity")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrivals:
-    """Delayed and attenuated copies of the call, one row per way of the sound.
+    """Copies of one call.
 
     Attributes
     ----------
-    delay_s : (way, mic) float64
-        From the start of the emission, the microphone's own lateness included.
-    amplitude : (way, mic) float64
-        The microphone's own sensitivity included.
+    call : Call
+    delay_s : (path, mic) float64
+        From the start of the record, the microphone's own lateness included.
+    amplitude : (path, mic, node) float64
+        At the frequencies of the nodes, or one node for all; the microphone's sensitivity included.
+    stretch : (path, mic) float64 or None
+        How long a second of the call lasts, where something moves.
     """
 
-    delay_s: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
+    call: Call
+    delay_s: Floats
+    amplitude: Floats
+    stretch: Floats | None = None
 
 
-def arrivals(scene: Scene) -> Arrivals:
-    """Return all arrivals of a scene: the direct sound first, then the points in their order.
+def effect(name: str, function: str | None = None) -> Any:
+    """Return the function of an effect; importing it is what asking for it costs."""
+    return getattr(importlib.import_module(f"ertis_numba.simulation.effects.{name}"), function or name)
 
-    A point returns the call on spherical waves, ``a = s / (r_tx r_rx)`` after ``(r_tx + r_rx) / c``,
-    from the emitter at the origin to the point and on to each microphone; the direct sound is
-    ``s / r`` after ``r / c``. Delays are whole picoseconds: far finer than what can be measured, but
-    coarse enough that the last digits of sines and roots, in which processors differ, do not show.
+
+def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: Stopwatch) -> list[Arrivals]:
+    """Return all that arrives of calls.
+
+    Delays are whole picoseconds: far finer than what can be measured, but coarse enough that the last digits of
+    sines and roots, in which processors differ, do not show.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    active : set of str
+        The effects that are simulated.
+    frequency_hz : (node,) float64
+        Where filters are evaluated.
+    clock : Stopwatch
     """
-    layout = microphones(scene.sensor.array)
-    positions_m = layout.enabled_positions_m
-    ways_m, amplitudes = [], []
-    if scene.direct_sound is not None:
-        there_m = _length(positions_m)
-        ways_m.append(there_m)
-        amplitudes.append(_linear(scene.direct_sound.strength_db) / np.maximum(there_m, _NEAREST_M))
-    for point in scene.points:
-        back_m = _back_m(point, layout)
-        ways_m.append(point.range_m + back_m)
-        amplitudes.append(_amplitude(point, back_m))
-    wanted = (len(ways_m), len(positions_m))
-    delay_s = np.reshape(ways_m, wanted) / sound_speed_m_s(scene.sensor.air) + layout.delay_s[layout.enabled]
-    return Arrivals(
-        delay_s=np.rint(delay_s / _TICK_S) * _TICK_S,
-        amplitude=np.reshape(amplitudes, wanted) * layout.gain[layout.enabled],
-    )
+    gain, late_s = gains(shot, active, clock)
+    found = []
+    numbers = [] if shot.sensor.emitter.silent else [shot.number]
+    if "cross_emission" in active:
+        numbers += effect("cross_emission")(shot)
+    for number in numbers:
+        sensor = shot.scene.sensors[number]
+        level = _linear(sensor.emitter.level_db)
+        start_s = effect("sync_delay")(shot, number) if "sync_delay" in active else 0.0
+        own = "propagation" if number == shot.number else "cross_emission"
+        for paths in echoes(shot, active, number, clock):
+            amplitude = level * responses(shot, active, paths, sensor.emitter, frequency_hz, clock)
+            with clock("doppler" if "doppler" in active else own):
+                delay_s, stretch = _times(shot, active, paths)
+            found.append(_arrivals(sensor.call, delay_s + start_s + late_s, gain[:, None] * amplitude, stretch))
+    if "direct_sound" in active and not shot.sensor.emitter.silent:
+        with clock("direct_sound"):
+            paths = effect("direct_sound")(shot)
+            amplitude = _linear(shot.sensor.emitter.direct_sound_db or 0.0) * effect("spreading")(paths)
+            delay_s = effect("propagation")(paths, shot.speed_m_s)
+            found.append(_arrivals(shot.sensor.call, delay_s + late_s, (gain * amplitude)[..., None], None))
+    if "interference" in active:
+        with clock("interference"):
+            found += _sonars(shot, gain, late_s)
+    return found
 
 
-def true_peaks(scene: Scene) -> list[Peak]:
-    """Return the points as an image should show them, strongest first.
+def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch) -> list[Paths]:
+    """Return the paths of an emitter's call over targets and walls, and straight from another sensor's."""
+    mouth = shot.mouths[number]
+    if "walls" in active:
+        with clock("walls"):
+            firsts, seconds, specular = effect("walls")(shot, mouth)
+    else:
+        firsts = images(mouth, shot.targets.positions_m, (), 0)
+        seconds = images(shot.ear, shot.targets.positions_m, (), 0)
+        specular = images(mouth, shot.ear.centre_m[None], (), 0)
+    if "occlusion" in active:
+        with clock("occlusion"):
+            hide = effect("occlusion")
+            firsts, seconds, specular = (hide(seen, shot.mirrors) for seen in (firsts, seconds, specular))
+    over = by_targets
+    if "target_size" in active and np.any(shot.targets.radius_m):
+        over = effect("target_size", "over_surfaces")
+    found = []
+    for first in firsts:
+        for second in seconds:
+            chosen = np.flatnonzero(first.exists & second.exists)
+            if len(chosen) and len(first.mirrors) + len(second.mirrors) <= shot.scene.max_reflections:
+                found.append(over(first.end, second.end, shot.targets.chosen(chosen)))
+    for seen in specular:
+        if seen.exists[0] and (seen.mirrors or number != shot.number):
+            found.append(without_target(seen.end, shot.ear, shot.targets))
+    return found
 
-    The level is that of the mean amplitude over the microphones, spreading included, below the
-    strongest point.
+
+def responses(
+    shot: Snapshot,
+    active: AbstractSet[str],
+    paths: Paths,
+    emitter: Emitter,
+    frequency_hz: Floats,
+    clock: Stopwatch,
+) -> Floats:
+    """Return what distance, air, walls, targets and directions leave of a call: (path, mic, node) float64."""
+    amplitude = paths.reflection * _strength(paths)[:, None, None] * np.ones((*paths.second_m.shape, 1))
+    if "spreading" in active:
+        with clock("spreading"):
+            amplitude *= effect("spreading")(paths)[..., None]
+    if "target_size" in active and np.any(paths.targets.diameter_m):
+        with clock("target_size"):
+            pattern = effect("target_size", "disc_pattern")(paths, frequency_hz, shot.speed_m_s)
+            amplitude = amplitude * pattern
+    if "absorption" in active:
+        with clock("absorption"):
+            amplitude = amplitude * effect("absorption")(paths, shot.sensor.air, frequency_hz)
+    if "emitter_directivity" in active and emitter.diameter_m:
+        with clock("emitter_directivity"):
+            pattern = effect("emitter_directivity")(paths, emitter.diameter_m, frequency_hz, shot.speed_m_s)
+            amplitude = amplitude * pattern
+    diameter_m = shot.sensor.electronics.microphone_diameter_m
+    if "microphone_directivity" in active and diameter_m:
+        with clock("microphone_directivity"):
+            pattern = effect("microphone_directivity")(paths, diameter_m, frequency_hz, shot.speed_m_s)
+            amplitude = amplitude * pattern
+    return amplitude
+
+
+def gains(shot: Snapshot, active: AbstractSet[str], clock: Stopwatch) -> tuple[Floats, Floats]:
+    """Return sensitivity and lateness of the microphones: both (mic,) float64.
+
+    Both hold the calibration of the settings, which processing takes out, and the spread, which it does
+    not know.
     """
-    layout = microphones(scene.sensor.array)
-    amplitudes = [float(np.mean(_amplitude(point, _back_m(point, layout)))) for point in scene.points]
-    peaks = [
-        Peak(
-            azimuth_deg=point.azimuth_deg,
-            elevation_deg=point.elevation_deg,
-            range_m=point.range_m,
-            level_db=float(20 * np.log10(amplitude / max(amplitudes))),
-        )
-        for point, amplitude in zip(scene.points, amplitudes, strict=True)
-    ]
-    return sorted(peaks, key=lambda peak: -peak.level_db)
+    gain, late_s = shot.layout.gain[shot.channels], shot.layout.delay_s[shot.channels]
+    if "microphone_spread" in active:
+        with clock("microphone_spread"):
+            more, later_s = effect("microphone_spread")(shot)
+            gain, late_s = gain * more, late_s + later_s
+    if "microphone_faults" in active:
+        with clock("microphone_faults"):
+            gain = gain * effect("microphone_faults")(shot)
+    return gain, late_s
 
 
-def _back_m(point: Point, layout: Layout) -> NDArray[np.float64]:
-    """Return the distance from a point to each microphone: (mic,)."""
-    direction = unit_vectors(np.radians(point.azimuth_deg), np.radians(point.elevation_deg))
-    return _length(point.range_m * direction - layout.enabled_positions_m)
+def _strength(paths: Paths) -> Floats:
+    """Return what targets reflect: (path,) float64. From afar a sphere is a point of half of its radius."""
+    targets = paths.targets
+    if not len(targets):
+        return np.ones(1)
+    return targets.strength * np.where((targets.radius_m > 0) & (not paths.surface), targets.radius_m / 2, 1.0)
 
 
-def _amplitude(point: Point, back_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    spread_m2 = max(point.range_m, _NEAREST_M) * np.maximum(back_m, _NEAREST_M)
-    return np.asarray(_linear(point.strength_db) / spread_m2)
+def _times(shot: Snapshot, active: AbstractSet[str], paths: Paths) -> tuple[Floats, Floats | None]:
+    if "doppler" in active:
+        delay_s, stretch = effect("doppler")(paths, shot.speed_m_s)
+        return delay_s, stretch
+    return effect("propagation")(paths, shot.speed_m_s), None
 
 
-def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
+def _sonars(shot: Snapshot, gain: Floats, late_s: Floats) -> list[Arrivals]:
+    found = []
+    for sonar in shot.scene.sonars:
+        paths = effect("interference", "way_from")(shot, sonar)
+        amplitude = _linear(sonar.level_db) * effect("spreading")(paths)
+        way_s = effect("propagation")(paths, shot.speed_m_s)
+        starts_s = effect("interference", "calls_of")(shot, sonar)
+        if len(starts_s):
+            delay_s = way_s + starts_s[:, None] + late_s
+            found.append(
+                _arrivals(sonar.call, delay_s, np.repeat((gain * amplitude)[..., None], len(starts_s), axis=0), None)
+            )
+    return found
+
+
+def _arrivals(call: Call, delay_s: Floats, amplitude: Floats, stretch: Floats | None) -> Arrivals:
+    return Arrivals(call, np.rint(delay_s / _TICK_S) * _TICK_S, amplitude, stretch)
 
 
 def _linear(level_db: float) -> float:

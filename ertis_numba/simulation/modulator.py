@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
+from ertis_numba.geometry import Layout
 
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]
 
@@ -18,12 +19,15 @@ _GAIN_STEP = 2.0**-20  # gains as short numbers: no processor's last digit can c
 
 
 class Modulator:
-    """One modulator per microphone, its state kept from block to block.
+    """One modulator per enabled microphone, its state kept from block to block.
 
     Parameters
     ----------
+    layout : Layout
     keys : (mic,) uint64
-        Seed of each microphone's dither.
+        Seed of each microphone's noise and dither.
+    noise_rms : (mic,) float64
+        White noise added to each signal, full scale 1; 0 for none, which also costs nothing.
     order : int
         1 to 4.
     dither : float
@@ -36,31 +40,52 @@ class Modulator:
     """
 
     def __init__(
-        self, keys: NDArray[np.uint64], *, order: int, dither: float, band: float, threads: int | None = None
+        self,
+        layout: Layout,
+        keys: NDArray[np.uint64],
+        noise_rms: NDArray[np.float64],
+        *,
+        order: int,
+        dither: float,
+        band: float,
+        threads: int | None = None,
     ) -> None:
-        self._keys = keys
-        self._gains = np.asarray(loop_gains(order, band))
-        self._states = np.zeros((len(keys), _MAX_ORDER))
-        self._dither = dither
+        self._mics = _mics_of_bits(layout)
+        n_mics = int(layout.enabled.sum())
+        checks.shape("keys", keys.shape, (n_mics,))
+        checks.shape("noise_rms", noise_rms.shape, (n_mics,))
+        self._keys, self._noise_rms = keys, noise_rms
+        self._states = np.zeros((n_mics, _MAX_ORDER))
+        self._loop = np.array([*loop_gains(order, band), dither, _LIMIT])
         self._first = 0
         self._kernels = kernels.load("cpu")
         self._threads = self._kernels.max_threads if threads is None else threads
 
-    def process(self, signals: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Return the bits of the next block: (mic, sample) uint8, 0 or 1.
+    def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:
+        """Fill the words of the next block; bits without an enabled microphone become 0.
 
         Parameters
         ----------
         signals : (mic, sample) float64
-            Full scale 1. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
+            Full scale 1, finite. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
+        out : (sample, word) uint8, uint16, uint32 or uint64
         """
-        bits = np.empty(signals.shape, dtype=np.uint8)
+        octets = out.view(np.uint8)  # words are little-endian, as this package's processors are
+        checks.shape("signals", signals.shape, (len(self._states), len(out)))
+        checks.shape("out, in bytes,", octets.shape, (len(out), len(self._mics)))
+        signals = np.ascontiguousarray(signals, dtype=np.float64)
         with self._kernels.threads(self._threads):
             self._kernels.modulate_pdm(
-                signals, self._keys, self._states, self._gains, self._first, self._dither, _LIMIT, bits
+                signals, self._mics, self._keys, self._noise_rms, self._states, self._loop, self._first, octets
             )
-        self._first += signals.shape[1]
-        return bits
+        self._first += len(out)
+
+
+def _mics_of_bits(layout: Layout) -> NDArray[np.int32]:
+    """Return the microphone that each bit of a sample's words belongs to, −1 for none: (octet, 8) int32."""
+    mics = np.full(layout.n_words * layout.word_bits, -1, dtype=np.int32)
+    mics[: len(layout.enabled)][layout.enabled] = np.arange(layout.enabled.sum())
+    return mics.reshape(-1, 8)
 
 
 def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,78 +1,186 @@
-"""From a scene to the PDM words that its sensor would record."""
+"""From a scene to the PDM words that its sensors would record."""
 
-import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
-from ertis_numba.simulation.arrivals import Arrivals, arrivals
+from ertis_numba.simulation import synthesis
+from ertis_numba.simulation.arrivals import arrivals, effect, gains
 from ertis_numba.simulation.modulator import Modulator
+from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.scene import Scene
-from ertis_numba.waveform import call_at
+from ertis_numba.simulation.snapshot import Snapshot, snapshot
+from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.truth import reflectors
 
-__all__ = ["received", "render"]
+__all__ = ["Simulator", "render"]
 
-_BLOCK = 32_768  # PDM samples rendered at a time, so that memory does not grow with the record
-_SIGNAL_STEP = 2.0**-20  # −131 dBFS of noise, to hide the last digits, in which processors differ
+_CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word
+_SYNC_STEP_NS = 400
 
 
-def render(scene: Scene, index: int = 0) -> Measurement:
-    """Return measurement ``index`` of a scene; scene and index decide every bit.
+class Simulator:
+    """Renders the measurements of one sensor, with the effects that the scene calls for.
 
-    Channels without a microphone hold zeros.
+    Parameters
+    ----------
+    scene : Scene
+    sensor : str, optional
+        The first by default.
+    plan : Plan, optional
+        Which effects; what the scene calls for by default.
+    threads : int, optional
+        For the modulators; all cores by default. The bits do not depend on it.
+
+    Attributes
+    ----------
+    scene : Scene
+    sensor : Sensor
+    plan : Plan
+    clock : Stopwatch
+        What each effect has cost so far.
     """
-    checks.whole("index", index, 0)
-    settings = scene.sensor
-    layout = microphones(settings.array)
-    words = np.empty((settings.recording.n_samples, layout.n_words), dtype=f"u{layout.word_bits // 8}")
-    ways = arrivals(scene)
-    seeds = np.random.SeedSequence((scene.seed, index)).spawn(int(layout.enabled.sum()))
-    noises = [np.random.default_rng(seed) for seed in seeds]
-    modulator = Modulator(
-        np.array([seed.generate_state(1, np.uint64)[0] for seed in seeds]),
-        order=scene.electronics.modulator_order,
-        dither=scene.electronics.dither,
-        band=min(settings.call.high_frequency_hz / settings.recording.pdm_rate_hz, 0.25),
+
+    def __init__(
+        self, scene: Scene, *, sensor: str | None = None, plan: Plan | None = None, threads: int | None = None
+    ) -> None:
+        self.scene = scene
+        self.sensor = scene.sensor(sensor)
+        self.plan = make_plan(scene) if plan is None else plan
+        self.clock = Stopwatch()
+        self._layout = microphones(self.sensor.array)
+        self._settings = self.sensor.settings()
+        self._threads = threads
+        rate_hz = self.sensor.recording.pdm_rate_hz
+        calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
+        self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
+
+    def render(self, index: int = 0) -> Measurement:
+        """Return measurement ``index``; scene, sensor and index decide every bit.
+
+        Channels without a microphone hold zeros.
+        """
+        shot = self._shot(index)
+        n_samples, n_words = self.sensor.recording.n_samples, self._layout.n_words
+        words = np.empty((n_samples, n_words), dtype=f"<u{self._layout.word_bits // 8}")
+        for channels in range(0, len(self._layout.enabled), _CHANNELS):
+            part = slice(channels, channels + _CHANNELS)
+            columns = slice(channels // self._layout.word_bits, (channels + _CHANNELS) // self._layout.word_bits)
+            self._modulate(shot, index, part, words[:, columns])
+        if "microphone_faults" in self.plan.active:
+            with self.clock("microphone_faults"):
+                effect("microphone_faults", "stick")(words.view(np.uint8), self.sensor.electronics)
+        return Measurement(words if n_words > 1 else words[:, 0], self._settings, self._stamp(shot, index))
+
+    def signals(self, index: int = 0) -> NDArray[np.float64]:
+        """Return what the modulators receive, their own noise apart: (mic, sample) float64, full scale 1."""
+        return np.concatenate(list(self._signals(self._shot(index), index)), axis=1)
+
+    def reflectors(self, index: int = 0) -> list[Reflector]:
+        """Return what an image of measurement ``index`` should show, strongest first."""
+        return reflectors(self._shot(index), self.plan.active)
+
+    def _shot(self, index: int) -> Snapshot:
+        checks.whole("index", index, 0)
+        return snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
+
+    def _modulate(self, shot: Snapshot, index: int, part: slice, out: NDArray[np.unsignedinteger]) -> None:
+        """Fill the words of some channels."""
+        mics = np.flatnonzero((shot.channels >= part.start) & (shot.channels < part.stop))
+        if not len(mics):
+            out[:] = 0
+            return
+        chosen = slice(mics[0], mics[-1] + 1)
+        electronics, recording = self.sensor.electronics, self.sensor.recording
+        modulator = Modulator(
+            _part(self._layout, part),
+            self._keys(index, len(shot.channels))[chosen],
+            np.full(len(mics), self._noise_rms()),
+            order=electronics.modulator_order,
+            dither=electronics.dither,
+            band=min(self.sensor.call.high_frequency_hz / recording.pdm_rate_hz, 0.25),
+            threads=self._threads,
+        )
+        first = 0
+        for block in self._signals(shot.of_mics(chosen), index):
+            words = np.empty((block.shape[1], out.shape[1]), dtype=out.dtype)
+            with self.clock("modulation"):
+                modulator.process(block, out=words)
+            out[first : first + len(words)] = words
+            first += len(words)
+
+    def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
+        active, recording = self.plan.active, self.sensor.recording
+        arrived = arrivals(shot, active, self._node_hz, self.clock)
+        blocks = synthesis.signals(
+            arrived,
+            n_samples=recording.n_samples,
+            rate_hz=recording.pdm_rate_hz,
+            n_mics=len(shot.channels),
+            clock=self.clock,
+        )
+        gain, _ = gains(shot, active, self.clock)
+        seed = self.scene.seed, index, self.scene.sensors.index(self.sensor)
+        fields = []
+        if "ambient_noise" in active and self.scene.ambient is not None:
+            fields.append(("ambient_noise", effect("ambient_noise")(shot, self.scene.ambient, (*seed, 0))))
+        if "interference" in active:
+            noise_of = effect("interference", "noise_of")
+            fields += [
+                ("interference", noise_of(shot, noise, (*seed, 1 + number)))
+                for number, noise in enumerate(self.scene.noises)
+            ]
+        first = 0
+        for block in blocks:
+            more = np.zeros_like(block) if fields or ("interference" in active and self.scene.tones) else None
+            for name, field in fields:
+                with self.clock(name):
+                    field.add_to(more, first)
+            if "interference" in active:
+                with self.clock("interference"):
+                    for tone in self.scene.tones:
+                        effect("interference", "add_tone")(shot, tone, more, first)
+            if more is not None:
+                block += gain[:, None] * more  # noqa: PLW2901  ours, and used once
+            first += block.shape[1]
+            yield block
+
+    def _noise_rms(self) -> float:
+        level = self.sensor.electronics.noise_dbfs
+        if level is None or "microphone_noise" not in self.plan.active:
+            return 0.0
+        return float(effect("microphone_noise")(level))
+
+    def _keys(self, index: int, n_mics: int) -> NDArray[np.uint64]:
+        number = self.scene.sensors.index(self.sensor)
+        seeds = np.random.SeedSequence((self.scene.seed, index, number)).spawn(n_mics)
+        return np.array([seed.generate_state(1, np.uint64)[0] for seed in seeds])
+
+    def _stamp(self, shot: Snapshot, index: int) -> Stamp:
+        later_ns = _SYNC_STEP_NS * shot.number if "sync_delay" in self.plan.active else 0
+        return Stamp(
+            sensor=self.sensor.name,
+            sequence=index,
+            sync_count=index,
+            timestamp_ns=round(index * 1e9 / self.scene.rate_hz) + later_ns,
+        )
+
+
+def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measurement:
+    """Return one measurement of a scene, of its first sensor by default; see `Simulator` for more of them."""
+    return Simulator(scene, sensor=sensor).render(index)
+
+
+def _part(layout: Layout, part: slice) -> Layout:
+    return Layout(
+        name=layout.name,
+        positions_m=layout.positions_m[part],
+        enabled=layout.enabled[part],
+        gain=layout.gain[part],
+        delay_s=layout.delay_s[part],
+        word_bits=layout.word_bits,
     )
-    for first in range(0, len(words), _BLOCK):
-        block = words[first : first + _BLOCK]
-        signals = received(scene, ways, first, first + len(block))
-        if scene.electronics.noise_dbfs is not None:
-            _add_noise(signals, noises, 10 ** (scene.electronics.noise_dbfs / 20))
-        block[:] = _packed(modulator.process(np.rint(signals / _SIGNAL_STEP) * _SIGNAL_STEP), layout)
-    stamp = Stamp(sequence=index, sync_count=index, timestamp_ns=round(index * 1e9 / scene.rate_hz))
-    return Measurement(words if layout.n_words > 1 else words[:, 0], settings, stamp)
-
-
-def received(scene: Scene, ways: Arrivals, first: int, stop: int) -> NDArray[np.float64]:
-    """Return what the microphones hear in PDM samples ``first`` to ``stop``: (mic, sample) float64.
-
-    The call is evaluated in closed form at ``n / pdm_rate − delay``: delays are exact, nothing is
-    interpolated. Half of the PDM rate is so far above a call of 80 kHz that what aliases of it stays
-    190 dB below its spectrum's top.
-    """
-    call, rate_hz = scene.sensor.call, scene.sensor.recording.pdm_rate_hz
-    signals = np.zeros((ways.delay_s.shape[1], stop - first))
-    for delay_s, amplitude in zip(ways.delay_s, ways.amplitude, strict=True):
-        begin = max(first, math.floor(delay_s.min() * rate_hz))
-        end = min(stop, math.ceil((delay_s.max() + call.duration_s) * rate_hz) + 1)
-        if begin < end:
-            time_s = np.arange(begin, end) / rate_hz - delay_s[:, None]
-            signals[:, begin - first : end - first] += amplitude[:, None] * call_at(call, time_s)
-    return signals
-
-
-def _add_noise(signals: NDArray[np.float64], noises: list[np.random.Generator], rms: float) -> None:
-    for signal, noise in zip(signals, noises, strict=True):
-        signal += rms * noise.standard_normal(signal.size)  # noqa: PLW2901 - a row, changed in place
-
-
-def _packed(bits: NDArray[np.uint8], layout: Layout) -> NDArray[np.unsignedinteger]:
-    """Put the bits of the enabled microphones into words: (mic, sample) to (sample, word)."""
-    channels = np.zeros((layout.n_words * layout.word_bits, bits.shape[1]), dtype=np.uint8)
-    channels[: len(layout.enabled)][layout.enabled] = bits
-    octets = np.ascontiguousarray(np.packbits(channels, axis=0, bitorder="little").T)
-    return octets.view(f"<u{layout.word_bits // 8}")

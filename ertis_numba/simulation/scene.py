@@ -1,113 +1,122 @@
-"""What is simulated, as frozen structures with TOML in and out.
+"""What is simulated: the whole content of a scene file.
 
-Strengths and levels are relative to full scale: an amplitude of 1, or 0 dB, is a signal that would
+Levels and strengths are relative to full scale: an amplitude of 1, or 0 dB, is a signal that would
 keep all PDM bits at one value.
 """
 
 from pathlib import Path
+from typing import Self
 
 from ertis_numba import checks
-from ertis_numba.documents import Document, Table
-from ertis_numba.geometry import load_layout
-from ertis_numba.settings import Settings
+from ertis_numba.documents import Document
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import load_layout, microphones
+from ertis_numba.settings import Array
+from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.sensors import Sensor
+from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
+from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
 
-__all__ = ["DirectSound", "Electronics", "Point", "Scene", "load_scene"]
+__all__ = ["Scene", "load_scene"]
 
-_HIGHEST_STRENGTH_DB = 120.0  # far beyond any overload; the bound catches amplitudes given for levels
-
-
-class Point(Table, frozen=True, kw_only=True):
-    """A reflector so small that it sends the call back alike in all directions.
-
-    Attributes
-    ----------
-    azimuth_deg, elevation_deg : float
-        In the sensor frame.
-    range_m : float
-        From the sensor's origin, where the emitter is.
-    strength_db : float
-        Level of the echo if reflector, emitter and microphone were 1 m apart. The amplitude of an
-        echo is ``10 ** (strength_db / 20) / (r_tx r_rx)``, distances in metres.
-    """
-
-    azimuth_deg: float = 0.0
-    elevation_deg: float = 0.0
-    range_m: float
-    strength_db: float = -20.0
-
-    def __post_init__(self) -> None:
-        checks.between("point.azimuth_deg", self.azimuth_deg, -180.0, 180.0)
-        checks.between("point.elevation_deg", self.elevation_deg, -90.0, 90.0)
-        checks.between("point.range_m", self.range_m, 1e-3, 1000.0)
-        checks.between("point.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
-
-
-class DirectSound(Table, frozen=True, kw_only=True):
-    """What the microphones hear of the emitter beside them.
-
-    Attributes
-    ----------
-    strength_db : float
-        Level 1 m from the emitter; the amplitude is ``10 ** (strength_db / 20) / r``.
-    """
-
-    strength_db: float = -40.0
-
-    def __post_init__(self) -> None:
-        checks.between("direct_sound.strength_db", self.strength_db, -300.0, _HIGHEST_STRENGTH_DB)
-
-
-class Electronics(Table, frozen=True, kw_only=True):
-    """What the microphones add.
-
-    Attributes
-    ----------
-    noise_dbfs : float, optional
-        Root mean square of each microphone's white noise, over the whole band up to half of the PDM
-        rate; none by default. In a band B it is lower by ``10 log10(pdm_rate / 2 B)`` decibels.
-    modulator_order : int
-        Order of the sigma-delta modulators, 1 to 4.
-    dither : float
-        Width of the uniform dither at the quantiser, full scale 1.
-    """
-
-    noise_dbfs: float | None = None
-    modulator_order: int = 4
-    dither: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.noise_dbfs is not None:
-            checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
-        checks.whole("electronics.modulator_order", self.modulator_order, 1, 4)
-        checks.between("electronics.dither", self.dither, 0.0, 2.0)
+_MOST_REFLECTIONS = 4
 
 
 class Scene(Document, frozen=True, kw_only=True):
-    """A sensor and what it hears: the whole content of a scene file.
+    """Sensors and what they hear.
 
     Attributes
     ----------
     seed : int
-        Decides noise and dither. Measurements of one scene differ by their index alone.
+        Decides noise, dither and the spread of microphones. Measurements of one scene differ by their index alone.
     rate_hz : float
         Measurements per second.
-    sensor : Settings
-    electronics : Electronics
-    direct_sound : DirectSound, optional
-        None is heard by default.
-    points : tuple of Point
+    count : int
+        Number of measurements.
+    tolerance_db : float
+        Effects that change no image by more are left out.
+    max_reflections : int
+        Walls that a sound may meet on its way.
+    effects : dict of str to bool
+        Decides for effects by name instead of the tolerance.
+    sensors : tuple of Sensor
+        They emit together. One eRTIS at the origin by default.
+    points, spheres, walls, boxes
+        What returns the sound.
+    tones, noises, sonars, ambient
+        What else is to be heard.
     """
 
     seed: int = 0
     rate_hz: float = 20.0
-    sensor: Settings = Settings()
-    electronics: Electronics = Electronics()
-    direct_sound: DirectSound | None = None
+    count: int = 1
+    tolerance_db: float = 0.1
+    max_reflections: int = 2
+    effects: dict[str, bool] = {}
+    sensors: tuple[Sensor, ...] = (Sensor(),)
     points: tuple[Point, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    walls: tuple[Wall, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    tones: tuple[Tone, ...] = ()
+    noises: tuple[Noise, ...] = ()
+    sonars: tuple[Sonar, ...] = ()
+    ambient: Ambient | None = None
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
+        checks.whole("count", self.count, 1, 10**9)
+        checks.between("tolerance_db", self.tolerance_db, 1e-6, 60.0)
+        checks.whole("max_reflections", self.max_reflections, 0, _MOST_REFLECTIONS)
+        for name, wanted in self.effects.items():
+            checks.choice("effect", name, EFFECTS)
+            if name in INDISPENSABLE and not wanted:
+                raise ArgumentError(f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); take it out of effects")
+        if not self.sensors:
+            raise ArgumentError("scene has no sensors; give at least one")
+        names = [sensor.name for sensor in self.sensors]
+        for name in names:
+            if names.count(name) > 1:
+                raise ArgumentError(f"scene has {names.count(name)} sensors named {name!r}; name each differently")
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything changes its place."""
+        things = (*self.points, *self.spheres, *self.walls, *self.boxes, *self.tones, *self.noises, *self.sonars)
+        return any(thing.moves for thing in (*things, *(sensor.path() for sensor in self.sensors)))
+
+    def all_walls(self) -> tuple[tuple[str, Wall], ...]:
+        """Return the walls and the sides of the boxes with their names."""
+        sides = [
+            (f"boxes[{number}].{side}", wall)
+            for number, box in enumerate(self.boxes)
+            for side, wall in zip(("front", "back", "left", "right", "top", "bottom"), box.walls(), strict=True)
+        ]
+        return (*((f"walls[{number}]", wall) for number, wall in enumerate(self.walls)), *sides)
+
+    def sensor(self, name: str | None = None) -> Sensor:
+        """Return a sensor by name, the first by default.
+
+        Raises
+        ------
+        ArgumentError
+            There is none of this name.
+        """
+        names = [sensor.name for sensor in self.sensors]
+        if name is not None:
+            checks.choice("sensor", name, names)
+        return self.sensors[0 if name is None else names.index(name)]
+
+    def with_layouts_of(self, folder: Path) -> Self:
+        """Return a scene that depends on no layout file; those it names are looked for in ``folder``."""
+        return self.replace(sensors=tuple(sensor.replace(array=_read(sensor.array, folder)) for sensor in self.sensors))
+
+
+def _read(array: Array, folder: Path) -> Array:
+    if array.positions_m is not None or Path(array.layout).suffix.lower() not in {".toml", ".csv"}:
+        return array
+    return load_layout(folder / array.layout).to_array()
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -121,12 +130,16 @@ def load_scene(path: str | Path) -> Scene:
     SettingsError
         The file cannot be read or used.
     ArgumentError
-        Its layout file cannot be read or used.
+        A layout cannot be read or used, or a sensor has no such channel.
     """
     path = Path(path)
-    scene = Scene.load(path)
-    layout = scene.sensor.array.layout
-    if scene.sensor.array.positions_m is None and Path(layout).suffix.lower() in {".toml", ".csv"}:
-        array = load_layout(path.parent / layout).to_array()
-        scene = scene.replace(sensor=scene.sensor.replace(array=array))
+    scene = Scene.load(path).with_layouts_of(path.parent)
+    for sensor in scene.sensors:
+        enabled = microphones(sensor.array).enabled
+        for channel in sensor.electronics.faulty_channels:
+            if channel >= len(enabled) or not enabled[channel]:
+                raise ArgumentError(
+                    f"{path}: sensor {sensor.name!r} has no microphone on channel {channel}, which is to be faulty; "
+                    f"give one of its {len(enabled)} channels, counted from 0"
+                )
     return scene

@@ -1,6 +1,6 @@
 """Files: recordings and energyscapes. The only door to h5py."""
 
-from ertis_numba.storage._reader import file_kind
+from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.atomic import check_target, replacing
 from ertis_numba.storage.energyscape import (
     EnergyscapeReader,
@@ -29,6 +29,7 @@ __all__ = [
     "open_energyscapes",
     "open_recording",
     "replacing",
+    "sensor_names",
     "write_energyscapes",
     "write_recording",
 ]

@@ -5,7 +5,7 @@ import operator
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Generic, Self, TypeVar
@@ -14,11 +14,13 @@ import h5py
 import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError, SettingsError
+from ertis_numba.frames import Stamp
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
+from ertis_numba.storage.truth import Truth, read_truth
 
-__all__ = ["Reader", "file_kind"]
+__all__ = ["Reader", "file_kind", "sensor_names"]
 
 Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
@@ -38,6 +40,19 @@ def file_kind(path: str | Path) -> str:
         return _kind(file, Path(path), "a recording or an energyscape file")
 
 
+def sensor_names(path: str | Path) -> tuple[str, ...]:
+    """Return the names of the sensors in a recording or an energyscape file, in the order of the file.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, or is neither.
+    """
+    with _open(Path(path)) as file, _reading(file, Path(path)):
+        _kind(file, Path(path), "a recording or an energyscape file")
+        return tuple(file["sensors"])
+
+
 class Reader(ABC, Generic[Item]):
     """A file of one row per measurement, as a sequence that reads a row when asked for it.
 
@@ -47,8 +62,13 @@ class Reader(ABC, Generic[Item]):
     ----------
     path : Path
     sensor : str
+        Whose rows these are.
+    sensors : tuple of str
+        All sensors in the file, in its order.
     settings : Settings
         They depend on no other file.
+    truth : Truth or None
+        What the rows should show, where they come from a simulation.
     attributes : dict
         The attributes of the file: uuid, source, date_created and others.
     """
@@ -63,6 +83,7 @@ class Reader(ABC, Generic[Item]):
         try:
             with self._reading():
                 self._require_kind()
+                self.sensors: tuple[str, ...] = tuple(self._file["sensors"])
                 self.sensor = self._choose(sensor)
                 self._group = self._file["sensors"][self.sensor]
                 self._require_variables()
@@ -72,6 +93,7 @@ class Reader(ABC, Generic[Item]):
                 self._require_shapes()
                 self._load()
                 self._require_content()
+                self.truth: Truth | None = read_truth(self._group)
         except BaseException:
             self._file.close()
             raise
@@ -98,6 +120,11 @@ class Reader(ABC, Generic[Item]):
         with self.path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
+    def stamps(self) -> list[Stamp]:
+        """Return the stamps of all measurements, which are not read themselves."""
+        with self._reading():
+            return self._rows.stamps(self.sensor)
+
     def __len__(self) -> int:
         return len(self._rows)
 
@@ -123,22 +150,8 @@ class Reader(ABC, Generic[Item]):
         """Close the file; closing twice does no harm."""
         self._file.close()
 
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        """Name the file in errors, and call what the library cannot read damaged."""
-        try:
-            yield
-        except DataError as error:
-            named = str(error) if str(error).startswith(str(self.path)) else f"{self.path}: {error}"
-            raise type(error)(named) from error
-        except SettingsError as error:
-            raise DataError(str(error)) from error
-        except ArgumentError:
-            raise
-        except _UNREADABLE as error:
-            if not self._file:
-                raise DataError(f"{self.path} is closed; open it again") from error
-            raise DataError(f"{self.path} is damaged or cut short ({_reason(error)}); copy it again") from error
+    def _reading(self) -> AbstractContextManager[None]:
+        return _reading(self._file, self.path)
 
     def _require_kind(self) -> None:
         kind = _kind(self._file, self.path, _A[self._kind])
@@ -147,12 +160,12 @@ class Reader(ABC, Generic[Item]):
             raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
 
     def _choose(self, sensor: str | None) -> str:
-        names = [str(name) for name in self._file["sensors"]]
-        if sensor is None and len(names) != 1:
-            raise ArgumentError(f"{self.path} holds {len(names)} sensors; choose one of {', '.join(names)}")
-        if sensor is not None and sensor not in names:
-            raise ArgumentError(f"{self.path} has no sensor {sensor!r}; choose one of {', '.join(names)}")
-        return sensor or names[0]
+        names = ", ".join(self.sensors)
+        if sensor is None and len(self.sensors) != 1:
+            raise ArgumentError(f"{self.path} holds {len(self.sensors)} sensors; choose one of {names} (--sensor)")
+        if sensor is not None and sensor not in self.sensors:
+            raise ArgumentError(f"{self.path} has no sensor {sensor!r}; choose one of {names}")
+        return self.sensors[0] if sensor is None else sensor
 
     def _require_variables(self) -> None:
         missing = [variable.name for variable in self._table if variable.name not in self._group]
@@ -175,6 +188,24 @@ class Reader(ABC, Generic[Item]):
                 f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, its record says "
                 f"{str(wanted)[:8]}…: the file is damaged; copy it again"
             )
+
+
+@contextmanager
+def _reading(file: h5py.File, path: Path) -> Iterator[None]:
+    """Name the file in errors, and call what the library cannot read damaged."""
+    try:
+        yield
+    except DataError as error:
+        named = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        raise type(error)(named) from error
+    except SettingsError as error:
+        raise DataError(str(error)) from error
+    except ArgumentError:
+        raise
+    except _UNREADABLE as error:
+        if not file:
+            raise DataError(f"{path} is closed; open it again") from error
+        raise DataError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
 
 
 def _open(path: Path) -> h5py.File:

@@ -16,6 +16,12 @@ from ertis_numba.storage.schema import CHUNK_ROWS
 
 __all__ = ["RowReader", "RowWriter"]
 
+_STAMP_FIELDS = {
+    "time": "timestamp_ns",
+    "time_uncertainty": "timestamp_uncertainty_ns",
+    "sequence": "sequence",
+    "sync_count": "sync_count",
+}
 _STAMP_COLUMNS = ("time", "time_uncertainty", "sequence", "sync_count", "epoch", "crc32")
 
 
@@ -117,13 +123,15 @@ class RowReader:
 
     def stamp(self, index: int, sensor: str) -> Stamp:
         """Return the stamp of one measurement."""
-        return Stamp(
-            sensor=sensor,
-            sequence=self.column("sequence", index),
-            sync_count=self.column("sync_count", index),
-            timestamp_ns=self.column("time", index),
-            timestamp_uncertainty_ns=self.column("time_uncertainty", index),
-        )
+        return Stamp(sensor=sensor, **{field: self.column(name, index) for name, field in _STAMP_FIELDS.items()})
+
+    def stamps(self, sensor: str) -> list[Stamp]:
+        """Return the stamps of all measurements."""
+        columns = (self._group[name][:].tolist() for name in _STAMP_FIELDS)
+        return [
+            Stamp(sensor=sensor, **dict(zip(_STAMP_FIELDS.values(), row, strict=True)))
+            for row in zip(*columns, strict=True)
+        ]
 
     def column(self, name: str, index: int) -> Any:
         """Return the number of one measurement in a column."""

@@ -2,10 +2,9 @@
 
 import os
 import re
-import uuid
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -25,11 +24,13 @@ from ertis_numba.storage.schema import (
     FORMAT_VERSION,
     Variable,
     content_sha256,
+    content_uuid,
     date_created,
     describe,
     sensor_path,
     software_versions,
 )
+from ertis_numba.storage.truth import Truth, write_truth
 
 __all__ = ["Writer", "self_contained"]
 
@@ -37,25 +38,30 @@ Item = TypeVar("Item", Measurement, Energyscape)
 
 
 class Writer(ABC, Generic[Item]):
-    """Writes rows as they come; the file appears when the ``with`` block ends well, or not at all."""
+    """Writes rows as they come; the file appears when the ``with`` block ends well, or not at all.
+
+    Rows of several sensors may come in any order; each sensor gets a group of its own.
+    """
 
     _kind: ClassVar[str]
     _data: ClassVar[str]
     _table: ClassVar[tuple[Variable, ...]]
 
-    def __init__(self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str]) -> None:
+    def __init__(
+        self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str], truth: Mapping[str, Truth] | None
+    ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
         self._attributes = attributes
+        self._truth = truth or {}
         self._part: Path
         self._file: h5py.File | None = None
-        self._rows: RowWriter | None = None
-        self._sensor = ""
+        self._rows: dict[str, RowWriter] = {}
         check_target(self.path, overwrite=overwrite)
 
     @abstractmethod
     def _begin(self, group: h5py.Group, first: Item) -> None:
-        """Lay out the group of a sensor for items like ``first``."""
+        """Lay out the group of a sensor for items like ``first``, which is not yet written."""
 
     @abstractmethod
     def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
@@ -63,6 +69,10 @@ class Writer(ABC, Generic[Item]):
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write what is known at the end only."""
+
+    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | None:  # noqa: ARG002  what overrides it needs both
+        """Return what the rows of a sensor should show, where it is known."""
+        return self._truth.get(sensor)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -84,18 +94,13 @@ class Writer(ABC, Generic[Item]):
         if self._file is None:
             raise ArgumentError(f"{self.path} is not open for writing; use the writer in a with statement")
         with self._naming_file():
-            if self._rows is None:
-                self._sensor = item.stamp.sensor
-                group = self._file.create_group(sensor_path(self._sensor), track_order=True)
+            sensor = item.stamp.sensor
+            if sensor not in self._rows:
+                group = self._file.create_group(sensor_path(sensor), track_order=True)
                 self._begin(group, item)
-                self._rows = RowWriter(group, self._data)
-            if item.stamp.sensor != self._sensor:
-                raise ArgumentError(
-                    f"measurement {len(self._rows)} is of sensor {item.stamp.sensor!r}, "
-                    f"the ones before it of {self._sensor!r}; write one file per sensor"
-                )
+                self._rows[sensor] = RowWriter(group, self._data)
             row, columns = self._row(item)
-            self._rows.append(row, item.stamp, **columns)
+            self._rows[sensor].append(row, item.stamp, **columns)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -113,9 +118,9 @@ class Writer(ABC, Generic[Item]):
         try:
             yield file
             with self._naming_file():
-                rows = self._finish(file)
+                self._finish(file)
                 file.close()
-                self._compare(rows)
+                self._compare()
         except BaseException:
             # Closing writes what is still in memory, and HDF5 that cannot do so takes the process with
             # it (h5py issue 914). An emptied file gives back the room for it on a full disk.
@@ -124,14 +129,11 @@ class Writer(ABC, Generic[Item]):
                 file.close()
             raise
 
-    def _finish(self, file: h5py.File) -> RowWriter:
-        if self._rows is None:
+    def _finish(self, file: h5py.File) -> None:
+        if not self._rows:
             raise ArgumentError(f"{self.path} would hold no measurement; give at least one")
-        self._rows.flush()
-        group = file[sensor_path(self._sensor)]
-        self._complete(group, self._rows)
-        content = content_sha256(group, self._table)
-        describe(group, {"content_sha256": content})
+        self._require_sensors("truth", self._truth)
+        contents = {sensor: self._finish_sensor(file, sensor) for sensor in self._rows}
         describe(
             file,
             {
@@ -139,23 +141,43 @@ class Writer(ABC, Generic[Item]):
                 "ertis_format": self._kind,
                 "ertis_format_version": FORMAT_VERSION,
                 "date_created": date_created(),
-                # Version 8: the content makes the identity, so the same content is recognised.
-                "uuid": str(uuid.UUID(bytes=_as_version_8(bytes.fromhex(content)[:16]))),
+                "uuid": content_uuid(contents),
                 **self._attributes,
                 **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
             },
         )
-        return self._rows
 
-    def _compare(self, written: RowWriter) -> None:
+    def _finish_sensor(self, file: h5py.File, sensor: str) -> str:
+        """Write what is known at the end only, and return the SHA-256 of the sensor's content."""
+        rows, group = self._rows[sensor], file[sensor_path(sensor)]
+        rows.flush()
+        self._complete(group, rows)
+        truth = self._truth_of(sensor, group)
+        if truth is not None:
+            write_truth(group, truth, len(rows))
+        content = content_sha256(group, self._table)
+        describe(group, {"content_sha256": content})
+        return content
+
+    def _require_sensors(self, name: str, given: Iterable[str]) -> None:
+        """Refuse what was given for a sensor of which nothing came: it would be lost."""
+        for sensor in given:
+            if sensor not in self._rows:
+                raise ArgumentError(
+                    f"{name} is given for sensor {sensor!r}, of which no measurement came; "
+                    f"{self.path} would hold {', '.join(self._rows)}"
+                )
+
+    def _compare(self) -> None:
         """Read every row back from the closed file and compare it with what was given."""
         with h5py.File(self._part, "r") as file:
-            rows = RowReader(file[sensor_path(self._sensor)], self._data)
-            check = 0
-            for index in range(len(rows)):
-                check = zlib.crc32(rows.row(index).data, check)
-        if (len(rows), check) != (len(written), written.check):
-            raise DataError(f"{self.path} reads back differently than it was written; check the disk")
+            for sensor, written in self._rows.items():
+                rows = RowReader(file[sensor_path(sensor)], self._data)
+                check = 0
+                for index in range(len(rows)):
+                    check = zlib.crc32(rows.row(index).data, check)
+                if (len(rows), check) != (len(written), written.check):
+                    raise DataError(f"{self.path} reads back differently than it was written; check the disk")
 
     @contextmanager
     def _naming_file(self) -> Iterator[None]:
@@ -178,11 +200,3 @@ def _reason(error: Exception) -> str:
     """Return the system's words, which HDF5 hides in the middle of its own."""
     inner = re.search(r"error message = '(.*?)'", str(error))
     return inner[1] if inner else str(error).partition("\n")[0]
-
-
-def _as_version_8(digest: bytes) -> bytes:
-    """Set version and variant of a UUID whose other bits are free (RFC 9562, section 5.8)."""
-    made = bytearray(digest)
-    made[6] = made[6] & 0x0F | 0x80
-    made[8] = made[8] & 0x3F | 0x80
-    return bytes(made)

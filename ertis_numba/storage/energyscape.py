@@ -1,6 +1,8 @@
 """Energyscape files: what processing a recording gave, with its axes."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -12,10 +14,12 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.storage._reader import Reader
+from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer, self_contained
 from ertis_numba.storage.atomic import check_target
 from ertis_numba.storage.recording import RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
+from ertis_numba.storage.truth import Truth
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
@@ -25,11 +29,16 @@ _AXES = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range
 class EnergyscapeWriter(Writer[Energyscape]):
     """Writes energyscapes one by one; use it in a ``with`` statement.
 
+    Energyscapes of several sensors may come in any order.
+
     Parameters
     ----------
     path : str or Path
-    recording : RecordingReader, optional
-        What they were made from; the file keeps its uuid and SHA-256.
+    recording : RecordingReader or sequence of RecordingReader, optional
+        What they were made from: one reader, or one for each sensor of the same recording. The file
+        keeps its uuid and SHA-256, and the truth of each measurement an energyscape came from.
+    truth : mapping of str to Truth, optional
+        What each sensor should show, by its name, in place of what the recording says.
     dtype : {"float32", "float16"}
         float16 halves the file; it keeps three digits down to -84 dB of full scale and fewer below, and
         netCDF programs cannot read it.
@@ -45,26 +54,21 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self,
         path: str | Path,
         *,
-        recording: RecordingReader | None = None,
+        recording: RecordingReader | Sequence[RecordingReader] | None = None,
+        truth: Mapping[str, Truth] | None = None,
         dtype: Literal["float32", "float16"] = "float32",
         overwrite: bool = False,
     ) -> None:
         checks.choice("dtype", dtype, ("float32", "float16"))
-        origin = {"source": "", "history": ""}
-        if recording is not None:
-            check_target(Path(path), overwrite=overwrite, sources=[recording.path])
-            origin = {
-                "source": recording.path.name,
-                "history": f"processed from recording {recording.uuid}",
-                "recording_uuid": recording.uuid,
-                "recording_sha256": recording.sha256(),
-            }
-        super().__init__(path, overwrite=overwrite, attributes=origin)
+        readers = [recording] if isinstance(recording, RecordingReader) else [*(recording or ())]
+        check_target(Path(path), overwrite=overwrite, sources=[reader.path for reader in readers])
+        super().__init__(path, overwrite=overwrite, attributes=_origin(readers), truth=truth)
         self._dtype = np.dtype(dtype).newbyteorder("<").str
-        self._first: Energyscape | None = None
+        self._first: dict[str, Energyscape] = {}
+        self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
 
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
-        self._first = first
+        self._first[first.stamp.sensor] = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
         lay_out(
             group,
@@ -78,9 +82,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         describe(group["energy"], {"coordinates": "azimuth elevation"})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
-        first = self._first
-        if first is None or item is first:
-            return item.energy, {}
+        first = self._first[item.stamp.sensor]
         if item.settings is not first.settings and item.settings != first.settings:
             raise ArgumentError("an energyscape has other settings than the first; write it to its own file")
         for field in _AXES.values():
@@ -88,6 +90,41 @@ class EnergyscapeWriter(Writer[Energyscape]):
             if ours is not theirs and not np.array_equal(ours, theirs):
                 raise ArgumentError(f"an energyscape has another {field} than the first; write it to its own file")
         return item.energy, {}
+
+    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | None:
+        given = super()._truth_of(sensor, group)
+        if given is not None or sensor not in self._recorded:
+            return given
+        truth, recorded = self._recorded[sensor]
+        written = RowReader(group, self._data).stamps(sensor)
+        if written == recorded:
+            return truth
+        # Some only, or in another order: each takes the truth of the measurement that it came from.
+        counts = Counter(recorded)
+        for index, stamp in enumerate(written):
+            if counts[stamp] != 1:
+                raise ArgumentError(
+                    f"energyscape {index} of sensor {sensor} has the stamp of {counts[stamp]} measurements of the "
+                    "recording, wanted 1 to take its truth from; give the recording it came from, or its truth"
+                )
+        places = {stamp: index for index, stamp in enumerate(recorded)}
+        return replace(truth, reflectors=tuple(truth.reflectors[places[stamp]] for stamp in written))
+
+
+def _origin(readers: Sequence[RecordingReader]) -> dict[str, str]:
+    """Return what the file says about the recording that it was made from."""
+    if not readers:
+        return {"source": "", "history": ""}
+    first = readers[0]
+    for reader in readers:
+        if reader.uuid != first.uuid:
+            raise ArgumentError(f"{reader.path} is another recording than {first.path}; write one file for each")
+    return {
+        "source": first.path.name,
+        "history": f"processed from recording {first.uuid}",
+        "recording_uuid": first.uuid,
+        "recording_sha256": first.sha256(),
+    }
 
 
 class EnergyscapeReader(Reader[Energyscape]):
@@ -148,7 +185,8 @@ def write_energyscapes(
     path: str | Path,
     images: Iterable[Energyscape],
     *,
-    recording: RecordingReader | None = None,
+    recording: RecordingReader | Sequence[RecordingReader] | None = None,
+    truth: Mapping[str, Truth] | None = None,
     dtype: Literal["float32", "float16"] = "float32",
     overwrite: bool = False,
 ) -> Path:
@@ -161,7 +199,7 @@ def write_energyscapes(
     DataError
         The disk is full or cannot be written.
     """
-    with EnergyscapeWriter(path, recording=recording, dtype=dtype, overwrite=overwrite) as writer:
+    with EnergyscapeWriter(path, recording=recording, truth=truth, dtype=dtype, overwrite=overwrite) as writer:
         for image in images:
             writer.write(image)
     return writer.path

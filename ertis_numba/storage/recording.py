@@ -1,6 +1,6 @@
 """Recordings: measurements as they came from the microphones, and what is needed to process them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones
@@ -17,11 +18,15 @@ from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer, self_contained
 from ertis_numba.storage.schema import RECORDING, Variable, describe, lay_out
-from ertis_numba.storage.truth import Truth, read_truth, write_truth
+from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
 
 __all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
 
+Mounting = tuple[Sequence[float], Sequence[float]]
+"""Where a sensor is, x, y, z in m, and how it is turned, a unit quaternion x, y, z, w."""
+
+_UNIT = 1e-6  # of deviation that rounding to six digits leaves
 _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
 
 
@@ -37,17 +42,24 @@ class Gap:
 class RecordingWriter(Writer[Measurement]):
     """Writes a recording measurement by measurement; use it in a ``with`` statement.
 
+    Measurements of several sensors may come in any order.
+
     Parameters
     ----------
     path : str or Path
     settings : Settings, optional
-        Those of the first measurement by default. Layout files are written out into the recording.
+        For a recording of one sensor; those of the first measurement of each sensor by default. Layout
+        files are written out into the recording.
     overwrite : bool
         Replace a file of this name.
     source : str
         Where the measurements come from.
-    truth : Truth, optional
-        What a simulated recording should show.
+    truth : mapping of str to Truth, optional
+        What each simulated sensor should show, by its name.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Where each sensor is and how it is turned, by its name: x, y, z in metres, and the unit
+        quaternion x, y, z, w that turns the sensor frame into that of the surroundings. At the origin,
+        not turned, by default.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -61,21 +73,29 @@ class RecordingWriter(Writer[Measurement]):
         settings: Settings | None = None,
         overwrite: bool = False,
         source: str = "",
-        truth: Truth | None = None,
+        truth: Mapping[str, Truth] | None = None,
+        mounting: Mapping[str, Mounting] | None = None,
     ) -> None:
-        super().__init__(path, overwrite=overwrite, attributes={"source": source, "history": ""})
-        self._settings = settings
-        self._checked = settings
-        self._truth = truth
+        super().__init__(path, overwrite=overwrite, attributes={"source": source, "history": ""}, truth=truth)
+        self._given = settings
+        self._settings: dict[str, Settings] = {}
+        self._checked: dict[str, Settings] = {}
+        self._mounting = {sensor: _checked_mounting(sensor, *given) for sensor, given in (mounting or {}).items()}
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
-        given = self._settings or first.settings
+        sensor = first.stamp.sensor
+        if self._given is not None and self._settings:
+            raise ArgumentError(
+                f"settings are given for one sensor, but measurements came of {', '.join(self._settings)} "
+                f"and {sensor}; give none, so that each has its own"
+            )
+        given = self._given or first.settings
         if given.processing.directions.lower().endswith(".csv"):
             raise ArgumentError(
                 f"processing.directions is the file {given.processing.directions}, which a recording cannot hold; "
                 "name a grid, and give the file when processing"
             )
-        self._settings = settings = self_contained(given)
+        settings = self._settings[sensor] = self_contained(given)
         layout = microphones(settings.array)
         samples = call_samples(settings.call)
         several = {"word": layout.n_words} if layout.n_words > 1 else {}
@@ -93,30 +113,32 @@ class RecordingWriter(Writer[Measurement]):
             dtypes={"pdm": f"<u{layout.word_bits // 8}"},
             texts={"settings": settings.to_toml()},
         )
-        describe(group, _mounting(first.stamp.sensor, settings))
+        describe(group, _identity(sensor, settings) | self._mounting.get(sensor, _checked_mounting(sensor)))
         describe(group["pdm"], {"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
         describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
         group["microphone"][:] = np.arange(len(layout.enabled))
         group["call"][:] = samples
         for name, values in _copies(layout).items():
             group[name][:] = values
-        if self._truth is not None:
-            write_truth(group.file, self._truth)
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
-        self._require_same(item.settings)
+        self._require_same(item.stamp.sensor, item.settings)
         air = item.settings.air
         return item.words, {name: getattr(air, field) for name, field in _AIR.items()}
 
-    def _require_same(self, settings: Settings) -> None:
+    def _require_same(self, sensor: str, settings: Settings) -> None:
         """Refuse what one set of settings cannot describe: all but the air must be equal."""
-        if settings is self._checked or self._settings is None:
+        if settings is self._checked.get(sensor):
             return
         came = self_contained(settings)
         for name in ("array", "call", "recording"):
-            if getattr(came, name) != getattr(self._settings, name):
+            if getattr(came, name) != getattr(self._settings[sensor], name):
                 raise ArgumentError(f"a measurement has other {name} settings than the recording; write it to its own")
-        self._checked = settings
+        self._checked[sensor] = settings
+
+    def _finish(self, file: h5py.File) -> None:
+        super()._finish(file)
+        self._require_sensors("mounting", self._mounting)
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         values: dict[str, list[Any]] = {
@@ -141,16 +163,26 @@ def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
     }
 
 
-def _mounting(sensor: str, settings: Settings) -> dict[str, Any]:
-    """Return who the sensor is and how it is mounted: at the origin, as long as nobody says more."""
-    return {
-        "serial_number": sensor,
-        "model": settings.array.layout,
-        "firmware": "",
-        "frame_id": sensor,
-        "translation_m": np.zeros(3),
-        "rotation_xyzw": np.array([0.0, 0.0, 0.0, 1.0]),
+def _identity(sensor: str, settings: Settings) -> dict[str, Any]:
+    """Return who the sensor is."""
+    return {"serial_number": sensor, "model": settings.array.layout, "firmware": "", "frame_id": sensor}
+
+
+def _checked_mounting(
+    sensor: str, translation_m: Sequence[float] = (0.0, 0.0, 0.0), rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+) -> dict[str, NDArray[np.float64]]:
+    """Return how a sensor is mounted, or refuse it."""
+    made = {
+        "translation_m": np.asarray(translation_m, dtype=np.float64),
+        "rotation_xyzw": np.asarray(rotation_xyzw, dtype=np.float64),
     }
+    for (name, values), size in zip(made.items(), (3, 4), strict=True):
+        checks.shape(f"{name} of sensor {sensor}", values.shape, (size,))
+        checks.finite_array(f"{name} of sensor {sensor}", values)
+    length = float(np.linalg.norm(made["rotation_xyzw"]))
+    if abs(length - 1) > _UNIT:
+        raise ArgumentError(f"rotation_xyzw of sensor {sensor} has length {length:g}; give a unit quaternion")
+    return made
 
 
 class RecordingReader(Reader[Measurement]):
@@ -159,8 +191,10 @@ class RecordingReader(Reader[Measurement]):
     Attributes
     ----------
     gaps : tuple of Gap
-    truth : Truth or None
-        What a simulated recording should show.
+    translation_m : (3,) float64
+        Where the sensor is.
+    rotation_xyzw : (4,) float64
+        The unit quaternion that turns the sensor frame into that of the surroundings.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -168,7 +202,8 @@ class RecordingReader(Reader[Measurement]):
     _table: ClassVar[tuple[Variable, ...]] = RECORDING
 
     gaps: tuple[Gap, ...]
-    truth: Truth | None
+    translation_m: NDArray[np.float64]
+    rotation_xyzw: NDArray[np.float64]
 
     def _load(self) -> None:
         self._require_agreement()
@@ -176,7 +211,9 @@ class RecordingReader(Reader[Measurement]):
         self.gaps = tuple(
             Gap(int(first), int(last), reason.decode()) for first, last, reason in zip(*columns, strict=True)
         )
-        self.truth = read_truth(self._file)
+        self.translation_m, self.rotation_xyzw = (
+            np.asarray(self._group.attrs[name], dtype=np.float64) for name in ("translation_m", "rotation_xyzw")
+        )
 
     def _item(self, index: int) -> Measurement:
         air = Air(**{field: self._rows.column(name, index) for name, field in _AIR.items()})
@@ -234,7 +271,8 @@ def write_recording(
     settings: Settings | None = None,
     overwrite: bool = False,
     source: str = "",
-    truth: Truth | None = None,
+    truth: Mapping[str, Truth] | None = None,
+    mounting: Mapping[str, Mounting] | None = None,
 ) -> Path:
     """Write measurements as they come and return the path; the arguments are those of `RecordingWriter`.
 
@@ -245,7 +283,9 @@ def write_recording(
     DataError
         The disk is full or cannot be written.
     """
-    with RecordingWriter(path, settings=settings, overwrite=overwrite, source=source, truth=truth) as writer:
+    with RecordingWriter(
+        path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting
+    ) as writer:
         for measurement in measurements:
             writer.write(measurement)
     return writer.path

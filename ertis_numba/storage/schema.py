@@ -8,6 +8,7 @@ import hashlib
 import math
 import os
 import re
+import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -29,11 +30,13 @@ __all__ = [
     "TRUTH",
     "Variable",
     "content_sha256",
+    "content_uuid",
     "date_created",
     "describe",
     "lay_out",
     "sensor_path",
     "software_versions",
+    "text_type",
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
@@ -109,11 +112,14 @@ ENERGYSCAPE: Final = (
 
 TRUTH: Final = (
     Variable("scene", (), "str", "scene as TOML"),
+    Variable("name", ("measurement", "target"), "str", "what the reflectors are in the scene"),
     Variable("azimuth", ("measurement", "target"), "<f8", "azimuth of the reflectors", "radian"),
     Variable("elevation", ("measurement", "target"), "<f8", "elevation of the reflectors", "radian"),
     Variable("range", ("measurement", "target"), "<f8", "distance of the reflectors from the sensor's origin", "m"),
     Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest", "dB"),
+    Variable("velocity", ("measurement", "target", "axis"), "<f8", "x, y, z in the frame of the sensor", "m/s"),
 )
+"""In the group ``truth`` of a sensor."""
 
 
 def lay_out(
@@ -121,7 +127,7 @@ def lay_out(
     table: Iterable[Variable],
     *,
     sizes: Mapping[str, int],
-    dtypes: Mapping[str, str] | None = None,
+    dtypes: Mapping[str, str | np.dtype[Any]] | None = None,
     texts: Mapping[str, str] | None = None,
 ) -> None:
     """Make the variables of ``table`` in ``group``, with a named scale for each of their axes.
@@ -133,8 +139,8 @@ def lay_out(
     sizes : mapping of str to int
         Length of each axis. One that is left out is left out of every variable, unless it is one
         that grows with the file; rows along time are chunks of their own where a row is an array.
-    dtypes : mapping of str to str, optional
-        Types that the table leaves open.
+    dtypes : mapping of str to str or dtype, optional
+        Types that the table leaves open, or other ones.
     texts : mapping of str to str, optional
         What the variables that are one text hold.
     """
@@ -144,7 +150,7 @@ def lay_out(
     for variable, dims in sorted(variables, key=lambda pair: pair[1] != (pair[0].name,)):
         if not dims:
             text = (texts or {})[variable.name].encode()
-            dataset = group.create_dataset(variable.name, (), _text_type(len(text)), data=text)
+            dataset = group.create_dataset(variable.name, (), text_type(len(text)), data=text)
         else:
             dtype = (dtypes or {}).get(variable.name, variable.dtype)
             dataset = _dataset(group, variable.name, dims, sizes, dtype)
@@ -163,8 +169,10 @@ def _dims(variable: Variable, sizes: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(dim for dim in variable.dims if dim in sizes or dim in _UNLIMITED)
 
 
-def _dataset(group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str) -> h5py.Dataset:
-    kind = _text_type(_COLUMN_TEXT_BYTES) if dtype == "str" else np.dtype(dtype)
+def _dataset(
+    group: h5py.Group, name: str, dims: tuple[str, ...], sizes: Mapping[str, int], dtype: str | np.dtype[Any]
+) -> h5py.Dataset:
+    kind = text_type(_COLUMN_TEXT_BYTES) if dtype == "str" else np.dtype(dtype)
     shape = tuple(sizes.get(dim, 0) for dim in dims)
     if dims[0] not in _UNLIMITED:
         return group.create_dataset(name, shape, kind)
@@ -193,12 +201,13 @@ def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[s
     for name, value in attributes.items():
         if isinstance(value, str):
             text = value.encode("utf-8", "backslashreplace")  # file names may be no text at all
-            owner.attrs.create(name, text, dtype=_text_type(len(text)))
+            owner.attrs.create(name, text, dtype=text_type(len(text)))
         else:
             owner.attrs[name] = value
 
 
-def _text_type(n_bytes: int) -> np.dtype[Any]:
+def text_type(n_bytes: int) -> np.dtype[Any]:
+    """Return the type of a text in UTF-8 that always takes ``n_bytes``, one at least."""
     made: np.dtype[Any] = h5py.string_dtype("utf-8", max(1, n_bytes))
     return made
 
@@ -207,14 +216,43 @@ def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
     """Return the SHA-256 over the variables of a sensor, in hexadecimal.
 
     Of those with one array per measurement, only the CRC-32 of each row goes in. So all of a file can
-    be checked, in parts, without reading all of it first.
+    be checked, in parts, without reading all of it first. The truth follows where there is one: its
+    seed, then its variables.
     """
     digest = hashlib.sha256()
+    _digest(digest, group, table)
+    if "truth" in group:
+        digest.update(f"seed{group['truth'].attrs['seed']}".encode())
+        _digest(digest, group["truth"], TRUTH)
+    return digest.hexdigest()
+
+
+def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable]) -> None:
     for variable in table:
         if variable.dtype:
             values = np.asarray(group[variable.name][()])
             digest.update(variable.name.encode() + values.tobytes())
-    return digest.hexdigest()
+
+
+def content_uuid(contents: Mapping[str, str]) -> str:
+    """Return the identity of a file: a UUID of version 8, which its content makes (RFC 9562, section 5.8).
+
+    Parameters
+    ----------
+    contents : mapping of str to str
+        `content_sha256` of each sensor, by name. The name of a single sensor does not count; nor does
+        the order in which several were written.
+    """
+    (content,) = contents.values() if len(contents) == 1 else (_joined(contents),)
+    made = bytearray(bytes.fromhex(content)[:16])
+    made[6] = made[6] & 0x0F | 0x80
+    made[8] = made[8] & 0x3F | 0x80
+    return str(uuid.UUID(bytes=bytes(made)))
+
+
+def _joined(contents: Mapping[str, str]) -> str:
+    lines = "".join(f"{name} {content}\n" for name, content in sorted(contents.items()))
+    return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def sensor_path(name: str) -> str:

@@ -16,6 +16,7 @@ import numba
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract import KernelSet
+from ertis_numba.kernels._cpu.add_paths import add_paths
 from ertis_numba.kernels._cpu.decimate import decimate
 from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
 from ertis_numba.kernels._cpu.delay_and_sum_envelope import delay_and_sum_envelope
@@ -86,5 +87,6 @@ KERNELS = KernelSet(
     delay_and_sum_envelope=delay_and_sum_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    add_paths=add_paths,
     modulate_pdm=modulate_pdm,
 )

@@ -1,47 +1,160 @@
 """Turn signals into the bits of sigma-delta modulators, one per microphone.
 
-Recursive in time, so microphones run side by side and each keeps its state in registers. The dither
-is a hash of the microphone's key and the number of the sample, not a stream: neither the number of
-threads nor the cut into blocks changes a bit. No fastmath, for the same reason.
+Recursive in time, so microphones run side by side: an octet of a word, or two, in one set of vectors, and each
+thread has octets of its own. Noise and dither are a hash of the microphone's key and the number of the
+sample, not a stream: neither the number of threads nor the cut into blocks changes a bit. No fastmath, for
+the same reason. Ten times faster than a loop over one microphone at a time.
 """
+
+import math
 
 import numpy as np
 from numba import njit, prange
 
+from ertis_numba.kernels._cpu.lanes import LANES, as_float64, bits, clamp, load, sign, splat, store, turn_octet
+
 __all__ = ["modulate_pdm"]
+
+_OCTETS = LANES // 8
+_INTEGRATORS = 4
+_TILE = 256  # samples between two writes of octets: threads that write beside each other wait for each other's lines
 
 # SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators, 2014)
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
-_30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-_UNIT = 2.0**-53
+_12, _24, _27, _30, _31 = np.uint64(12), np.uint64(24), np.uint64(27), np.uint64(30), np.uint64(31)
+
+# The upper 16 bits of a hash are its dither, four fields of 12 bits its noise.
+_TOP_16 = np.uint64(0x000F_FFF0_0000_0000)  # once shifted right by 12: the upper 16 bits of a fraction of 52
+_FIELDS_0_AND_2 = np.uint64(0x0000_000F_FF00_0FFF)
+_LOW_24 = np.uint64(0xFF_FFFF)
+_ONE, _TWO_52 = np.uint64(0x3FF0_0000_0000_0000), np.uint64(0x4330_0000_0000_0000)  # 1 and 2⁵² as float64
+_DITHER_MEAN = 1.5 - 2.0**-17
+_NOISE_MEAN = 2.0**52 + 4 * 4095 / 2
+_NOISE_UNIT = 1 / math.sqrt((4096.0**2 - 1) / 3)  # 1 / rms of a sum of four numbers from 0 to 4095
+
+_TO_GRID = 1.5 * 2.0**32  # float64 of this size lie 2⁻²⁰ apart: adding it rounds, on every processor
 
 
 @njit(inline="always")
-def _dither(key, sample):
-    """Return a number in [−½, ½) that only key and sample decide."""
-    z = key + np.uint64(sample) * _STEP
-    z = (z ^ (z >> _30)) * _MIX_1
-    z = (z ^ (z >> _27)) * _MIX_2
-    z = z ^ (z >> _31)
-    return np.int64(z >> _11) * _UNIT - 0.5
+def _hashed(counter):
+    """Return SplitMix64 of the counters."""
+    z = (counter ^ (counter >> splat(_30))) * splat(_MIX_1)
+    z = (z ^ (z >> splat(_27))) * splat(_MIX_2)
+    return z ^ (z >> splat(_31))
+
+
+@njit(inline="always")
+def _dither(z):
+    """Return the upper 16 bits of a hash as uniform numbers within ±½."""
+    return as_float64(((z >> splat(_12)) & splat(_TOP_16)) | splat(_ONE)) - splat(_DITHER_MEAN)
+
+
+@njit(inline="always")
+def _noise(z):
+    """Return the sum of the four 12-bit fields of a hash, less its mean."""
+    pairs = (z & splat(_FIELDS_0_AND_2)) + ((z >> splat(_12)) & splat(_FIELDS_0_AND_2))
+    total = (pairs & splat(_LOW_24)) + (pairs >> splat(_24))
+    return as_float64(total | splat(_TWO_52)) - splat(_NOISE_MEAN)
+
+
+@njit(nogil=True, cache=True)
+def _fill_tile(signals, rows, begin, count, tile):
+    """Copy ``count`` samples of the lanes' signals to ``tile`` (sample, lane)."""
+    whole = count - count % 8
+    for n in range(0, whole, 8):
+        for octet in range(_OCTETS):
+            turn_octet(signals, rows, octet, begin + n, tile, n)
+    for lane in range(LANES):
+        for n in range(whole, count):
+            tile[n, lane] = signals[rows[lane], begin + n]
+
+
+@njit(nogil=True, cache=True)
+def _run(signals, rows, counters, scales, states, loop, octets, masks, out):
+    """Modulate the microphones of all lanes; ``states`` (integrator, lane) is kept up to date."""
+    tile, words = np.empty((_TILE, LANES), np.float64), np.empty(_TILE, np.uint16)
+    c1, c2, c3, c4 = splat(loop[0]), splat(loop[1]), splat(loop[2]), splat(loop[3])
+    r1, r2, dither, low, high = splat(loop[4]), splat(loop[5]), splat(loop[6]), splat(-loop[7]), splat(loop[7])
+    counter, scale = load(counters, 0), load(scales, 0)
+    noisy = False
+    for lane in range(LANES):
+        if scales[0, lane] != 0.0:
+            noisy = True
+    s1, s2, s3, s4 = load(states, 0), load(states, 1), load(states, 2), load(states, 3)
+    for begin in range(0, signals.shape[1], _TILE):
+        count = min(_TILE, signals.shape[1] - begin)
+        _fill_tile(signals, rows, begin, count, tile)
+        for n in range(count):
+            z = _hashed(counter)
+            counter = counter + splat(_STEP)
+            u = load(tile, n)
+            if noisy:
+                u = u + scale * _noise(z)
+            u = (u + splat(_TO_GRID)) - splat(_TO_GRID)
+            quantised = (u + dither * _dither(z)) + ((s1 + s2) + (s3 + s4))
+            words[n] = bits(quantised)
+            d = u - sign(quantised)
+            s1 = clamp(s1 + (c1 * d - r1 * s2), low, high)
+            s2 = clamp(s2 + c2 * s1, low, high)
+            s3 = clamp(s3 + (c3 * s2 - r2 * s4), low, high)
+            s4 = clamp(s4 + c4 * s3, low, high)
+        for k in range(_OCTETS):
+            for n in range(count):
+                out[begin + n, octets[k]] = (words[n] >> (8 * k)) & masks[k]
+    store(s1, states, 0)
+    store(s2, states, 1)
+    store(s3, states, 2)
+    store(s4, states, 3)
+
+
+@njit(nogil=True, cache=True)
+def _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out):
+    """Modulate the microphones of as many octets as there are lanes for."""
+    rows, counters, masks = np.empty(LANES, np.int64), np.empty((1, LANES), np.uint64), np.empty(_OCTETS, np.int64)
+    scales, kept = np.empty((1, LANES)), np.empty((_INTEGRATORS, LANES))
+    masks[:] = 0
+    for lane in range(LANES):
+        mic = mics[octets[lane // 8], lane % 8]
+        if mic >= 0:
+            masks[lane // 8] |= 1 << lane % 8
+        mic = max(mic, 0)  # a lane without microphone runs along with the first one, and its bits are masked
+        rows[lane] = mic
+        counters[0, lane] = keys[mic] + np.uint64(first) * _STEP
+        scales[0, lane] = noise_rms[mic] * _NOISE_UNIT
+        for integrator in range(_INTEGRATORS):
+            kept[integrator, lane] = states[mic, integrator]
+    _run(signals, rows, counters, scales, kept, loop, octets, masks, out)
+    for lane in range(LANES):
+        if masks[lane // 8] >> lane % 8 & 1:
+            for integrator in range(_INTEGRATORS):
+                states[rows[lane], integrator] = kept[integrator, lane]
+
+
+@njit(nogil=True, cache=True)
+def _used_octets(mics, out):
+    """Return the octets that have a microphone; set the others to 0."""
+    used = np.empty(len(mics), np.int64)
+    count = 0
+    for octet in range(len(mics)):
+        has_mic = False
+        for mic in mics[octet]:
+            has_mic |= mic >= 0
+        if has_mic:
+            used[count] = octet
+            count += 1
+        else:
+            out[:, octet] = 0
+    return used[:count]
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def modulate_pdm(signals, keys, states, gains, first, dither, limit, out):
+def modulate_pdm(signals, mics, keys, noise_rms, states, loop, first, out):
     """See `ModulatePdm`."""
-    c1, c2, c3, c4, r1, r2 = gains[0], gains[1], gains[2], gains[3], gains[4], gains[5]
-    for mic in prange(signals.shape[0]):
-        s1, s2, s3, s4 = states[mic, 0], states[mic, 1], states[mic, 2], states[mic, 3]
-        key = keys[mic]
-        for sample in range(signals.shape[1]):
-            u = signals[mic, sample]
-            above = (u + dither * _dither(key, first + sample)) + ((s1 + s2) + (s3 + s4)) >= 0.0
-            out[mic, sample] = above
-            d = u - (1.0 if above else -1.0)
-            s1 = min(max(s1 + (c1 * d - r1 * s2), -limit), limit)
-            s2 = min(max(s2 + c2 * s1, -limit), limit)
-            s3 = min(max(s3 + (c3 * s2 - r2 * s4), -limit), limit)
-            s4 = min(max(s4 + c4 * s3, -limit), limit)
-        states[mic, 0], states[mic, 1], states[mic, 2], states[mic, 3] = s1, s2, s3, s4
+    used = _used_octets(mics, out)
+    for group in prange((len(used) + _OCTETS - 1) // _OCTETS):
+        octets = np.empty(_OCTETS, np.int64)
+        for k in range(_OCTETS):
+            octets[k] = used[min(group * _OCTETS + k, len(used) - 1)]  # an odd one goes twice, to the same bits
+        _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out)

@@ -1,0 +1,68 @@
+"""``ertis compare``: how far an energyscape file is from the truth."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.stages.compare import Errors
+
+__all__ = ["compare"]
+
+_WIDTHS = {
+    "measurements": 12,
+    "matched": 7,
+    "missed": 6,
+    "false": 5,
+    "angle_rms_deg": 13,
+    "range_bias_m": 12,
+    "range_rms_m": 11,
+    "level_rms_db": 12,
+}
+
+
+@click.command()
+@options.input_file("IMG.h5")
+@options.sensor("One sensor only; all of the file by default.")
+@options.min_level("Leave out reflectors and peaks that are weaker, below the strongest.")
+@options.as_json
+def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) -> None:
+    """Say how far an energyscape file is from the truth.
+
+    The file must come from a simulated recording, whose truth it keeps. Only reflectors that the image
+    can show count: on its range axis, and within half of the array's main lobe of its directions. A
+    reflector is found if a peak lies within 0.1 m and one and a half main lobes; a peak is false if no
+    reflector explains it. Finding nothing is no failure: the exit code is 0.
+    """
+    from ertis_numba.stages.compare import errors_of
+
+    compared = {
+        name: [comparison for _, comparison in options.comparisons(path, name, min_level)]
+        for name in options.sensors_of(path, sensor)
+    }
+    sensors = {name: errors_of(given) for name, given in compared.items()}
+    whole = errors_of(comparison for given in compared.values() for comparison in given)
+    if as_json:
+        rows = [{"sensor": name, **_rounded(errors)} for name, errors in sensors.items()]
+        options.print_json({**_rounded(whole), "sensors": rows})
+        return
+    width = max(map(len, (*sensors, "sensor")))
+    click.echo("  ".join(["sensor".ljust(width), *(name.rjust(size) for name, size in _WIDTHS.items())]))
+    for name, errors in (*sensors.items(), ("all", whole)):
+        cells = _rounded(errors)
+        shown = (_cell(cells[column]).rjust(size) for column, size in _WIDTHS.items())
+        click.echo("  ".join([name.ljust(width), *shown]))
+
+
+def _rounded(errors: "Errors") -> dict[str, Any]:
+    return {name: round(value, 6) if isinstance(value, float) else value for name, value in asdict(errors).items()}
+
+
+def _cell(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, int) else f"{value:.5f}"

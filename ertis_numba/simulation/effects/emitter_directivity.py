@@ -1,0 +1,25 @@
+"""A piston sends ahead."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.paths import Paths
+
+__all__ = ["emitter_directivity"]
+
+
+def emitter_directivity(
+    paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
+) -> NDArray[np.float64]:
+    """Return what the emitter sends into the directions of the paths: (path, 1, frequency) float64.
+
+    A circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``; nothing behind it. The
+    direction is that towards the middle of the array.
+    """
+    cos = np.mean(paths.leaving, axis=1) @ paths.mouth.facing
+    sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
+    pattern = piston(math.pi * diameter_m / speed_m_s * sin[:, None] * frequency_hz)
+    return np.asarray(np.where(cos[:, None] >= 0, pattern, 0.0)[:, None, :])

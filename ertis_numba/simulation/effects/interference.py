@@ -1,0 +1,60 @@
+"""Tones, noise and other sonars."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.effects._noise import NoiseField
+from ertis_numba.simulation.effects.spreading import spreading
+from ertis_numba.simulation.paths import Paths, without_target
+from ertis_numba.simulation.placed import Placed
+from ertis_numba.simulation.snapshot import Mouth, Snapshot
+from ertis_numba.simulation.sources import Noise, Sonar, Tone
+
+__all__ = ["add_tone", "calls_of", "noise_of", "way_from"]
+
+
+def way_from(shot: Snapshot, source: Placed) -> Paths:
+    """Return the straight way from a source to the microphones; it sends alike in all directions."""
+    mouth = Mouth(
+        position_m=source.position_at(shot.time_s), velocity_m_s=source.velocity_at(shot.time_s), facing=np.zeros(3)
+    )
+    return without_target(mouth, shot.ear, shot.targets)
+
+
+def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: int) -> None:
+    """Add ``a / r · sin(2π f (t - r / c))``, t being the time of the scene: (mic, sample) float64, in place."""
+    way, rate_hz = way_from(shot, tone), shot.sensor.recording.pdm_rate_hz
+    amplitude = 10 ** (tone.level_db / 20) * spreading(way)[0]
+    # The whole turns of a long time are taken out before they cost digits.
+    turns = (tone.frequency_hz * (shot.time_s - way.length_m[0] / shot.speed_m_s)) % 1.0
+    swing_rad = 2 * math.pi * tone.frequency_hz / rate_hz * np.arange(first, first + signals.shape[1])
+    start_rad = 2 * math.pi * turns
+    signals += np.outer(amplitude * np.cos(start_rad), np.sin(swing_rad))
+    signals += np.outer(amplitude * np.sin(start_rad), np.cos(swing_rad))
+
+
+def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> NoiseField:
+    """Return the noise of one source: the same for all microphones but for delay and ``1 / r``."""
+    way = way_from(shot, noise)
+    return NoiseField(
+        seed,
+        delay_s=(way.length_m - np.linalg.norm(way.mouth.position_m - shot.ear.centre_m)) / shot.speed_m_s,
+        amplitude=10 ** (noise.level_db / 20) * spreading(way),
+        band_hz=noise.band_hz,
+        rate_hz=shot.sensor.recording.pdm_rate_hz,
+    )
+
+
+def calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:
+    """Return when another sonar's calls begin that are heard during the record: (call,) float64.
+
+    In seconds after the record begins, so often below 0. Its calls reach the microphones straight; their echoes
+    are far weaker.
+    """
+    way_s = float(np.mean(way_from(shot, sonar).length_m)) / shot.speed_m_s
+    earliest_s = shot.time_s - way_s - sonar.call.duration_s - sonar.offset_s
+    latest_s = shot.time_s - way_s + shot.sensor.recording.duration_s - sonar.offset_s
+    numbers = np.arange(max(0, math.ceil(earliest_s / sonar.period_s)), math.floor(latest_s / sonar.period_s) + 1)
+    return np.asarray(sonar.offset_s + numbers * sonar.period_s - shot.time_s)

@@ -1,0 +1,36 @@
+"""Amplitude falls with distance."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.paths import Paths
+
+__all__ = ["spreading"]
+
+_NEAREST_M = 0.01  # emitters, reflectors and microphones have a size: amplitudes stop growing here
+
+
+def spreading(paths: Paths) -> NDArray[np.float64]:
+    """Return the amplitude that distance leaves: (path, mic) float64.
+
+    A point spreads anew what it receives, ``1 / (r₁ r₂)``; a mirror does not, ``1 / (r₁ + r₂)``. A sphere of
+    radius a lies between, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and ``B = r₁ + r₂ + 2 r₁ r₂
+    cos θ / a``, θ being the angle of incidence: straight on ``a / (2 r (r + a))`` (how a
+    tube of rays opens at a curved mirror; A. D. Pierce, Acoustics, 1989, chapter 8).
+    """
+    first_m, second_m = paths.first_m, paths.second_m
+    if not len(paths.targets):
+        return np.asarray(1 / np.maximum(first_m + second_m, _NEAREST_M))
+    first_m, second_m = np.maximum(first_m, _NEAREST_M), np.maximum(second_m, _NEAREST_M)
+    amplitude = 1 / (first_m * second_m)
+    if not paths.surface:
+        return np.asarray(amplitude)
+    is_sphere = paths.targets.radius_m > 0
+    radius_m = paths.targets.radius_m[is_sphere, None]
+    r1, r2 = first_m[is_sphere], second_m[is_sphere]
+    # The two legs open by twice the angle of incidence.
+    cos_double = -np.sum(paths.leaving[is_sphere] * paths.arriving[is_sphere], axis=-1)
+    cos = np.sqrt(np.maximum((1 + cos_double) / 2, 1e-6))
+    along, across = r1 + r2 + 2 * r1 * r2 / (radius_m * cos), r1 + r2 + 2 * r1 * r2 * cos / radius_m
+    amplitude[is_sphere] = 1 / np.sqrt(along * across)
+    return np.asarray(amplitude)

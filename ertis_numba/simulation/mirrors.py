@@ -1,0 +1,146 @@
+"""Images in walls, and what stands in the way."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.snapshot import Ear, Mirror, Mouth
+
+__all__ = ["Seen", "blocked", "images", "reflected"]
+
+Floats = NDArray[np.float64]
+End = TypeVar("End", Mouth, Ear)
+_SKIN = 1e-9  # of a leg's length: what touches a wall does not cross it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen(Generic[End]):
+    """One end of paths as places see it, straight or in walls.
+
+    Attributes
+    ----------
+    end : Mouth or Ear
+        Itself or its image.
+    exists : (place,) bool
+        Whether the mirror points lie on the walls.
+    corners_m : (corner, place, axis) float64
+        From the end to the places, both included.
+    mirrors : tuple of int
+        The wall at each inner corner.
+    """
+
+    end: End
+    exists: NDArray[np.bool_]
+    corners_m: Floats
+    mirrors: tuple[int, ...]
+
+
+def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> list[Seen[End]]:
+    """Return an end and its images of up to ``most`` reflections that some place sees.
+
+    The image of an image: ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for
+    efficiently simulating small-room acoustics, JASA 65, 1979), kept where every mirror point lies within its
+    wall (J. Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
+
+    Parameters
+    ----------
+    end : Mouth or Ear
+    places_m : (place, axis) float64
+    mirrors : sequence of Mirror
+    most : int
+    """
+    n_places = len(places_m)
+    straight = np.stack([np.broadcast_to(_position(end), places_m.shape), places_m])
+    found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
+    chains: list[tuple[tuple[int, ...], tuple[End, ...]]] = [((), (end,))]
+    for _ in range(most):
+        chains = [
+            ((*walls, number), (*ends, reflected(ends[-1], mirror)))
+            for walls, ends in chains
+            for number, mirror in enumerate(mirrors)
+            if not walls or walls[-1] != number
+        ]
+        for walls, ends in chains:
+            exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m)
+            if exists.any():
+                found.append(Seen(ends[-1], exists, corners_m, walls))
+    return found
+
+
+def reflected(end: End, mirror: Mirror) -> End:
+    """Return the image of an end in one more wall."""
+    normal = mirror.axes[0]
+    velocity_m_s = mirror.velocity_m_s + _turned(end.velocity_m_s - mirror.velocity_m_s, normal)
+    reflection = end.reflection * mirror.reflection
+    # The sound meets the walls in the order of the images from an emitter, and against it to a microphone.
+    if isinstance(end, Mouth):
+        return replace(
+            end,
+            position_m=_image(end.position_m, mirror),
+            velocity_m_s=velocity_m_s,
+            facing=_turned(end.facing, normal),
+            walls=(*end.walls, mirror.name),
+            reflection=reflection,
+        )
+    return replace(
+        end,
+        positions_m=_image(end.positions_m, mirror),
+        centre_m=_image(end.centre_m, mirror),
+        velocity_m_s=velocity_m_s,
+        axes=_turned(end.axes, normal),
+        walls=(mirror.name, *end.walls),
+        reflection=reflection,
+    )
+
+
+def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
+    """Return to which places a wall stands in the way: (place,) bool.
+
+    A leg is blocked by every wall that it crosses, those apart at which it begins or ends.
+    """
+    stopped = np.zeros(seen.corners_m.shape[1], dtype=np.bool_)
+    touched = (-1, *seen.mirrors, -1)
+    for leg, (start_m, stop_m) in enumerate(zip(seen.corners_m[:-1], seen.corners_m[1:], strict=True)):
+        for number, mirror in enumerate(mirrors):
+            if number not in touched[leg : leg + 2]:
+                crosses, _ = _crossing(start_m, stop_m, mirror)
+                stopped |= crosses
+    return stopped
+
+
+def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Follow the sound back from the places over the walls to the end itself."""
+    exists = np.ones(len(places_m), dtype=np.bool_)
+    corners_m = [places_m]
+    for image, mirror in zip(ends[:0:-1], walls[::-1], strict=True):
+        hit, point_m = _crossing(corners_m[-1], np.broadcast_to(_position(image), places_m.shape), mirror)
+        exists &= hit
+        corners_m.append(point_m)
+    corners_m.append(np.broadcast_to(_position(ends[0]), places_m.shape))
+    return exists, np.stack(corners_m[::-1])
+
+
+def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[NDArray[np.bool_], Floats]:
+    """Return whether legs cross a wall, and where: (place,) bool, (place, axis) float64."""
+    before = (start_m - mirror.point_m) @ mirror.axes[0]
+    after = (stop_m - mirror.point_m) @ mirror.axes[0]
+    apart = before - after
+    share = np.divide(before, apart, out=np.full_like(before, -1.0), where=apart != 0)
+    point_m = start_m + share[:, None] * (stop_m - start_m)
+    inside = np.all(np.abs((point_m - mirror.point_m) @ mirror.axes[1:].T) <= mirror.half_size_m, axis=-1)
+    return inside & (share > _SKIN) & (share < 1 - _SKIN), point_m
+
+
+def _position(end: Mouth | Ear) -> Floats:
+    return end.position_m if isinstance(end, Mouth) else end.centre_m
+
+
+def _image(points_m: Floats, mirror: Mirror) -> Floats:
+    return np.asarray(mirror.point_m + _turned(points_m - mirror.point_m, mirror.axes[0]))
+
+
+def _turned(vectors: Floats, normal: Floats) -> Floats:
+    return np.asarray(vectors - 2 * (vectors @ normal)[..., None] * normal)

@@ -1,0 +1,33 @@
+"""The effects by name, in the order in which they are decided and reported."""
+
+from typing import Final
+
+__all__ = ["EFFECTS", "INDISPENSABLE"]
+
+EFFECTS: Final = {
+    "propagation": "sound takes its time, to any part of a sample",
+    "spreading": "amplitude falls with distance",
+    "walls": "mirror images of emitters and targets in walls",
+    "occlusion": "walls stand between",
+    "target_size": "spheres have a surface, discs face somewhere",
+    "absorption": "air takes the high frequencies",
+    "emitter_directivity": "a piston sends ahead",
+    "microphone_directivity": "a port hears ahead",
+    "doppler": "motion shifts and stretches the call",
+    "cross_emission": "sensors hear each other's calls",
+    "sync_delay": "each sensor of the SYNC chain starts later",
+    "direct_sound": "microphones hear the emitter beside them",
+    "interference": "tones, noise and other sonars",
+    "ambient_noise": "noise from everywhere",
+    "microphone_noise": "white noise of each microphone",
+    "microphone_spread": "gains and delays that no calibration knows",
+    "microphone_faults": "dead and stuck microphones",
+    "modulation": "sigma-delta modulators make bits",
+}
+"""What each effect is."""
+
+INDISPENSABLE: Final = {
+    "propagation": "an image is made of delays",
+    "modulation": "a recording holds bits",
+}
+"""Effects of every scene, and why."""

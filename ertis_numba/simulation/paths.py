@@ -1,0 +1,118 @@
+"""The ways of the sound: from an emitter, by a target or none, to every microphone."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.snapshot import Ear, Mouth, Targets
+
+__all__ = ["Paths", "by_targets", "unit", "without_target"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paths:
+    """Ways that share one emitter and one set of microphones, or one image of them.
+
+    Attributes
+    ----------
+    mouth : Mouth
+    ear : Ear
+    targets : Targets
+        One per path. Without any there is one path, all of it the second leg.
+    first_m, second_m : (path, mic) float64
+        Lengths of the legs before and after the target.
+    leaving, arriving : (path, mic, axis) float64
+        Unit vectors along the first and the last leg, as the sound goes, among the images.
+    surface : bool
+        Legs end on the surface of spheres, rather than in their centres.
+    """
+
+    mouth: Mouth
+    ear: Ear
+    targets: Targets
+    first_m: Floats
+    second_m: Floats
+    leaving: Floats
+    arriving: Floats
+    surface: bool = False
+
+    def __len__(self) -> int:
+        return len(self.first_m)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The target of each path, and the walls before and after it."""
+        before, after = self.mouth.walls, self.ear.walls
+        return tuple(" > ".join((*before, name, *after)) for name in self.targets.names) or (
+            " > ".join((*before, *after)) or "direct sound",
+        )
+
+    @property
+    def length_m(self) -> Floats:
+        """Length of the whole way: (path, mic) float64."""
+        return self.first_m + self.second_m
+
+    @property
+    def reflection(self) -> float:
+        """Amplitude that the walls leave."""
+        return self.mouth.reflection * self.ear.reflection
+
+    def of_mics(self, mics: slice) -> Self:
+        """Return the paths to some of the microphones."""
+        cut = {name: getattr(self, name)[:, mics] for name in ("first_m", "second_m", "leaving", "arriving")}
+        return replace(self, ear=replace(self.ear, positions_m=self.ear.positions_m[mics]), **cut)
+
+
+def by_targets(mouth: Mouth, ear: Ear, targets: Targets, *, corners_m: Floats | None = None) -> Paths:
+    """Return the paths over targets, at least one.
+
+    Parameters
+    ----------
+    mouth : Mouth
+    ear : Ear
+    targets : Targets
+    corners_m : (path, mic, axis) float64, optional
+        Where the paths turn; the targets' positions by default.
+    """
+    places_m = targets.positions_m[:, None, :] if corners_m is None else corners_m
+    there_m = places_m - mouth.position_m
+    back_m = ear.positions_m - places_m
+    shape = back_m.shape[:2]
+    return Paths(
+        mouth=mouth,
+        ear=ear,
+        targets=targets,
+        first_m=np.broadcast_to(_length(there_m), shape),
+        second_m=_length(back_m),
+        leaving=np.broadcast_to(unit(there_m), back_m.shape),
+        arriving=unit(back_m),
+        surface=corners_m is not None,
+    )
+
+
+def without_target(mouth: Mouth, ear: Ear, targets: Targets) -> Paths:
+    """Return the one path from an emitter or its image straight to the microphones."""
+    way_m = (ear.positions_m - mouth.position_m)[None]
+    return Paths(
+        mouth=mouth,
+        ear=ear,
+        targets=targets.chosen(np.arange(0)),
+        first_m=np.zeros(way_m.shape[:2]),
+        second_m=_length(way_m),
+        leaving=unit(way_m),
+        arriving=unit(way_m),
+    )
+
+
+def unit(vectors: Floats) -> Floats:
+    """Return vectors scaled to length 1; those of no length stay as they are."""
+    length = _length(vectors)[..., None]
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
+
+
+def _length(vectors: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))

@@ -1,0 +1,103 @@
+"""Where things of a scene are, and how they move."""
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.documents import Table
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["Placed", "Vector", "check_vector"]
+
+Vector = tuple[float, float, float]
+_FARTHEST_M = 1e4
+_FASTEST_M_S = 100.0  # a third of the speed of sound: beyond, the air itself gives way
+_STILL: Vector = (0.0, 0.0, 0.0)
+
+
+class Placed(Table, frozen=True, kw_only=True):
+    """Something that has a place in the world frame: x forward, y left, z up.
+
+    Attributes
+    ----------
+    position_m : (x, y, z), optional
+        When the first measurement begins.
+    azimuth_deg, elevation_deg, range_m : float, optional
+        The same seen from the origin; give either these or ``position_m``.
+    velocity_m_s : (x, y, z)
+    waypoints : tuple of (time_s, x, y, z)
+        Instead of all these: straight lines between points, rest before the first and after the last.
+    """
+
+    position_m: Vector | None = None
+    azimuth_deg: float | None = None
+    elevation_deg: float | None = None
+    range_m: float | None = None
+    velocity_m_s: Vector = _STILL
+    waypoints: tuple[tuple[float, float, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        name = self.label()
+        polar = [value for value in (self.azimuth_deg, self.elevation_deg, self.range_m) if value is not None]
+        if (self.position_m is not None) + bool(polar) + bool(self.waypoints) != 1:
+            raise ArgumentError(
+                f"{name} has not one place; give position_m, or range_m with azimuth_deg and elevation_deg, or waypoints"
+            )
+        if polar:
+            if self.range_m is None:
+                raise ArgumentError(f"{name} has a direction and no range_m; give it, too")
+            checks.between(f"{name}.range_m", self.range_m, 1e-3, _FARTHEST_M)
+            checks.between(f"{name}.azimuth_deg", self.azimuth_deg or 0.0, -180.0, 180.0)
+            checks.between(f"{name}.elevation_deg", self.elevation_deg or 0.0, -90.0, 90.0)
+        if self.position_m is not None:
+            check_vector(f"{name}.position_m", self.position_m, _FARTHEST_M)
+        check_vector(f"{name}.velocity_m_s", self.velocity_m_s, _FASTEST_M_S)
+        if self.waypoints and self.velocity_m_s != _STILL:
+            raise ArgumentError(f"{name} has waypoints and velocity_m_s; give one of the two")
+        for number, (time_s, *place) in enumerate(self.waypoints):
+            checks.finite(f"{name}.waypoints[{number}] time", time_s)
+            check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), _FARTHEST_M)
+        for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
+            if after_s <= before_s:
+                raise ArgumentError(f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give rising times")
+            checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, _FASTEST_M_S)
+
+    @classmethod
+    def label(cls) -> str:
+        """Return what errors call it."""
+        return cls.__name__.lower()
+
+    @property
+    def moves(self) -> bool:
+        """Whether it ever changes its place."""
+        return self.velocity_m_s != _STILL or len(self.waypoints) > 1
+
+    def position_at(self, time_s: float) -> NDArray[np.float64]:
+        """Return the position at a time of the scene: (axis,) float64."""
+        if self.waypoints:
+            times, *axes = np.array(self.waypoints).T
+            return np.array([np.interp(time_s, times, axis) for axis in axes])
+        return self._start_m() + time_s * np.array(self.velocity_m_s)
+
+    def velocity_at(self, time_s: float) -> NDArray[np.float64]:
+        """Return the velocity at a time of the scene: (axis,) float64."""
+        for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
+            if before_s <= time_s < after_s:
+                return (np.array(b) - np.array(a)) / (after_s - before_s)
+        return np.array(_STILL if self.waypoints else self.velocity_m_s)
+
+    def _start_m(self) -> NDArray[np.float64]:
+        if self.position_m is not None:
+            return np.array(self.position_m)
+        azimuth_rad, elevation_rad = math.radians(self.azimuth_deg or 0.0), math.radians(self.elevation_deg or 0.0)
+        return np.asarray((self.range_m or 0.0) * unit_vectors(np.array(azimuth_rad), np.array(elevation_rad)))
+
+
+def check_vector(name: str, vector: Vector, most: float) -> None:
+    """Refuse a vector with a part beyond ``most``."""
+    for part in vector:
+        checks.between(name, part, -most, most)

@@ -1,0 +1,232 @@
+"""A scene at one instant, in the world frame: where everything is and how it moves."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import Layout, microphones
+from ertis_numba.simulation.scene import Scene
+from ertis_numba.simulation.sensors import Sensor
+
+__all__ = ["Ear", "Mirror", "Mouth", "Snapshot", "Targets", "snapshot"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mouth:
+    """An emitter, or its image in walls.
+
+    Attributes
+    ----------
+    position_m, velocity_m_s : (axis,) float64
+    facing : (axis,) float64
+        Unit vector.
+    walls : tuple of str
+        Which the sound meets, in its order.
+    reflection : float
+        Amplitude that they leave.
+    """
+
+    position_m: Floats
+    velocity_m_s: Floats
+    facing: Floats
+    walls: tuple[str, ...] = ()
+    reflection: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ear:
+    """The microphones of a sensor, or their image in walls.
+
+    Attributes
+    ----------
+    positions_m : (mic, axis) float64
+    centre_m, velocity_m_s : (axis,) float64
+    axes : (3, axis) float64
+        The sensor's x, y and z as unit vectors; the image of a right hand is a left one.
+    walls : tuple of str
+        Which the sound meets, in its order.
+    reflection : float
+        Amplitude that they leave.
+    """
+
+    positions_m: Floats
+    centre_m: Floats
+    velocity_m_s: Floats
+    axes: Floats
+    walls: tuple[str, ...] = ()
+    reflection: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Targets:
+    """Points and spheres.
+
+    Attributes
+    ----------
+    names : tuple of str
+    positions_m, velocities_m_s : (target, axis) float64
+    strength : (target,) float64
+        Amplitude of the echo at 1 m from a point, or reflected by a sphere.
+    radius_m : (target,) float64
+        0 for points.
+    diameter_m : (target,) float64
+        Of discs, 0 for others.
+    normals : (target, axis) float64
+        Where discs face.
+    """
+
+    names: tuple[str, ...]
+    positions_m: Floats
+    velocities_m_s: Floats
+    strength: Floats
+    radius_m: Floats
+    diameter_m: Floats
+    normals: Floats
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def chosen(self, places: NDArray[np.intp]) -> Self:
+        """Return some of them: (target,) numbers."""
+        arrays = {field.name: getattr(self, field.name)[places] for field in fields(self)[1:]}
+        return replace(self, names=tuple(self.names[k] for k in places), **arrays)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirror:
+    """A wall.
+
+    Attributes
+    ----------
+    name : str
+    point_m, velocity_m_s : (axis,) float64
+    axes : (3, axis) float64
+        Normal, width and height as unit vectors.
+    half_size_m : (2,) float64
+        Infinite where the wall has no end.
+    reflection : float
+        Amplitude.
+    """
+
+    name: str
+    point_m: Floats
+    velocity_m_s: Floats
+    axes: Floats
+    half_size_m: Floats
+    reflection: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """What one sensor is about to hear.
+
+    Attributes
+    ----------
+    scene : Scene
+    sensor : Sensor
+        The one that listens.
+    time_s : float
+        Start of the emission.
+    layout : Layout
+        Its microphones.
+    channels : (mic,) int64
+        Their channels.
+    ear : Ear
+    mouths : tuple of Mouth
+        One per sensor of the scene.
+    targets : Targets
+    mirrors : tuple of Mirror
+    speed_m_s : float
+        Of sound.
+    """
+
+    scene: Scene
+    sensor: Sensor
+    time_s: float
+    layout: Layout
+    channels: NDArray[np.int64]
+    ear: Ear
+    mouths: tuple[Mouth, ...]
+    targets: Targets
+    mirrors: tuple[Mirror, ...]
+    speed_m_s: float
+
+    @property
+    def number(self) -> int:
+        """Place of the listening sensor in the scene, and on the SYNC chain."""
+        return self.scene.sensors.index(self.sensor)
+
+    @property
+    def mouth(self) -> Mouth:
+        """The listening sensor's own emitter."""
+        return self.mouths[self.number]
+
+    def of_mics(self, mics: slice) -> Self:
+        """Return the same with some of the microphones."""
+        ear = replace(self.ear, positions_m=self.ear.positions_m[mics])
+        return replace(self, ear=ear, channels=self.channels[mics])
+
+
+def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
+    """Return the scene at a time, as a sensor meets it."""
+    layout = microphones(sensor.array)
+    place, rotation = sensor.path(), sensor.rotation()
+    centre_m = place.position_at(time_s)
+    return Snapshot(
+        scene=scene,
+        sensor=sensor,
+        time_s=time_s,
+        layout=layout,
+        channels=np.flatnonzero(layout.enabled),
+        ear=Ear(
+            positions_m=centre_m + layout.enabled_positions_m @ rotation.T,
+            centre_m=centre_m,
+            velocity_m_s=place.velocity_at(time_s),
+            axes=rotation.T,
+        ),
+        mouths=tuple(
+            Mouth(
+                position_m=other.path().position_at(time_s),
+                velocity_m_s=other.path().velocity_at(time_s),
+                facing=other.rotation()[:, 0],
+            )
+            for other in scene.sensors
+        ),
+        targets=_targets(scene, time_s),
+        mirrors=tuple(
+            Mirror(
+                name=name,
+                point_m=wall.position_at(time_s),
+                velocity_m_s=wall.velocity_at(time_s),
+                axes=wall.axes(),
+                half_size_m=np.array(wall.size_m or (np.inf, np.inf)) / 2,
+                reflection=10 ** (wall.reflection_db / 20),
+            )
+            for name, wall in scene.all_walls()
+        ),
+        speed_m_s=sound_speed_m_s(sensor.air),
+    )
+
+
+def _targets(scene: Scene, time_s: float) -> Targets:
+    things = [*scene.points, *scene.spheres]
+    names = [f"points[{n}]" for n in range(len(scene.points))] + [f"spheres[{n}]" for n in range(len(scene.spheres))]
+    none = np.zeros(3)
+    return Targets(
+        names=tuple(names),
+        positions_m=np.array([thing.position_at(time_s) for thing in things]).reshape(-1, 3),
+        velocities_m_s=np.array([thing.velocity_at(time_s) for thing in things]).reshape(-1, 3),
+        strength=10
+        ** (
+            np.array([p.strength_db for p in scene.points] + [s.reflection_db for s in scene.spheres], dtype=np.float64)
+            / 20
+        ),
+        radius_m=np.array([0.0 for _ in scene.points] + [s.radius_m for s in scene.spheres]),
+        diameter_m=np.array([p.diameter_m for p in scene.points] + [0.0 for _ in scene.spheres]),
+        normals=np.array([p.normal_at(time_s) for p in scene.points] + [none for _ in scene.spheres]).reshape(-1, 3),
+    )

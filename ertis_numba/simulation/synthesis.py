@@ -1,0 +1,142 @@
+"""From arrivals to the signals at the microphones, block by block."""
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.settings import Call
+from ertis_numba.simulation.arrivals import Arrivals
+from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.waveform import call_at
+
+__all__ = ["BLOCK", "NODE_HZ", "highest_hz", "node_frequencies", "signals"]
+
+Floats = NDArray[np.float64]
+
+BLOCK = 32_768
+"""PDM samples made at a time, so that memory does not grow with the record."""
+NODE_HZ = 1000.0
+"""Filters are evaluated so far apart and run straight between: patterns of pistons of 20 cm hold to 1 %."""
+_RING = 2048  # samples that a filter may ring before and after a call
+_DEAF = 10 ** (-90 / 20)  # what lies so far below the top of a call's spectrum is left out
+
+
+def node_frequencies(top_hz: float) -> Floats:
+    """Return where filters are to be evaluated: (node,) float64, from 0 on."""
+    return np.arange(math.ceil(top_hz / NODE_HZ) + 1) * NODE_HZ
+
+
+@functools.cache
+def highest_hz(call: Call, rate_hz: float) -> float:
+    """Return where a call's spectrum is over: it stays 90 dB below its top, or half of the rate is reached."""
+    n_fft = scipy.fft.next_fast_len(4 * math.ceil(call.duration_s * rate_hz), real=True)
+    spectrum = np.abs(np.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
+    return float(np.flatnonzero(spectrum > _DEAF * spectrum.max())[-1] * rate_hz / n_fft)
+
+
+def signals(
+    arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, clock: Stopwatch
+) -> Iterator[Floats]:
+    """Yield the signals of blocks of the record: (mic, sample) float64 each.
+
+    Every block holds the calls that begin in it, as one spectrum: ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. So delays are
+    exact, filters are products, and of the spectrum only the bins that a call occupies are computed.
+    What a call leaves over its block goes to the next ones.
+    """
+    delay_samples = [entry.delay_s * rate_hz for entry in arrived]
+    before = _RING + max((math.ceil(max(0.0, -delay.min(initial=0.0))) for delay in delay_samples), default=0)
+    n_fft = _length(arrived, delay_samples, rate_hz, before)
+    first_block = [
+        np.maximum(np.floor((delay.min(axis=1) - _RING) / BLOCK), 0.0).astype(int) for delay in delay_samples
+    ]
+    rest = np.zeros((n_mics, 0))
+    for number, begin in enumerate(range(0, n_samples, BLOCK)):
+        spectra: NDArray[np.complex128] | None = None
+        for entry, delay, blocks in zip(arrived, delay_samples, first_block, strict=True):
+            chosen = blocks == number
+            if chosen.any():
+                if spectra is None:
+                    spectra = np.zeros((n_mics, n_fft // 2 + 1), dtype=np.complex128)
+                with clock("doppler" if entry.stretch is not None else "propagation"):
+                    _add(entry, chosen, delay[chosen] - begin + before, rate_hz, n_fft, spectra)
+        size = min(BLOCK, n_samples - begin)
+        with clock("propagation"):
+            if spectra is not None:
+                sound = scipy.fft.irfft(spectra, n_fft, overwrite_x=True, workers=kernels.load("cpu").max_threads)
+                sound = sound[:, before:]
+                sound[:, : rest.shape[1]] += rest
+                rest = sound
+            block = np.zeros((n_mics, size))
+            kept = min(size, rest.shape[1])
+            block[:, :kept] = rest[:, :kept]
+            rest = rest[:, kept:]
+        yield block
+
+
+def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_hz: float, before: int) -> int:
+    """Return the length of a block's transform: room for a block, its calls and what filters add."""
+    call = spread = 0
+    step = 1
+    for entry, delay in zip(arrived, delay_samples, strict=True):
+        stretch = 1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0))
+        call = max(call, math.ceil(stretch * entry.call.duration_s * rate_hz))
+        spread = max(spread, math.ceil(np.ptp(delay, axis=1).max(initial=0.0)))
+        if entry.stretch is not None:
+            step = math.lcm(step, _step(entry.call, rate_hz))
+    n_fft = before + 2 * _RING + BLOCK + call + spread
+    return step * int(scipy.fft.next_fast_len(-(-n_fft // step), real=True))
+
+
+def _step(call: Call, rate_hz: float) -> int:
+    """Return by how much a call may be sampled more slowly: a power of two, so that several have one in common."""
+    return int(2 ** math.floor(math.log2(max(1.0, rate_hz / (2.2 * highest_hz(call, rate_hz))))))
+
+
+def _add(
+    entry: Arrivals,
+    chosen: NDArray[np.bool_],
+    delay_samples: Floats,
+    rate_hz: float,
+    n_fft: int,
+    spectra: NDArray[np.complex128],
+) -> None:
+    n_bins = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
+    out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
+    nodes_per_bin = rate_hz / n_fft / NODE_HZ
+    turns, amplitude = delay_samples / n_fft, entry.amplitude[chosen]
+    add_paths = kernels.load("cpu").add_paths
+    if entry.stretch is None:
+        add_paths(_spectrum(entry.call, rate_hz, n_fft)[None, :n_bins], turns, amplitude, 0, nodes_per_bin, out)
+    else:
+        for path, stretch in enumerate(entry.stretch[chosen]):
+            call = _stretched(entry.call, stretch, rate_hz, n_fft, n_bins)
+            one = slice(path, path + 1)
+            add_paths(call, turns[one], amplitude[one], 0, nodes_per_bin, out)
+    spectra[:, :n_bins] += out
+
+
+@functools.lru_cache(maxsize=8)
+def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
+    return np.asarray(scipy.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
+
+
+def _stretched(
+    call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
+) -> NDArray[np.complex128]:
+    """Return the spectra of a call whose seconds last longer or shorter: (mic, bin) complex128.
+
+    Sampled as slowly as its band allows.
+    """
+    step = _step(call, rate_hz)
+    n_samples = math.ceil(call.duration_s * stretch.max() * rate_hz / step) + 1
+    time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]
+    spectra = scipy.fft.rfft(call_at(call, time_s), n_fft // step, workers=kernels.load("cpu").max_threads)
+    wide = np.zeros((len(stretch), n_bins), dtype=np.complex128)
+    kept = min(n_bins, spectra.shape[1])
+    wide[:, :kept] = step * spectra[:, :kept]
+    return wide

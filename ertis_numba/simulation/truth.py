@@ -1,0 +1,67 @@
+"""What the image of a simulated measurement should show."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.frames import Reflector
+from ertis_numba.simulation.arrivals import echoes, responses
+from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.stopwatch import Stopwatch
+
+__all__ = ["reflectors"]
+
+Floats = NDArray[np.float64]
+_SILENT = 1e-9  # of the strongest
+
+
+def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
+    """Return the echoes of a sensor's own call as an image should show them, strongest first.
+
+    A reflector stands at half of the way of its sound, in the direction from which the sound comes; by a wall, that
+    is the place of its mirror image. Its level is that of the mean amplitude over the microphones and the
+    call's band, below the strongest; its velocity is relative to the sensor, and only along the line of sight where
+    walls are involved.
+    """
+    sight = Sight(shot, active)
+    level = _levels(shot, sight)
+    if not len(level) or not level.max():
+        return []
+    velocity_m_s = np.concatenate([_velocity_m_s(paths) for paths in sight.paths(shot.number, active)])
+    found = [
+        Reflector(
+            name=sight.own.names[k],
+            azimuth_deg=float(np.degrees(np.arctan2(direction[1], direction[0]))),
+            elevation_deg=float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
+            range_m=float(sight.own.delay_s[k] * shot.speed_m_s / 2),
+            level_db=float(20 * np.log10(level[k] / level.max())),
+            velocity_m_s=(float(velocity_m_s[k, 0]), float(velocity_m_s[k, 1]), float(velocity_m_s[k, 2])),
+        )
+        for k, direction in enumerate(sight.own.direction / np.linalg.norm(sight.own.direction, axis=1, keepdims=True))
+        if level[k] > _SILENT * level.max()
+    ]
+    return sorted(found, key=lambda reflector: -reflector.level_db)
+
+
+def _levels(shot: Snapshot, sight: Sight) -> Floats:
+    """Return the mean amplitude of each path over microphones and band: (path,) float64."""
+    emitter, ways = shot.sensor.emitter, []
+    if not emitter.silent:
+        ways = echoes(shot, sight.active, shot.number, Stopwatch())
+    parts = [
+        responses(shot, sight.active, paths, emitter, sight.frequency_hz, Stopwatch()) * sight.power for paths in ways
+    ]
+    return np.concatenate([np.zeros(0), *(np.abs(np.sum(part, axis=2)).mean(axis=1) for part in parts)])
+
+
+def _velocity_m_s(paths: Paths) -> Floats:
+    """Return velocities in the sensor frame: (path, axis) float64."""
+    mouth, ear, targets = paths.mouth, paths.ear, paths.targets
+    if len(targets) and not (mouth.walls or ear.walls):
+        return np.asarray((targets.velocities_m_s - ear.velocity_m_s) @ ear.axes.T)
+    leaving, arriving = np.mean(paths.leaving, axis=1), np.mean(paths.arriving, axis=1)
+    corner_m_s = targets.velocities_m_s if len(targets) else np.broadcast_to(mouth.velocity_m_s, leaving.shape)
+    longer_m_s = np.sum(leaving * (corner_m_s - mouth.velocity_m_s), axis=1)
+    longer_m_s += np.sum(arriving * (ear.velocity_m_s - corner_m_s), axis=1)
+    return np.asarray(-arriving @ ear.axes.T * (longer_m_s / 2)[:, None])

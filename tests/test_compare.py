@@ -1,0 +1,218 @@
+"""Errors against a known truth, in images whose content is known by formula."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Peak, Reflector
+from ertis_numba.settings import Array
+from ertis_numba.stages.compare import Comparison, Match, compare, errors_of
+from tests.test_detect import image_of
+
+
+def true(azimuth_deg, range_m, level_db=0.0, *, elevation_deg=0.0, name="points[0]"):
+    return Reflector(
+        name=name, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=range_m, level_db=level_db
+    )
+
+
+def ideal(*reflectors, **options):
+    """The image of reflectors as they are said to be."""
+    return image_of(
+        [(r.azimuth_deg, r.elevation_deg, r.range_m, 10 ** (r.level_db / 20)) for r in reflectors], **options
+    )
+
+
+def counts(comparison):
+    return tuple(len(getattr(comparison, name)) for name in ("matched", "missed", "false", "explained"))
+
+
+LEFT, MIDDLE, RIGHT = true(-40, 0.95, -6.0), true(3.3, 1.3), true(55.5, 1.45, -4.0)
+
+
+def test_reflectors_that_are_where_they_should_be():
+    comparison = compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])
+    assert counts(comparison) == (3, 0, 0, 0)
+    assert [match.reflector for match in comparison.matched] == [MIDDLE, RIGHT, LEFT]
+    errors = errors_of([comparison])
+    assert errors.angle_rms_deg < 0.5
+    assert abs(errors.range_bias_m) < 1e-3
+    assert errors.range_rms_m < 1e-3
+    assert errors.level_rms_db < 0.5
+
+
+def test_known_errors_are_measured():
+    """The truth is displaced by a known step from what the image shows."""
+    told = [true(r.azimuth_deg + 2, r.range_m - 0.05, r.level_db) for r in (LEFT, MIDDLE, RIGHT)]
+    exact = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])])
+    errors = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), told)])
+    assert (errors.matched, errors.missed, errors.false) == (3, 0, 0)
+    assert errors.angle_rms_deg == pytest.approx(2, abs=2 * exact.angle_rms_deg)
+    assert errors.range_bias_m == pytest.approx(0.05, abs=1e-3)
+    assert errors.range_rms_m == pytest.approx(0.05, abs=1e-3)
+
+
+def test_levels_are_below_the_strongest_found():
+    told = [true(3.3, 1.3, -3.0), true(55.5, 1.45, -9.0), true(20, 1.1, 0.0, name="not there")]
+    comparison = compare(ideal(MIDDLE, RIGHT), told)
+    assert [reflector.name for reflector in comparison.missed] == ["not there"]
+    # The image shows the second 4 dB below the first, the truth says 6.
+    assert [match.level_db for match in comparison.matched] == pytest.approx([0.0, 2.0], abs=0.3)
+
+
+def test_what_is_not_there_is_missed_and_what_should_not_be_is_false():
+    comparison = compare(ideal(LEFT, MIDDLE), [MIDDLE, RIGHT])
+    assert comparison.missed == (RIGHT,)
+    assert [peak.azimuth_deg for peak in comparison.false] == pytest.approx([-40], abs=1)
+    assert counts(comparison) == (1, 1, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("told", "found"),
+    [
+        (true(3.3, 1.3 + 0.09), True),
+        (true(3.3, 1.3 + 0.11), False),
+        (true(3.3 + 15, 1.3), True),
+        (true(3.3 + 20, 1.3), False),
+    ],
+)
+def test_gate(told, found):
+    assert counts(compare(ideal(MIDDLE), [told])) == ((1, 0, 0, 0) if found else (0, 1, 1, 0))
+
+
+def test_two_at_the_same_place_are_one_found_and_one_missed():
+    twin = true(3.3, 1.3, -1.0, name="twin")
+    comparison = compare(ideal(MIDDLE), [MIDDLE, twin])
+    assert counts(comparison) == (1, 1, 0, 0)
+
+
+def test_as_many_as_possible_are_assigned():
+    """The nearest peak of the one in between is the only one of its neighbour."""
+    image = ideal(true(0, 1.10), true(0, 1.20))
+    comparison = compare(image, [true(0, 1.16, name="between"), true(0, 1.24, name="behind")])
+    assert counts(comparison) == (2, 0, 0, 0)
+    assert [match.range_m for match in comparison.matched] == pytest.approx([-0.06, -0.04], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        true(20, 1.7, 6.0),  # beyond the last range
+        true(20, 0.7, 6.0),
+        true(20, 1.0, -32.0),  # too weak
+        true(20, 1.0, elevation_deg=25.0),  # out of the plane
+        true(160, 1.0),  # behind the array
+    ],
+    ids=["far", "near", "weak", "above", "behind"],
+)
+def test_what_the_image_cannot_show_is_not_missed(hidden):
+    assert counts(compare(ideal(MIDDLE), [hidden, MIDDLE])) == (1, 0, 0, 0)
+
+
+def test_plane_array_shows_what_is_behind_it_in_front():
+    behind = true(180 - 3.3, 1.3)
+    comparison = compare(ideal(MIDDLE, LEFT), [behind, LEFT])
+    assert counts(comparison) == (1, 0, 0, 1)
+    assert comparison.explained[0].azimuth_deg == pytest.approx(3.3, abs=0.5)
+
+
+def test_mirror_image_of_a_reflector_that_counts():
+    """In a grid that goes around, a plane array shows one reflector twice."""
+    image = ideal(MIDDLE, directions="3d:2000")
+    around = image.replace(
+        azimuth_rad=np.concatenate([image.azimuth_rad, np.pi - image.azimuth_rad]),
+        elevation_rad=np.tile(image.elevation_rad, 2),
+        energy=np.concatenate([image.energy, np.float32(0.999) * image.energy]),
+    )
+    assert counts(compare(around, [MIDDLE]))[:3] == (1, 0, 0)
+
+
+def test_side_lobes_of_what_is_out_of_the_plane_are_explained():
+    above = true(20, 1.0, elevation_deg=40.0)
+    comparison = compare(ideal(above, MIDDLE), [above, MIDDLE])
+    assert counts(comparison)[:3] == (1, 0, 0)
+    assert comparison.explained
+    assert counts(compare(ideal(above, MIDDLE), [MIDDLE]))[2]
+
+
+def test_weak_ones_explain_peaks_and_are_not_missed():
+    weak = true(-40, 0.95, -10.3)
+    shown = true(-40, 0.95, -9.7)  # by chance a little stronger in the image
+    assert counts(compare(ideal(MIDDLE, shown), [MIDDLE, weak], min_level_db=-10)) == (1, 0, 0, 1)
+
+
+def test_strong_one_that_is_shown_weaker_is_found():
+    shown = true(-40, 0.95, -11)
+    assert counts(compare(ideal(MIDDLE, shown), [MIDDLE, true(-40, 0.95, -9)], min_level_db=-10)) == (1 + 1, 0, 0, 0)
+
+
+def test_level_counts_from_the_strongest_that_counts():
+    """What is behind the image does not make the others too weak."""
+    told = [true(0, 9.0, 0.0), true(3.3, 1.3, -35.0), true(55.5, 1.45, -39.0)]
+    assert counts(compare(ideal(MIDDLE, RIGHT), told)) == (2, 0, 0, 0)
+
+
+def test_solid_angle():
+    given = [true(-21.7, 1.0, elevation_deg=13.2), true(30.1, 1.3, -6.0, elevation_deg=-41.0)]
+    comparison = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), given, min_level_db=-12)
+    assert counts(comparison) == (2, 0, 0, 0)
+    assert errors_of([comparison]).angle_rms_deg < 0.7
+    told = [true(-21.7, 1.0, elevation_deg=16.2), given[1]]
+    match = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), told, min_level_db=-12).matched[0]
+    assert match.angle_deg == pytest.approx(3, abs=0.5)
+
+
+def test_planar_image_is_about_azimuth_only():
+    comparison = compare(ideal(MIDDLE), [true(3.3, 1.3, elevation_deg=4.0)])
+    assert comparison.matched[0].angle_deg < 0.2
+
+
+def test_one_microphone_shows_no_direction():
+    image = ideal(MIDDLE)
+    one = image.settings.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
+    comparison = compare(image.replace(settings=one), [true(-90, 1.3)])
+    assert counts(comparison)[:2] == (1, 0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_nothing_to_find(noise):
+    comparison = compare(image_of([], noise=noise), [])
+    assert counts(comparison)[:2] == (0, 0)
+    assert len(comparison.false) == (100 if noise else 0)  # noise alone is not listed without end
+    assert counts(compare(image_of([]), [MIDDLE])) == (0, 1, 0, 0)
+
+
+@pytest.mark.parametrize("n_ranges", [1, 2, 3])
+def test_small_images(n_ranges):
+    image = ideal(MIDDLE)
+    small = image.replace(energy=image.energy[:, :n_ranges].copy(), range_m=image.range_m[:n_ranges])
+    assert counts(compare(small, [MIDDLE]))[:2] == (0, 0)
+
+
+def test_errors_over_several_images():
+    first, second = compare(ideal(MIDDLE), [MIDDLE]), compare(ideal(MIDDLE), [RIGHT])
+    errors = errors_of([first, second])
+    assert (errors.measurements, errors.matched, errors.missed, errors.false) == (2, 1, 1, 1)
+    peak = Peak(azimuth_deg=0.0, elevation_deg=0.0, range_m=1.0, level_db=0.0)
+    matches = [
+        Match(reflector=MIDDLE, peak=peak, angle_deg=angle, range_m=range_m, level_db=level)
+        for angle, range_m, level in [(3.0, 0.01, 1.0), (4.0, -0.02, -2.0)]
+    ]
+    known = [Comparison(matched=(match,), missed=(), false=(), explained=()) for match in matches]
+    errors = errors_of(known)
+    assert errors.angle_rms_deg == pytest.approx(math.sqrt(12.5))
+    assert errors.range_bias_m == pytest.approx(-0.005)
+    assert errors.range_rms_m == pytest.approx(math.sqrt(0.00025))
+    assert errors.level_rms_db == pytest.approx(math.sqrt(2.5))
+
+
+def test_errors_of_nothing_are_none():
+    errors = errors_of([compare(ideal(MIDDLE), [RIGHT])])
+    assert {errors.angle_rms_deg, errors.range_bias_m, errors.range_rms_m, errors.level_rms_db} == {None}
+
+
+def test_refuses():
+    with pytest.raises(ArgumentError, match="min_level_db is 3; give a number from -1000 to 0"):
+        compare(ideal(MIDDLE), [], min_level_db=3.0)
