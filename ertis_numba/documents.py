@@ -3,6 +3,7 @@
 A structure checks itself once, when it is made, in its ``__post_init__``. Unknown keys are refused.
 """
 
+import re
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +14,9 @@ from ertis_numba import checks
 from ertis_numba.errors import SettingsError
 
 __all__ = ["Document", "Table"]
+
+_HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
+_KEY = re.compile(r"\s*([\w-]+)\s*[=.]")
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -46,9 +50,15 @@ class Document(Table, frozen=True, kw_only=True):
         """
         try:
             return msgspec.toml.decode(text, type=cls)
-        except msgspec.DecodeError as error:  # ValidationError is one, too
-            reason = str(error).replace("Object contains unknown field", "unknown key").replace("$.", "")
-            raise SettingsError(f"{source or cls.__name__.lower()}: {reason}; correct it or take it out") from error
+        except msgspec.DecodeError as error:
+            place = source or cls.__name__.lower()
+            reason, _, path = str(error).replace("Object contains unknown field", "unknown key").partition(" - at `$")
+            if isinstance(error, msgspec.ValidationError):  # syntax errors name their lines themselves
+                place += f", line {_line_to_blame(cls, text, error)}"
+            if path:
+                place += f", {path.strip('.`')}"
+            remedy = "" if ";" in reason else "; correct it or take it out"
+            raise SettingsError(f"{place}: {reason}{remedy}") from error
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -70,10 +80,35 @@ class Document(Table, frozen=True, kw_only=True):
         return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
 
 
-def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+def _without_none(value: Any) -> Any:
     """TOML has no null: what is not given is left out."""
-    return {
-        key: _without_none(value) if isinstance(value, dict) else value
-        for key, value in table.items()
-        if value is not None
-    }
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(item) for item in value]
+    return value
+
+
+def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationError) -> int:
+    """Return the number of the line that an error is about, counted from 1.
+
+    That is the first line up to which the text errs in this way, or the one of the same table whose key the error
+    names.
+    """
+    lines = text.splitlines()
+    end = next((n for n in range(1, len(lines)) if _error(kind, lines[:n]) == str(error)), len(lines))
+    headers = [n for n, line in enumerate(lines, 1) if _HEADER.match(line)]
+    begin = max((n for n in headers if n <= end), default=1)
+    stop = min((n for n in headers if n > end), default=len(lines) + 1)
+    told, _, path = str(error).partition(" - at `$")
+    named = {*re.findall(r"\w+", told.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
+    keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, min(stop, len(lines) + 1)))
+    return next((n for n, key in keys if key and key[1] in named), begin if headers and begin in headers else end)
+
+
+def _error(kind: type[Document], lines: list[str]) -> str:
+    try:
+        msgspec.toml.decode("\n".join(lines), type=kind)
+    except msgspec.DecodeError as error:
+        return str(error)
+    return ""

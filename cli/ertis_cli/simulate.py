@@ -1,73 +1,177 @@
 """``ertis simulate``: a scene to a recording."""
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Peak
+    from ertis_numba.frames import Measurement, Reflector
     from ertis_numba.simulation import Scene
+    from ertis_numba.simulation.plan import Plan
+    from ertis_numba.simulation.render import Simulator
     from ertis_numba.storage import Truth
 
 __all__ = ["simulate"]
+
+_ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
 
 @click.command()
 @options.input_file("SCENE.toml")
 @options.output("Recording to write; SCENE.h5 beside the scene by default.")
-@click.option("--count", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Measurements.")
+@click.option(
+    "--count", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor; the scene's own by default."
+)
 @click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides noise; the scene's own by default.")
+@options.sensor("Render this sensor only; all by default.")
+@click.option(
+    "--tolerance-db",
+    type=float,
+    metavar="DB",
+    help="Leave out effects that change no image by more; the scene's own, 0.1, by default.",
+)
+@click.option("--explain", is_flag=True, help="Print a table of effects: on or off, why, and what they cost.")
 @options.force
 @options.quiet
 @options.as_json
 def simulate(
-    *, path: Path, target: Path | None, count: int, seed: int | None, force: bool, quiet: bool, as_json: bool
+    *,
+    path: Path,
+    target: Path | None,
+    count: int | None,
+    seed: int | None,
+    sensor: str | None,
+    tolerance_db: float | None,
+    explain: bool,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Turn a scene into a recording.
 
-    The recording holds the words that the scene's sensor would record, the scene itself, and where an
-    image should show each reflector. Scene, seed and number of the measurement decide every bit.
+    The recording holds the words that the scene's sensors would record, the scene itself, and where an
+    image should show each reflector. Only the effects that the scene calls for are simulated. Scene, seed,
+    sensor and number of the measurement decide every bit.
     """
-    from ertis_numba.simulation import load_scene, true_peaks
+    from ertis_numba.simulation import load_scene
     from ertis_numba.storage import check_target, write_recording
 
+    changes = {"count": count, "seed": seed, "tolerance_db": tolerance_db}
     scene = load_scene(path)
-    if seed is not None:
-        scene = scene.replace(seed=seed)
+    scene = scene.replace(**{name: value for name, value in changes.items() if value is not None})
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
-    peaks = true_peaks(scene)
+    names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
     with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
-        from ertis_numba.simulation.render import render
+        from ertis_numba.simulation.plan import make_plan
+        from ertis_numba.simulation.render import Simulator
 
-        first = render(scene)
-    rest = (render(scene, index) if index else first for index in range(count))
-    with options.progress(rest, length=count, label="simulating", quiet=quiet) as shown:
-        write_recording(target, shown, overwrite=force, source=path.name, truth=_truth(scene, peaks, count))
-    options.say(
-        f"{target}: {options.counted(count, 'measurement')}, {options.counted(len(peaks), 'reflector')}", quiet=quiet
+        plan = make_plan(scene)
+        simulators = [Simulator(scene, sensor=name, plan=plan) for name in names]
+        firsts = [simulator.render(0) for simulator in simulators]
+        if explain:  # costs are those of calls that compile nothing
+            for simulator in simulators:
+                simulator.clock.cost_ms.clear()
+            firsts = [simulator.render(0) for simulator in simulators]
+    truth = {simulator.sensor.name: _truth(simulator) for simulator in simulators}
+    shown = options.progress(
+        _measurements(simulators, firsts), length=scene.count * len(names), label="simulating", quiet=quiet
     )
+    with shown as measurements:
+        write_recording(
+            target,
+            measurements,
+            overwrite=force,
+            source=path.name,
+            truth=truth,
+            mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
+        )
+    options.say(_summary(target, scene, truth), quiet=quiet)
+    effects = _effects(plan, simulators)
     if as_json:
-        reflectors = [{name: getattr(peak, name) for name in peak.__slots__} for peak in peaks]
-        options.print_json({"output": str(target), "measurements": count, "seed": scene.seed, "reflectors": reflectors})
+        options.print_json(_report(target, scene, truth) | ({"effects": effects} if explain else {}))
+    elif explain:
+        _print(effects)
 
 
-def _truth(scene: "Scene", peaks: "list[Peak]", count: int) -> "Truth":
-    import numpy as np
+def _measurements(simulators: "Sequence[Simulator]", firsts: "Sequence[Measurement]") -> "Iterator[Measurement]":
+    """Yield what sensors measure together, one sensor after the other."""
+    yield from firsts
+    for index in range(1, simulators[0].scene.count):
+        for simulator in simulators:
+            yield simulator.render(index)
 
+
+def _truth(simulator: "Simulator") -> "Truth":
     from ertis_numba.storage import Truth
 
-    def column(name: str) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-        return np.tile(np.array([getattr(peak, name) for peak in peaks], dtype=np.float64), (count, 1))
+    scene = simulator.scene
+    reflectors = [tuple(simulator.reflectors(0))] * scene.count
+    if scene.moves:
+        reflectors[1:] = [tuple(simulator.reflectors(index)) for index in range(1, scene.count)]
+    return Truth(scene=scene.to_toml(), seed=scene.seed, reflectors=tuple(reflectors))
 
-    return Truth(
-        scene=scene.to_toml(),
-        seed=scene.seed,
-        azimuth_rad=np.radians(column("azimuth_deg")),
-        elevation_rad=np.radians(column("elevation_deg")),
-        range_m=column("range_m"),
-        level_db=column("level_db"),
-    )
+
+def _mounting(simulator: "Simulator") -> Any:
+    """Return where a sensor is when the first measurement begins, and how it is turned."""
+    return simulator.sensor.path().position_at(0.0), simulator.sensor.quaternion()
+
+
+def _effects(plan: "Plan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
+    """Return what ``--explain`` tells of each effect; costs are those of one measurement of one sensor."""
+    rendered = len(simulators) * simulators[0].scene.count
+    return [
+        {
+            "name": verdict.name,
+            "on": verdict.on,
+            "forced": verdict.forced,
+            "reason": verdict.reason,
+            "estimate_db": None if verdict.estimate_db is None else round(verdict.estimate_db, 6),
+            "cost_ms": round(sum(simulator.clock.cost_ms[verdict.name] for simulator in simulators) / rendered, 3),
+        }
+        for verdict in plan.verdicts
+    ]
+
+
+def _print(effects: list[dict[str, Any]]) -> None:
+    click.echo(_ROW.format(name="effect", state="", estimate="change", cost="cost", reason="why"))
+    for effect in effects:
+        estimate = effect["estimate_db"]
+        click.echo(
+            _ROW.format(
+                name=effect["name"],
+                state=("on" if effect["on"] else "off") + ("*" if effect["forced"] else ""),
+                estimate="" if estimate is None else f"{estimate:.2g} dB",
+                cost=f"{effect['cost_ms']:.1f} ms" if effect["on"] else "",
+                reason=effect["reason"],
+            )
+        )
+    if any(effect["forced"] for effect in effects):
+        click.echo("* as the scene says, whatever the estimate")
+
+
+def _summary(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> str:
+    several = f" of {options.counted(len(truth), 'sensor')}" if len(truth) > 1 else ""
+    most = max(len(reflectors) for entry in truth.values() for reflectors in entry.reflectors)
+    return f"{target}: {options.counted(scene.count, 'measurement')}{several}, {options.counted(most, 'reflector')}"
+
+
+def _report(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> dict[str, Any]:
+    return {
+        "output": str(target),
+        "measurements": scene.count,
+        "seed": scene.seed,
+        "sensors": [
+            {"sensor": name, "reflectors": [_row(reflector) for reflector in entry.reflectors[0]]}
+            for name, entry in truth.items()
+        ],
+    }
+
+
+def _row(reflector: "Reflector") -> dict[str, Any]:
+    row = {name: getattr(reflector, name) for name in reflector.__slots__}
+    return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings import Settings
 from ertis_numba.simulation.placed import Placed, Vector
 
 __all__ = ["Electronics", "Emitter", "Sensor"]
@@ -157,3 +157,16 @@ class Sensor(Settings, frozen=True, kw_only=True):
         about_y = np.array([[math.cos(pitch), 0, -math.sin(pitch)], [0, 1, 0], [math.sin(pitch), 0, math.cos(pitch)]])
         about_x = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
         return np.asarray(about_z @ about_y @ about_x, dtype=np.float64)
+
+    def quaternion(self) -> NDArray[np.float64]:
+        """Return the same turn as x, y, z, w: (4,) float64."""
+        half = [math.radians(angle) / 2 for angle in (self.yaw_deg, -self.pitch_deg, self.roll_deg)]
+        (cz, cy, cx), (sz, sy, sx) = ([function(angle) for angle in half] for function in (math.cos, math.sin))
+        return np.array(
+            [
+                sx * cy * cz - cx * sy * sz,
+                cx * sy * cz + sx * cy * sz,
+                cx * cy * sz - sx * sy * cz,
+                cx * cy * cz + sx * sy * sz,
+            ]
+        )
