@@ -273,7 +273,7 @@ class ModulatePdm(Protocol):
     Parameters
     ----------
     signals : (mic, sample) float64
-        Full scale 1; finite, and below 2³¹.
+        Full scale 1; finite, and below 2³¹. At least as long as ``out``; what is over is not used.
     mics : (octet, 8) int32
         Row of ``signals`` that each bit of the words follows, least significant first; −1 for a bit that stays 0.
         No row may stand in two places.

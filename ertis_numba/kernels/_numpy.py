@@ -179,6 +179,7 @@ def modulate_pdm(
 ) -> None:
     """See `ModulatePdm`; microphones side by side, samples one after the other."""
     c1, c2, c3, c4, r1, r2, width, limit = loop
+    signals = signals[:, : len(out)]
     noise, dither = _noise_and_dither(keys, first, signals.shape[1])
     grid = 2.0**-20
     followed = np.rint((signals + noise_rms[:, None] * _NOISE_UNIT * noise) / grid) * grid

@@ -68,10 +68,11 @@ class Modulator:
         ----------
         signals : (mic, sample) float64
             Full scale 1, finite. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
+            They may go on after the block.
         out : (sample, word) uint8, uint16, uint32 or uint64
         """
         octets = out.view(np.uint8)  # words are little-endian, as this package's processors are
-        checks.shape("signals", signals.shape, (len(self._states), len(out)))
+        checks.shape("signals", (len(signals), min(signals.shape[1], len(out))), (len(self._states), len(out)))
         checks.shape("out, in bytes,", octets.shape, (len(out), len(self._mics)))
         signals = np.ascontiguousarray(signals, dtype=np.float64)
         with self._kernels.threads(self._threads):

@@ -78,7 +78,9 @@ class Simulator:
 
     def signals(self, index: int = 0) -> NDArray[np.float64]:
         """Return what the modulators receive, their own noise apart: (mic, sample) float64, full scale 1."""
-        return np.concatenate(list(self._signals(self._shot(index), index)), axis=1)
+        n_samples = self.sensor.recording.n_samples
+        blocks = [block[:, : synthesis.BLOCK].copy() for block in self._signals(self._shot(index), index)]
+        return np.concatenate(blocks, axis=1)[:, :n_samples]
 
     def reflectors(self, index: int = 0) -> list[Reflector]:
         """Return what an image of measurement ``index`` should show, strongest first."""
@@ -105,13 +107,11 @@ class Simulator:
             band=min(self.sensor.call.high_frequency_hz / recording.pdm_rate_hz, 0.25),
             threads=self._threads,
         )
-        first = 0
-        for block in self._signals(shot.of_mics(chosen), index):
-            words = np.empty((block.shape[1], out.shape[1]), dtype=out.dtype)
+        for first, block in zip(_begins(len(out)), self._signals(shot.of_mics(chosen), index), strict=True):
+            words = np.empty_like(out[first : first + synthesis.BLOCK], order="C")
             with self.clock("modulation"):
                 modulator.process(block, out=words)
             out[first : first + len(words)] = words
-            first += len(words)
 
     def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
         active, recording = self.plan.active, self.sensor.recording
@@ -134,19 +134,17 @@ class Simulator:
                 ("interference", noise_of(shot, noise, (*seed, 1 + number)))
                 for number, noise in enumerate(self.scene.noises)
             ]
-        first = 0
-        for block in blocks:
-            more = np.zeros_like(block) if fields or ("interference" in active and self.scene.tones) else None
-            for name, field in fields:
-                with self.clock(name):
-                    field.add_to(more, first)
-            if "interference" in active:
+        tones = self.scene.tones if "interference" in active else ()
+        for first, block in zip(_begins(recording.n_samples), blocks, strict=True):
+            if fields or tones:
+                more = np.zeros((len(block), min(synthesis.BLOCK, recording.n_samples - first)))
+                for name, field in fields:
+                    with self.clock(name):
+                        field.add_to(more, first)
                 with self.clock("interference"):
-                    for tone in self.scene.tones:
+                    for tone in tones:
                         effect("interference", "add_tone")(shot, tone, more, first)
-            if more is not None:
-                block += gain[:, None] * more  # noqa: PLW2901  ours, and used once
-            first += block.shape[1]
+                block[:, : more.shape[1]] += gain[:, None] * more
             yield block
 
     def _noise_rms(self) -> float:
@@ -173,6 +171,10 @@ class Simulator:
 def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measurement:
     """Return one measurement of a scene, of its first sensor by default; see `Simulator` for more of them."""
     return Simulator(scene, sensor=sensor).render(index)
+
+
+def _begins(n_samples: int) -> range:
+    return range(0, n_samples, synthesis.BLOCK)
 
 
 def _part(layout: Layout, part: slice) -> Layout:

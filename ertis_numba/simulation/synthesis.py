@@ -23,6 +23,7 @@ BLOCK = 32_768
 NODE_HZ = 1000.0
 """Filters are evaluated so far apart and run straight between: patterns of pistons of 20 cm hold to 1 %."""
 _RING = 2048  # samples that a filter may ring before and after a call
+_STILL = 1e-12  # a stretch that no record is long enough to show
 _DEAF = 10 ** (-90 / 20)  # what lies so far below the top of a call's spectrum is left out
 
 
@@ -42,40 +43,42 @@ def highest_hz(call: Call, rate_hz: float) -> float:
 def signals(
     arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, clock: Stopwatch
 ) -> Iterator[Floats]:
-    """Yield the signals of blocks of the record: (mic, sample) float64 each.
+    """Yield the signals of one block of the record after the other: (mic, sample) float64.
 
     Every block holds the calls that begin in it, as one spectrum: ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. So delays are
     exact, filters are products, and of the spectrum only the bins that a call occupies are computed.
-    What a call leaves over its block goes to the next ones.
+    What a call leaves over its block goes to the next ones. An array that was yielded is used again, and it may go
+    on after the block of `BLOCK` samples.
     """
     delay_samples = [entry.delay_s * rate_hz for entry in arrived]
+    # What begins before the record wraps to the end of the first transform, where nothing is read.
     before = _RING + max((math.ceil(max(0.0, -delay.min(initial=0.0))) for delay in delay_samples), default=0)
     n_fft = _length(arrived, delay_samples, rate_hz, before)
     first_block = [
         np.maximum(np.floor((delay.min(axis=1) - _RING) / BLOCK), 0.0).astype(int) for delay in delay_samples
     ]
-    rest = np.zeros((n_mics, 0))
-    for number, begin in enumerate(range(0, n_samples, BLOCK)):
-        spectra: NDArray[np.complex128] | None = None
+    spectra = np.zeros((n_mics, n_fft // 2 + 1), dtype=np.complex128)
+    silence = np.zeros((n_mics, BLOCK))
+    rest = silence[:, :0]
+    for number in range(-(-n_samples // BLOCK)):
+        n_bins = 0
         for entry, delay, blocks in zip(arrived, delay_samples, first_block, strict=True):
             chosen = blocks == number
             if chosen.any():
-                if spectra is None:
-                    spectra = np.zeros((n_mics, n_fft // 2 + 1), dtype=np.complex128)
                 with clock("doppler" if entry.stretch is not None else "propagation"):
-                    _add(entry, chosen, delay[chosen] - begin + before, rate_hz, n_fft, spectra)
-        size = min(BLOCK, n_samples - begin)
+                    n_bins = max(n_bins, _add(entry, chosen, delay[chosen] - number * BLOCK, rate_hz, n_fft, spectra))
         with clock("propagation"):
-            if spectra is not None:
-                sound = scipy.fft.irfft(spectra, n_fft, overwrite_x=True, workers=kernels.load("cpu").max_threads)
-                sound = sound[:, before:]
+            if n_bins:
+                sound = scipy.fft.irfft(spectra, n_fft, workers=kernels.load("cpu").max_threads)
+                spectra[:, :n_bins] = 0.0
                 sound[:, : rest.shape[1]] += rest
-                rest = sound
-            block = np.zeros((n_mics, size))
-            kept = min(size, rest.shape[1])
-            block[:, :kept] = rest[:, :kept]
-            rest = rest[:, kept:]
-        yield block
+            else:
+                sound = silence
+                sound[:, :] = 0.0
+                sound[:, : rest.shape[1]] = rest[:, :BLOCK]
+        over = sound[:, BLOCK:-before] if n_bins else rest[:, BLOCK:]
+        yield sound
+        rest = over
 
 
 def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_hz: float, before: int) -> int:
@@ -104,20 +107,24 @@ def _add(
     rate_hz: float,
     n_fft: int,
     spectra: NDArray[np.complex128],
-) -> None:
+) -> int:
+    """Add some paths to the spectra of their block; return how many bins they occupy."""
     n_bins = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
     out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
-    nodes_per_bin = rate_hz / n_fft / NODE_HZ
-    turns, amplitude = delay_samples / n_fft, entry.amplitude[chosen]
-    add_paths = kernels.load("cpu").add_paths
-    if entry.stretch is None:
-        add_paths(_spectrum(entry.call, rate_hz, n_fft)[None, :n_bins], turns, amplitude, 0, nodes_per_bin, out)
-    else:
-        for path, stretch in enumerate(entry.stretch[chosen]):
-            call = _stretched(entry.call, stretch, rate_hz, n_fft, n_bins)
-            one = slice(path, path + 1)
-            add_paths(call, turns[one], amplitude[one], 0, nodes_per_bin, out)
+    turns, amplitude = delay_samples / n_fft, np.ascontiguousarray(entry.amplitude[chosen])
+    add_paths, nodes_per_bin = kernels.load("cpu").add_paths, rate_hz / n_fft / NODE_HZ
+    still = np.ones(len(turns), dtype=np.bool_)
+    if entry.stretch is not None:
+        stretch = entry.stretch[chosen]
+        still = np.abs(stretch - 1).max(axis=1) < _STILL
+        for path in np.flatnonzero(~still):
+            call = _stretched(entry.call, stretch[path], rate_hz, n_fft, n_bins)
+            add_paths(call, turns[[path]], amplitude[[path]], 0, nodes_per_bin, out)
+    if still.any():
+        call = _spectrum(entry.call, rate_hz, n_fft)[None, :n_bins]
+        add_paths(call, turns[still], amplitude[still], 0, nodes_per_bin, out)
     spectra[:, :n_bins] += out
+    return n_bins
 
 
 @functools.lru_cache(maxsize=8)

@@ -83,8 +83,8 @@ def _run(signals, rows, counters, scales, states, loop, octets, masks, out):
         if scales[0, lane] != 0.0:
             noisy = True
     s1, s2, s3, s4 = load(states, 0), load(states, 1), load(states, 2), load(states, 3)
-    for begin in range(0, signals.shape[1], _TILE):
-        count = min(_TILE, signals.shape[1] - begin)
+    for begin in range(0, out.shape[0], _TILE):
+        count = min(_TILE, out.shape[0] - begin)
         _fill_tile(signals, rows, begin, count, tile)
         for n in range(count):
             z = _hashed(counter)
