@@ -14,6 +14,7 @@ $(VENV)/ready: setup.cfg pyproject.toml
 demo: $(VENV)/ready
 	$(BIN)/ertis process data/synthetic/reflectors.h5 --output demo.h5 --directions 2d:181 --force
 	$(BIN)/ertis peaks demo.h5 --top 5
+	$(BIN)/ertis compare demo.h5
 	$(BIN)/ertis plot demo.h5 --output demo.png --force
 
 test: $(VENV)/ready
@@ -25,8 +26,9 @@ check: $(VENV)/ready
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-data: $(VENV)/ready  ## rebuild data/synthetic from its scenes
+data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/synthetic/build.py
+	$(BIN)/python data/synthetic/gallery.py
 
 pictures: $(VENV)/ready  ## redraw the pictures of the README
 	$(BIN)/python docs/pictures/build.py

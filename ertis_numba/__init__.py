@@ -10,6 +10,12 @@
     peaks = ertis.find_peaks(image, top=5)
     ertis.plot(image, peaks=peaks).savefig("image.png")
 
+Or from a scene, whose truth is known::
+
+    simulator = ertis.Simulator(ertis.load_scene("data/synthetic/scenes/corridor.toml"))
+    image = ertis.Pipeline(simulator.sensor.settings()).process(simulator.render(0))
+    comparison = ertis.compare(image, simulator.reflectors(0))
+
 Names are loaded when they are first used: importing the package loads neither Numba nor SciPy.
 """
 
@@ -26,13 +32,14 @@ if TYPE_CHECKING:
         SettingsError,
     )
     from ertis_numba.figures import plot
-    from ertis_numba.frames import Energyscape, Measurement, Peak, Stamp
+    from ertis_numba.frames import Energyscape, Measurement, Peak, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import open_raw
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
-    from ertis_numba.simulation.render import render
-    from ertis_numba.simulation.scene import load_scene
+    from ertis_numba.simulation.render import Simulator, render
+    from ertis_numba.simulation.scene import Scene, load_scene
+    from ertis_numba.stages.compare import compare
     from ertis_numba.stages.detect import find_peaks
     from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 
@@ -48,9 +55,13 @@ __all__ = [
     "Measurement",
     "Peak",
     "Pipeline",
+    "Reflector",
+    "Scene",
     "Settings",
     "SettingsError",
+    "Simulator",
     "Stamp",
+    "compare",
     "find_peaks",
     "load_layout",
     "load_scene",
@@ -66,13 +77,14 @@ __all__ = [
 _HOMES = {
     "errors": ("ArgumentError", "DataError", "DeviceError", "ErtisError", "FormatVersionError", "SettingsError"),
     "figures": ("plot",),
-    "frames": ("Energyscape", "Measurement", "Peak", "Stamp"),
+    "frames": ("Energyscape", "Measurement", "Peak", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("open_raw",),
     "pipeline": ("Pipeline",),
     "settings": ("Settings",),
-    "simulation.render": ("render",),
-    "simulation.scene": ("load_scene",),
+    "simulation.render": ("Simulator", "render"),
+    "simulation.scene": ("Scene", "load_scene"),
+    "stages.compare": ("compare",),
     "stages.detect": ("find_peaks",),
     "storage": ("open_energyscapes", "open_recording", "write_energyscapes", "write_recording"),
 }

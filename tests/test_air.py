@@ -1,12 +1,14 @@
-"""The speed of sound against tabulated values."""
+"""The speed of sound and absorption against tabulated values."""
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.settings import Air
 
 airs = st.builds(
@@ -69,3 +71,52 @@ def test_air_of_any_kind_has_a_sensible_speed(air):
 def test_warmer_air_is_faster(air, warmer_c):
     warm = air.replace(temperature_c=min(air.temperature_c + warmer_c, 60.0), humidity_percent=0.0)
     assert sound_speed_m_s(warm) >= sound_speed_m_s(air.replace(humidity_percent=0.0))
+
+
+# ---- absorption ------------------------------------------------------------------------------------
+
+TABLE_HZ = (20e3, 25e3, 30e3, 40e3, 50e3, 60e3, 80e3, 100e3)
+
+
+@pytest.mark.parametrize(
+    ("temperature_c", "humidity_percent", "wanted_db_m"),
+    [
+        (20, 50, (0.524, 0.732, 0.937, 1.318, 1.661, 1.980, 2.606, 3.280)),
+        (25, 50, (0.464, 0.679, 0.911, 1.392, 1.861, 2.308, 3.148, 3.974)),
+        (10, 70, (0.502, 0.655, 0.793, 1.037, 1.261, 1.487, 1.986, 2.581)),
+        (0, 50, (0.253, 0.293, 0.339, 0.450, 0.590, 0.761, 1.193, 1.749)),
+        (40, 50, (0.301, 0.456, 0.641, 1.094, 1.642, 2.267, 3.675, 5.206)),
+        (20, 20, (0.506, 0.579, 0.646, 0.783, 0.940, 1.123, 1.577, 2.156)),
+        (20, 90, (0.347, 0.522, 0.722, 1.173, 1.660, 2.158, 3.149, 4.126)),
+    ],
+)
+def test_absorption_is_that_of_the_standard(temperature_c, humidity_percent, wanted_db_m):
+    """At 101.325 kPa, to all the digits of the table."""
+    air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
+    assert_allclose(absorption_db_m(air, np.array(TABLE_HZ)), wanted_db_m, atol=6e-4)
+
+
+def test_absorption_at_the_anchors_of_the_standard():
+    """ISO 9613-1, table 1: 10 °C, 10 %."""
+    air = Air(temperature_c=10, humidity_percent=10)
+    assert_allclose(1000 * absorption_db_m(air, np.array([100.0, 1000.0])), [0.585, 21.6], rtol=0.005)
+
+
+def test_absorption_is_plausible_beside_measurements():
+    """B. D. Lawrence, J. A. Simmons, JASA 71, 1982: 0.7 dB/m at 30 kHz and 8 dB/m at 200 kHz."""
+    measured_db_m = np.array([0.7, 8.0])
+    assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), [0.91, 9.24], rtol=0.005)
+    assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), measured_db_m, rtol=0.35)
+
+
+def test_dry_air_relaxes_no_oxygen():
+    """Without vapour oxygen relaxes at 24 Hz, and what is left in ultrasound is classical: it grows as f²."""
+    dry = absorption_db_m(Air(humidity_percent=0), np.array([40e3, 80e3]))
+    assert dry[1] / dry[0] == pytest.approx(4, rel=0.01)
+    assert dry[0] < absorption_db_m(Air(humidity_percent=50), np.array([40e3]))[0]
+
+
+@given(airs, st.floats(1, 1e6))
+def test_absorption_is_finite_and_rises_with_frequency(air, frequency_hz):
+    low, high = absorption_db_m(air, np.array([frequency_hz, 1.5 * frequency_hz]))
+    assert 0 < low < high < 1e5

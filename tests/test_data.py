@@ -1,8 +1,11 @@
-"""The shipped recordings: what they hold, that they can be made again, and that they show their reflectors."""
+"""The shipped recordings, made again and looked at; the scenes of the gallery, and what its page says of them."""
 
+import dataclasses
+import functools
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +15,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.simulation import Scene, load_scene, true_peaks
-from ertis_numba.simulation.render import render
+from ertis_numba.simulation import Scene, load_scene
+from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.stages.compare import compare
 from ertis_numba.stages.detect import find_peaks
 from ertis_numba.storage import open_recording
 
@@ -42,19 +47,22 @@ def test_recording_is_its_scene(name):
     with open_recording(FOLDER / f"{name}.h5") as recording:
         (measurement,) = recording
         truth = recording.truth
-    assert_array_equal(measurement.words, render(scene).words)
-    assert hashlib.sha256(measurement.words.tobytes()).hexdigest() == report["words_sha256"]
+    simulator = Simulator(scene)
+    assert_array_equal(measurement.words, simulator.render().words)
+    (told,) = report["sensors"]
+    assert hashlib.sha256(measurement.words.tobytes()).hexdigest() == told["words_sha256"]
     assert Scene.from_toml(truth.scene) == scene
     assert (truth.seed, report["seed"]) == (scene.seed, scene.seed)
-    reflectors = report["reflectors"]
-    assert [reflector["range_m"] for reflector in reflectors] == [peak.range_m for peak in true_peaks(scene)]
-    for field, stored in {
-        "azimuth_deg": np.degrees(truth.azimuth_rad),
-        "elevation_deg": np.degrees(truth.elevation_rad),
-        "range_m": truth.range_m,
-        "level_db": truth.level_db,
-    }.items():
-        assert_allclose(stored, [[reflector[field] for reflector in reflectors]], atol=1e-9)
+    reflectors = simulator.reflectors()
+    assert len(scene.points) == len(reflectors) == len(told["reflectors"])
+    (stored,) = truth.reflectors
+    for field in ("name", "azimuth_deg", "elevation_deg", "range_m", "level_db"):
+        wanted = [getattr(reflector, field) for reflector in reflectors]
+        for given in (
+            [getattr(reflector, field) for reflector in stored],
+            [row[field] for row in told["reflectors"]],
+        ):
+            assert given == wanted if field == "name" else np.allclose(given, wanted, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -65,7 +73,7 @@ def test_recording_shows_its_reflectors(name, method):
         settings = recording.settings.replace(processing=recording.settings.processing.replace(method=method))
         image = Pipeline(settings).process(recording[0])
     found = find_peaks(image, top=None)
-    expected = json.loads((FOLDER / f"{name}.json").read_text())["reflectors"]
+    expected = json.loads((FOLDER / f"{name}.json").read_text())["sensors"][0]["reflectors"]
     angle_deg, range_m, level_db = (0.2, 0.001, 0.3) if method == "fast" else (2.0, 0.01, 1.0)
     for wanted in expected:
         near = min(found, key=lambda peak: abs(peak.range_m - wanted["range_m"]) - peak.level_db / 100)
@@ -88,3 +96,60 @@ def test_make_data_makes_the_same_words(tmp_path):
         assert (tmp_path / f"{name}.json").read_text() == (FOLDER / f"{name}.json").read_text()
     sums = (tmp_path / "SHA256SUMS").read_text().splitlines()
     assert {line.split("  ")[1] for line in sums} == {f"{name}.{kind}" for name in NAMES for kind in ("h5", "json")}
+
+
+# ---- the gallery -----------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "gallery.md").read_text()
+CALLED_FOR = {
+    "corridor": {"walls", "occlusion", "doppler", "emitter_directivity"},
+    "faulty_array": {"microphone_noise", "microphone_spread", "microphone_faults"},
+    "moving_person": {"doppler", "target_size", "interference", "ambient_noise", "microphone_noise"},
+    "shelf_of_bottles": {"walls", "target_size", "emitter_directivity"},
+    "two_facing_sensors": {"cross_emission", "sync_delay", "emitter_directivity"},
+}
+SCENES = sorted(CALLED_FOR)
+
+
+def told_of(name):
+    """What the page says of a scene, between its markers."""
+    return PAGE.partition(f"<!-- scene {name} -->")[2].partition(f"<!-- /scene {name} -->")[0]
+
+
+def test_gallery_shows_all_scenes():
+    assert {path.stem for path in (FOLDER / "scenes").glob("*.toml")} == set(SCENES)
+    assert sorted(re.findall(r"^<!-- scene (\w+) -->$", PAGE, re.MULTILINE)) == SCENES
+    pictures = set(re.findall(r"\]\((pictures/gallery/\w+\.png)\)", PAGE))
+    folder = ROOT / "docs" / "pictures" / "gallery"
+    assert {ROOT / "docs" / picture for picture in pictures} == set(folder.iterdir())
+    assert max(path.stat().st_size for path in folder.iterdir()) <= 150_000
+
+
+@functools.cache
+def begun(name):
+    """The scene, and what its first measurement calls for; later ones may call for more."""
+    scene = load_scene(FOLDER / "scenes" / f"{name}.toml")
+    return scene, make_plan(scene.replace(count=1))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_gallery_tells_which_effects_a_scene_calls_for(name):
+    told = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", told_of(name), re.MULTILINE))
+    on = {effect for effect, state in told.items() if state == "on"}
+    assert CALLED_FOR[name] <= on
+    scene, plan = begun(name)
+    assert not scene.effects
+    assert plan.active <= on
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_gallery_scene_gives_sensible_images(name):
+    scene, plan = begun(name)
+    for sensor in scene.sensors:
+        simulator = Simulator(scene, sensor=sensor.name, plan=plan)
+        assert 1e-3 < np.abs(simulator.signals()).max() < 0.5  # more overloads the modulators
+        settings = sensor.settings().replace(processing=sensor.processing.replace(directions="2d:31"))
+        image = Pipeline(settings).process(dataclasses.replace(simulator.render(), settings=settings))
+        assert np.isfinite(image.energy).all()
+        found = compare(image, simulator.reflectors(), min_level_db=-6.0)
+        assert len(found.matched) > len(found.missed)

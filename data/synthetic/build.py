@@ -1,7 +1,7 @@
-"""Make the recordings of this folder from its scenes: ``make data``.
+"""Make the recordings of this folder from its scenes: a part of ``make data``.
 
 Each ``NAME.toml`` becomes ``NAME.h5`` by ``ertis simulate``, and ``NAME.json`` holds the reflectors that
-an image of it should show and the SHA-256 of its words, as little-endian bytes. The words come out the
+an image of each sensor should show and the SHA-256 of its words, as little-endian bytes. The words come out the
 same everywhere. A file also names the libraries that wrote it, so its own sum in SHA256SUMS holds for
 the file as it is shipped.
 """
@@ -38,20 +38,20 @@ def build(folder: Path) -> None:
         ]
         environment = os.environ | {"SOURCE_DATE_EPOCH": DATE}
         made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - ours
+        told = json.loads(made.stdout)
         report = {
             "scene": scene.name,
-            "seed": json.loads(made.stdout)["seed"],
-            "words_sha256": words_sha256(target),
-            "reflectors": json.loads(made.stdout)["reflectors"],
+            "seed": told["seed"],
+            "sensors": [entry | {"words_sha256": words_sha256(target, entry["sensor"])} for entry in told["sensors"]],
         }
         target.with_suffix(".json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     write_sums(folder)
 
 
-def words_sha256(path: Path) -> str:
-    """Return the SHA-256 of the words of all measurements, one after the other."""
+def words_sha256(path: Path, sensor: str) -> str:
+    """Return the SHA-256 of the words of all measurements of a sensor, one after the other."""
     digest = hashlib.sha256()
-    with open_recording(path) as recording:
+    with open_recording(path, sensor=sensor) as recording:
         for measurement in recording:
             words = measurement.words
             digest.update(words.astype(words.dtype.newbyteorder("<")).tobytes())

@@ -78,10 +78,11 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
             with clock("doppler" if "doppler" in active else own):
                 delay_s, stretch = _times(shot, active, paths)
             found.append(_arrivals(sensor.call, delay_s + start_s + late_s, gain[:, None] * amplitude, stretch))
-    if "direct_sound" in active and not shot.sensor.emitter.silent:
+    direct_db = shot.sensor.emitter.direct_sound_db
+    if "direct_sound" in active and direct_db is not None and not shot.sensor.emitter.silent:
         with clock("direct_sound"):
             paths = effect("direct_sound")(shot)
-            amplitude = _linear(shot.sensor.emitter.direct_sound_db or 0.0) * effect("spreading")(paths)
+            amplitude = _linear(direct_db) * effect("spreading")(paths)
             delay_s = effect("propagation")(paths, shot.speed_m_s)
             found.append(_arrivals(shot.sensor.call, delay_s + late_s, (gain * amplitude)[..., None], None))
     if "interference" in active:
@@ -128,7 +129,8 @@ def responses(
     clock: Stopwatch,
 ) -> Floats:
     """Return what distance, air, walls, targets and directions leave of a call: (path, mic, node) float64."""
-    amplitude = paths.reflection * _strength(paths)[:, None, None] * np.ones((*paths.second_m.shape, 1))
+    strength = _strength(paths, spreads="spreading" in active)
+    amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
     if "spreading" in active:
         with clock("spreading"):
             amplitude *= effect("spreading")(paths)[..., None]
@@ -168,12 +170,16 @@ def gains(shot: Snapshot, active: AbstractSet[str], clock: Stopwatch) -> tuple[F
     return gain, late_s
 
 
-def _strength(paths: Paths) -> Floats:
-    """Return what targets reflect: (path,) float64. From afar a sphere is a point of half of its radius."""
+def _strength(paths: Paths, *, spreads: bool) -> Floats:
+    """Return what targets reflect: (path,) float64.
+
+    From afar a sphere is a point of half of its radius, which the law of its spreading holds already.
+    """
     targets = paths.targets
     if not len(targets):
         return np.ones(1)
-    return targets.strength * np.where((targets.radius_m > 0) & (not paths.surface), targets.radius_m / 2, 1.0)
+    as_point = (targets.radius_m > 0) & (not (paths.surface and spreads))
+    return np.asarray(targets.strength * np.where(as_point, targets.radius_m / 2, 1.0))
 
 
 def _times(shot: Snapshot, active: AbstractSet[str], paths: Paths) -> tuple[Floats, Floats | None]:

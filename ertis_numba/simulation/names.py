@@ -7,6 +7,8 @@ __all__ = ["EFFECTS", "INDISPENSABLE"]
 EFFECTS: Final = {
     "propagation": "sound takes its time, to any part of a sample",
     "spreading": "amplitude falls with distance",
+    "cross_emission": "sensors hear each other's calls",
+    "sync_delay": "each sensor of the SYNC chain starts later",
     "walls": "mirror images of emitters and targets in walls",
     "occlusion": "walls stand between",
     "target_size": "spheres have a surface, discs face somewhere",
@@ -14,8 +16,6 @@ EFFECTS: Final = {
     "emitter_directivity": "a piston sends ahead",
     "microphone_directivity": "a port hears ahead",
     "doppler": "motion shifts and stretches the call",
-    "cross_emission": "sensors hear each other's calls",
-    "sync_delay": "each sensor of the SYNC chain starts later",
     "direct_sound": "microphones hear the emitter beside them",
     "interference": "tones, noise and other sonars",
     "ambient_noise": "noise from everywhere",

@@ -7,7 +7,7 @@ to act upon.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import absorption_db_m
 from ertis_numba.simulation.arrivals import effect
+from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.sight import Echoes, Sight, change_db
 
 __all__ = ["ESTIMATES", "Estimate"]
-
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,33 +29,29 @@ class Estimate:
     ----------
     change_db : float
     reason : str
+    sure : float
+        The factor by which the change may be off.
     """
 
     change_db: float
     reason: str
+    sure: float = 4.0
 
 
 def spreading(sight: Sight) -> Estimate | None:
-    """Levels by distance, against the level at 1 m."""
-    own = sight.own
-    if not len(own):
+    """Levels by distance, against those without it."""
+    if not len(sight.heard):
         return None
-    spread = sight.echoes(sight.shot.number, sight.active | {"spreading"})
-    ratio_db = 20 * np.abs(np.log10(sight.levels(spread) / np.maximum(sight.levels(own), 1e-300) + 1e-300))
-    lengths_m = own.delay_s * sight.shot.speed_m_s
-    worst = int(np.argmax(ratio_db))
-    return Estimate(
-        change_db=float(ratio_db[worst]),
-        reason=f"on a way of {lengths_m[worst]:.2f} m {own.names[worst]} changes by {ratio_db[worst]:.1f} dB",
-    )
+    longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
+    return _filtered(sight, "spreading", f"on ways of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
 
 
 def walls(sight: Sight) -> Estimate | None:
     """The strongest echo over a wall."""
     if not sight.shot.mirrors:
         return None
-    more = sight.echoes(sight.shot.number, sight.active | {"walls"})
-    new = np.array([name not in sight.own.names for name in more.names], dtype=np.bool_)
+    more = sight.echoes(sight.active | {"walls"})
+    new = np.array([name not in sight.heard.names for name in more.names], dtype=np.bool_)
     return _ghosts(sight, more, new, "heard by {name} at {range:.2f} m, {level:+.1f} dB beside what is there")
 
 
@@ -63,17 +59,18 @@ def occlusion(sight: Sight) -> Estimate | None:
     """The strongest echo that a wall hides."""
     if not sight.shot.mirrors:
         return None
-    left = sight.echoes(sight.shot.number, sight.active | {"occlusion"})
-    hidden = np.array([name not in left.names for name in sight.own.names], dtype=np.bool_)
+    left = sight.echoes(sight.active | {"occlusion"})
+    hidden = np.array([name not in left.names for name in sight.heard.names], dtype=np.bool_)
     if not hidden.any():
         return Estimate(change_db=0.0, reason="no wall stands on any way")
-    level = np.where(hidden & sight.inside(sight.own.delay_s), sight.levels(sight.own), 0.0)
+    level = hidden * sight.levels(sight.heard) * sight.reach(sight.heard.delay_s)
     worst = int(np.argmax(level))
     open_sight = Sight(sight.shot, sight.active | {"occlusion"})
-    beside = open_sight.beside(sight.own.delay_s)
+    beside = open_sight.beside(sight.heard.delay_s)
     return Estimate(
         change_db=change_db(level, beside),
-        reason=f"a wall hides {sight.own.names[worst]}"
+        sure=5.0,
+        reason=f"a wall hides {sight.heard.names[worst]}"
         + (f" and {int(hidden.sum()) - 1} more" if hidden.sum() > 1 else ""),
     )
 
@@ -88,17 +85,12 @@ def target_size(sight: Sight) -> Estimate | None:
 
 def absorption(sight: Sight) -> Estimate | None:
     """Absorption over the longest way."""
-    if not len(sight.own):
+    if not len(sight.heard):
         return None
-    own = sight.own
+    own = sight.heard
     from_air = absorption_db_m(sight.shot.sensor.air, sight.frequency_hz)
     length_m = own.delay_s * sight.shot.speed_m_s
-    after = Echoes(
-        names=own.names,
-        gain=own.gain * 10 ** (-length_m[:, None] * from_air / 20),
-        delay_s=own.delay_s,
-        direction=own.direction,
-    )
+    after = replace(own, gain=own.gain * 10 ** (-length_m[:, None] * from_air / 20))
     longest_m = float(np.max(length_m, where=sight.shown, initial=0.0))
     return _filtered(
         sight,
@@ -108,26 +100,27 @@ def absorption(sight: Sight) -> Estimate | None:
 
 
 def emitter_directivity(sight: Sight) -> Estimate | None:
-    """How far off the emitter's axis the targets are."""
-    diameter_m = sight.shot.sensor.emitter.diameter_m
-    if not (diameter_m and len(sight.own)):
+    """How far off the emitters' axes the targets are."""
+    sensors = sight.shot.scene.sensors
+    diameter_m = max((sensors[number].emitter.diameter_m for number in sight.emitters(sight.active)), default=0.0)
+    if not (diameter_m and len(sight.heard)):
         return None
     return _filtered(
         sight,
         "emitter_directivity",
-        f"a piston of {1000 * diameter_m:g} mm changes {{name}} by {{change:.2f}} dB",
+        f"a piston of {1000 * diameter_m:.3g} mm changes {{name}} by {{change:.2f}} dB",
     )
 
 
 def microphone_directivity(sight: Sight) -> Estimate | None:
     """How far off the microphones' axis the sounds arrive."""
     diameter_m = sight.shot.sensor.electronics.microphone_diameter_m
-    if not (diameter_m and len(sight.own)):
+    if not (diameter_m and len(sight.heard)):
         return None
     return _filtered(
         sight,
         "microphone_directivity",
-        f"ports of {1000 * diameter_m:g} mm change {{name}} by {{change:.2f}} dB",
+        f"ports of {1000 * diameter_m:.3g} mm change {{name}} by {{change:.2f}} dB",
     )
 
 
@@ -139,50 +132,54 @@ def doppler(sight: Sight) -> Estimate | None:
     """
     shot = sight.shot
     scene = shot.scene
-    moving = [*scene.points, *scene.spheres, *scene.walls, *scene.boxes, shot.sensor.path()]
-    if not (len(sight.own) and any(thing.moves for thing in moving)):
+    moving = [*scene.points, *scene.spheres, *scene.walls, *scene.boxes, *(sensor.path() for sensor in scene.sensors)]
+    if not (len(sight.heard) and any(thing.moves for thing in moving)):
         return None
-    call = shot.sensor.call
-    rise = (1 / call.stop_frequency_hz - 1 / call.start_frequency_hz) / call.duration_s
-    coupling_s = 1 / call.start_frequency_hz / rise
     move = effect("doppler")
-    shifts_s, stretches = [], []
-    for paths in sight.paths(shot.number, sight.active):
-        delay_s, stretch = move(paths, shot.speed_m_s)
-        shift_s = delay_s - paths.length_m / shot.speed_m_s - (stretch - 1) * coupling_s
-        shifts_s.append(np.mean(shift_s, axis=1))
-        stretches.append(np.mean(stretch, axis=1))
-    shift_s, stretch = np.concatenate(shifts_s), np.concatenate(stretches)
-    own = sight.own
-    moved = Echoes(names=own.names, gain=own.gain, delay_s=own.delay_s + shift_s, direction=own.direction)
-    change = sight.envelope_change(own, moved) * sight.inside(own.delay_s)
+    shifts_s, turns_s, stretches, asides = [], [], [], []
+    for number in sight.emitters(sight.active):
+        call = scene.sensors[number].call
+        rise = (1 / call.stop_frequency_hz - 1 / call.start_frequency_hz) / call.duration_s
+        for paths in sight.paths(number, sight.active):
+            delay_s, stretch = move(paths, shot.speed_m_s)
+            late_s = delay_s - paths.length_m / shot.speed_m_s
+            coupled_s = (stretch - 1) / call.start_frequency_hz / rise
+            shifts_s.append(np.mean(late_s - coupled_s, axis=1))
+            turns_s.append(np.mean(np.abs(late_s) + np.abs(coupled_s), axis=1))
+            stretches.append(np.mean(stretch, axis=1))
+            asides.append(_aside_rad(paths, shot.speed_m_s))
+    shift_s, turn_s, stretch, aside_rad = (np.concatenate(parts) for parts in (shifts_s, turns_s, stretches, asides))
+    own = sight.heard
+    moved = replace(own, delay_s=own.delay_s + shift_s)
+    change = np.maximum(sight.envelope_change(own, moved, turn_s), sight.turn_change(own, aside_rad))
+    change *= sight.reach(own.delay_s)
     worst = int(np.argmax(np.abs(shift_s)))
     return Estimate(
         change_db=change_db(change, sight.beside(own.delay_s)),
+        sure=10.0,
         reason=f"{own.names[worst]}, coming at {-(stretch[worst] - 1) / 2 * shot.speed_m_s:.3g} m/s, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
     )
 
 
+def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
+    """Return by which angle targets move across the line of sight until the sound meets them: (path,) float64."""
+    if not len(paths.targets):
+        return np.zeros(len(paths))
+    way = paths.arriving[:, 0]
+    across_m_s = paths.targets.velocities_m_s - paths.ear.velocity_m_s
+    across_m_s = across_m_s - np.sum(across_m_s * way, axis=-1, keepdims=True) * way
+    return np.asarray(np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s / paths.second_m[:, 0])
+
+
 def cross_emission(sight: Sight) -> Estimate | None:
-    """The strongest that is heard of another sensor's call."""
-    others = effect("cross_emission")(sight.shot)
-    if not others:
+    """The strongest that is heard of another sensor's call, walls included."""
+    if not effect("cross_emission")(sight.shot):
         return None
-    worst = Estimate(change_db=0.0, reason="no other sensor can be heard")
-    for number in others:
-        foreign = sight.echoes(number, sight.active)
-        name = sight.shot.scene.sensors[number].name
-        heard = _ghosts(
-            sight,
-            foreign,
-            np.ones(len(foreign), dtype=np.bool_),
-            f"{name} is heard by {{name}} at {{range:.2f}} m, {{level:+.1f}} dB beside what is there",
-            like=_likeness(sight, number),
-        )
-        if heard.change_db > worst.change_db:
-            worst = heard
-    return worst
+    more = sight.echoes(sight.active | {"cross_emission", *(["walls"] if sight.shot.mirrors else [])})
+    own = sight.shot.sensor.name
+    foreign = np.array([_emitter(name, own) != own for name in more.names], dtype=np.bool_)
+    return _ghosts(sight, more, foreign, "{name} is heard at {range:.2f} m, {level:+.1f} dB beside what is there")
 
 
 def sync_delay(sight: Sight) -> Estimate | None:
@@ -191,16 +188,16 @@ def sync_delay(sight: Sight) -> Estimate | None:
         return None
     worst = Estimate(change_db=0.0, reason="nothing of another sensor is heard")
     for number in effect("cross_emission")(sight.shot):
-        foreign = sight.echoes(number, sight.active)
+        foreign = sight.of_emitter(number, sight.active)
         late_s = effect("sync_delay")(sight.shot, number)
-        moved = Echoes(
-            names=foreign.names, gain=foreign.gain, delay_s=foreign.delay_s + late_s, direction=foreign.direction
-        )
-        shift = sight.envelope_change(foreign, moved) * sight.inside(foreign.delay_s) * _likeness(sight, number)
+        moved = replace(foreign, delay_s=foreign.delay_s + late_s)
+        shift = sight.envelope_change(foreign, moved) * sight.reach(foreign.delay_s)
         change = change_db(shift, sight.beside(foreign.delay_s))
         if change > worst.change_db:
             name = sight.shot.scene.sensors[number].name
-            worst = Estimate(change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor")
+            worst = Estimate(
+                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=4.0
+            )
     return worst
 
 
@@ -209,20 +206,15 @@ def direct_sound(sight: Sight) -> Estimate | None:
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
-    call, speed_m_s = sight.shot.sensor.call, sight.shot.speed_m_s
-    first_m = sight.settings.processing.range_m[0]
     paths = effect("direct_sound")(sight.shot)
     amplitude = 10 ** (emitter.direct_sound_db / 20) * effect("spreading")(paths)[0]
-    over_m = sight.pulse_over_s() * speed_m_s / 2
-    if first_m > over_m:
-        return Estimate(
-            change_db=0.0, reason=f"it is over at {over_m:.2f} m, and the image begins at {first_m:.2f} m"
-        )
-    left = sight.near_field(amplitude, paths.length_m[0] / speed_m_s)
+    time_s, level = sight.near_field(amplitude, paths.length_m[0] / sight.shot.speed_m_s)
+    over_m = sight.settings.call.duration_s * sight.shot.speed_m_s / 2
     return Estimate(
-        change_db=change_db(left, sight.beside(sight.lags_s())),
-        reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, over at {over_m:.2f} m, "
-        f"while the image begins at {first_m:.2f} m ({1000 * call.duration_s:g} ms of call)",
+        change_db=change_db(level, sight.beside(time_s)),
+        reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, over at {over_m:.2f} m; "
+        f"the image begins at {sight.settings.processing.range_m[0]:.2f} m",
+        sure=10.0,
     )
 
 
@@ -245,11 +237,11 @@ def interference(sight: Sight) -> Estimate | None:
                 level = sight.of_white_noise(20 * math.log10(amplitude), coherent=True, band_hz=source.band_hz)
             else:
                 calls_s = effect("interference", "calls_of")(shot, source) + np.mean(paths.length_m) / shot.speed_m_s
-                level = amplitude * sight.likeness(source.call) * bool(np.any(sight.inside(calls_s)))
+                level = amplitude * sight.likeness(source.call) * float(np.max(sight.reach(calls_s), initial=0.0))
             if level * part > loudest:
                 loudest = level * part
                 reason = f"{kind}[{number}] is heard with {20 * math.log10(loudest / sight.floor):+.1f} dB beside the weakest"
-    return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.floor])), reason=reason)
+    return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.floor])), reason=reason, sure=6.0)
 
 
 def ambient_noise(sight: Sight) -> Estimate | None:
@@ -292,12 +284,11 @@ def microphone_faults(sight: Sight) -> Estimate | None:
     return _unequal(sight, hears[:, None] + np.zeros(len(sight.power)), f"{count} of {len(hears)} hear nothing")
 
 
-def _ghosts(sight: Sight, seen: Echoes, new: NDArray[np.bool_], wording: str, like: float = 1.0) -> Estimate:
+def _ghosts(sight: Sight, seen: Echoes, new: NDArray[np.bool_], wording: str) -> Estimate:
     """Return what new echoes add to the image."""
-    new = new & sight.inside(seen.delay_s)
     if not new.any():
-        return Estimate(change_db=0.0, reason="nothing of it comes to the ranges of the image")
-    level, beside = like * sight.levels(seen) * new, sight.beside(seen.delay_s)
+        return Estimate(change_db=0.0, reason="nothing of it arrives")
+    level, beside = sight.levels(seen) * sight.reach(seen.delay_s) * new, sight.beside(seen.delay_s)
     worst = int(np.argmax(level / beside))
     return Estimate(
         change_db=change_db(level, beside),
@@ -306,18 +297,27 @@ def _ghosts(sight: Sight, seen: Echoes, new: NDArray[np.bool_], wording: str, li
             range=seen.delay_s[worst] * sight.shot.speed_m_s / 2,
             level=20 * math.log10(max(level[worst] / beside[worst], 1e-15)),
         ),
+        sure=5.0,
     )
+
+
+def _emitter(name: str, own: str) -> str:
+    """Return whose call an echo is."""
+    sensor, colon, _ = name.partition(": ")
+    return sensor if colon else own
 
 
 def _filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
     """Return what a filter on each path, or the effect of that name, changes in the image."""
     if isinstance(after, str):
-        after = sight.echoes(sight.shot.number, sight.active | {after})
-    own = sight.own
-    ratio = sight.envelope_change(own, after) * sight.shown / sight.beside(own.delay_s, after)
+        after = sight.echoes(sight.active | {after})
+    if not len(sight.heard):
+        return Estimate(change_db=0.0, reason="nothing arrives")
+    own = sight.heard
+    ratio = sight.envelope_change(own, after) * sight.reach(own.delay_s) / sight.beside(own.delay_s, after)
     worst = int(np.argmax(ratio))
     found = 20 * math.log10(1 + ratio[worst])
-    return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found))
+    return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found), sure=5.0)
 
 
 def _noise(sight: Sight, level: float, reason: str) -> Estimate:
@@ -330,16 +330,14 @@ def _noise(sight: Sight, level: float, reason: str) -> Estimate:
 
 def _unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estimate:
     """Return what weights of microphones, (mic, node), change in the image of the echoes shown."""
-    directions = sight.own.direction[sight.shown]
-    if not len(directions):
-        return Estimate(change_db=0.0, reason="the image shows nothing that they could change")
+    directions = sight.heard.direction[sight.shown]
+    if not len(directions):  # though echoes from elsewhere may reach into it: left to a rehearsal
+        return Estimate(
+            change_db=sight.shot.scene.tolerance_db, reason=f"{reason}; the image shows nothing but side lobes"
+        )
     change = sight.beam_change(directions, weight)
     found = 20 * math.log10(1 + change)
     return Estimate(change_db=found, reason=f"{reason}: beams change by {found:.2f} dB of their reflector")
-
-
-def _likeness(sight: Sight, number: int) -> float:
-    return sight.likeness(sight.shot.scene.sensors[number].call)
 
 
 ESTIMATES: Final[dict[str, Callable[[Sight], Estimate | None]]] = {

@@ -1,6 +1,8 @@
 """Which effects a scene calls for."""
 
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from ertis_numba.simulation.snapshot import snapshot
 __all__ = ["Plan", "Verdict", "make_plan"]
 
 _INSTANTS = 9  # at which a scene in motion is asked
+_ROUNDS = 6  # two are the rule; effects that wait for each other take more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,13 +31,19 @@ class Verdict:
         By how much it changes the image; None where it cannot be left out or finds nothing to act upon.
     forced : bool
         The scene decides, whatever the estimate.
+    rehearsed : bool
+        The estimate was too close to the tolerance, so two renderings were compared: their change stands for it.
+    coupled : bool
+        It matters or not as another effect is on or off, and that one as this is; both are on to be safe.
     """
 
     name: str
     on: bool
     reason: str
-    estimate_db: float | None
+    estimate_db: float | None = None
     forced: bool = False
+    rehearsed: bool = False
+    coupled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,43 +62,71 @@ def make_plan(scene: Scene) -> Plan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
     All sensors are asked, at the beginning, at the end and in between; the greatest change counts. Effects are
-    decided one after the other, each in the light of those before it: geometry first, then what filters
-    echoes, then what adds to them.
+    estimated one after the other, each in the light of those before it: geometry first, then what filters
+    echoes, then what adds to them; and again in the light of all others, until nothing changes. Where an estimate is not sure
+    enough, the measurement where it is greatest is rendered and processed with the effect and without.
     """
-    times_s = [0.0]
+    indices = [0]
     if scene.moves and scene.count > 1:
-        times_s = list(np.unique(np.linspace(0, scene.count - 1, _INSTANTS).round()) / scene.rate_hz)
-    shots = [snapshot(scene, sensor, time_s) for sensor in scene.sensors for time_s in times_s]
-    verdicts: list[Verdict] = []
-    active: frozenset[str] = frozenset()
-    for name in EFFECTS:
-        if name in INDISPENSABLE:
-            verdict = Verdict(name=name, on=True, reason=INDISPENSABLE[name], estimate_db=None)
-        else:
-            estimates = [ESTIMATES[name](Sight(shot, active)) for shot in shots]
-            verdict = _verdict(name, [estimate for estimate in estimates if estimate is not None], scene)
-        verdicts.append(verdict)
-        if verdict.on:
-            active |= {name}
-    return Plan(tuple(verdicts))
-
-
-def _verdict(name: str, estimates: list[Estimate], scene: Scene) -> Verdict:
-    forced = scene.effects.get(name)
-    if not estimates:
-        return Verdict(
-            name=name,
-            on=bool(forced),
-            reason=f"the scene has nothing for it: {EFFECTS[name]}",
-            estimate_db=None,
-            forced=forced is not None,
+        indices = [int(index) for index in np.unique(np.linspace(0, scene.count - 1, _INSTANTS).round())]
+    verdicts: dict[str, Verdict] = {}
+    rehearsed = functools.cache(functools.partial(_rehearsed_db, scene))
+    for _ in range(_ROUNDS):
+        before = _active(verdicts)
+        for name in EFFECTS:
+            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, indices, rehearsed)
+        if _active(verdicts) == before:
+            return Plan(tuple(verdicts.values()))
+    waiting = _active(verdicts) ^ before  # one matters only with the other, which matters only without it
+    return Plan(
+        tuple(
+            replace(verdict, on=True, coupled=True) if verdict.name in waiting else verdict
+            for verdict in verdicts.values()
         )
-    worst = max(estimates, key=lambda estimate: estimate.change_db)
-    needed = worst.change_db > scene.tolerance_db
-    return Verdict(
-        name=name,
-        on=needed if forced is None else forced,
-        reason=worst.reason,
-        estimate_db=worst.change_db,
-        forced=forced is not None,
     )
+
+
+def _decided(
+    scene: Scene,
+    name: str,
+    others: frozenset[str],
+    indices: list[int],
+    rehearsed: Callable[[int, frozenset[str], str], float],
+) -> Verdict:
+    """Return the verdict on one effect beside others."""
+    if name in INDISPENSABLE:
+        return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
+    forced = scene.effects.get(name)
+    worst, index = _worst(scene, name, others, indices)
+    if worst is None:
+        reason = f"the scene has nothing for it: {EFFECTS[name]}"
+        return Verdict(name=name, on=bool(forced), reason=reason, forced=forced is not None)
+    if forced is not None:
+        return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
+    sure = not worst.change_db / worst.sure < scene.tolerance_db < worst.change_db * worst.sure
+    change_db = worst.change_db if sure else rehearsed(index, others, name)
+    return Verdict(
+        name=name, on=change_db > scene.tolerance_db, reason=worst.reason, estimate_db=change_db, rehearsed=not sure
+    )
+
+
+def _worst(scene: Scene, name: str, active: frozenset[str], indices: list[int]) -> tuple[Estimate | None, int]:
+    """Return the estimate of the greatest change, and the measurement it is about."""
+    worst, where = None, 0
+    for index in indices:
+        for sensor in scene.sensors:
+            estimate = ESTIMATES[name](Sight(snapshot(scene, sensor, index / scene.rate_hz), active))
+            if estimate is not None and (worst is None or estimate.change_db > worst.change_db):
+                worst, where = estimate, index
+    return worst, where
+
+
+def _rehearsed_db(scene: Scene, index: int, others: frozenset[str], name: str) -> float:
+    # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
+    from ertis_numba.simulation.rehearsal import rehearse  # noqa: PLC0415
+
+    return rehearse(scene, index, others, name)
+
+
+def _active(verdicts: dict[str, Verdict]) -> frozenset[str]:
+    return frozenset(verdict.name for verdict in verdicts.values() if verdict.on)

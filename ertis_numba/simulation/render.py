@@ -1,30 +1,15 @@
 """From a scene to the PDM words that its sensors would record."""
 
-from collections.abc import Iterator
-
-import numpy as np
-from numpy.typing import NDArray
-
-from ertis_numba import checks
-from ertis_numba.frames import Measurement, Reflector, Stamp
-from ertis_numba.geometry import Layout, microphones
-from ertis_numba.simulation import synthesis
-from ertis_numba.simulation.arrivals import arrivals, effect, gains
-from ertis_numba.simulation.modulator import Modulator
+from ertis_numba.frames import Measurement
+from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.scene import Scene
-from ertis_numba.simulation.snapshot import Snapshot, snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
-from ertis_numba.simulation.truth import reflectors
 
 __all__ = ["Simulator", "render"]
 
-_CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word
-_SYNC_STEP_NS = 400
 
-
-class Simulator:
-    """Renders the measurements of one sensor, with the effects that the scene calls for.
+class Simulator(Engine):
+    """Renders the measurements of one sensor with the effects that the scene calls for.
 
     Parameters
     ----------
@@ -38,151 +23,16 @@ class Simulator:
 
     Attributes
     ----------
-    scene : Scene
-    sensor : Sensor
     plan : Plan
-    clock : Stopwatch
-        What each effect has cost so far.
     """
 
     def __init__(
         self, scene: Scene, *, sensor: str | None = None, plan: Plan | None = None, threads: int | None = None
     ) -> None:
-        self.scene = scene
-        self.sensor = scene.sensor(sensor)
         self.plan = make_plan(scene) if plan is None else plan
-        self.clock = Stopwatch()
-        self._layout = microphones(self.sensor.array)
-        self._settings = self.sensor.settings()
-        self._threads = threads
-        rate_hz = self.sensor.recording.pdm_rate_hz
-        calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
-        self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
-
-    def render(self, index: int = 0) -> Measurement:
-        """Return measurement ``index``; scene, sensor and index decide every bit.
-
-        Channels without a microphone hold zeros.
-        """
-        shot = self._shot(index)
-        n_samples, n_words = self.sensor.recording.n_samples, self._layout.n_words
-        words = np.empty((n_samples, n_words), dtype=f"<u{self._layout.word_bits // 8}")
-        for channels in range(0, len(self._layout.enabled), _CHANNELS):
-            part = slice(channels, channels + _CHANNELS)
-            columns = slice(channels // self._layout.word_bits, (channels + _CHANNELS) // self._layout.word_bits)
-            self._modulate(shot, index, part, words[:, columns])
-        if "microphone_faults" in self.plan.active:
-            with self.clock("microphone_faults"):
-                effect("microphone_faults", "stick")(words.view(np.uint8), self.sensor.electronics)
-        return Measurement(words if n_words > 1 else words[:, 0], self._settings, self._stamp(shot, index))
-
-    def signals(self, index: int = 0) -> NDArray[np.float64]:
-        """Return what the modulators receive, their own noise apart: (mic, sample) float64, full scale 1."""
-        n_samples = self.sensor.recording.n_samples
-        blocks = [block[:, : synthesis.BLOCK].copy() for block in self._signals(self._shot(index), index)]
-        return np.concatenate(blocks, axis=1)[:, :n_samples]
-
-    def reflectors(self, index: int = 0) -> list[Reflector]:
-        """Return what an image of measurement ``index`` should show, strongest first."""
-        return reflectors(self._shot(index), self.plan.active)
-
-    def _shot(self, index: int) -> Snapshot:
-        checks.whole("index", index, 0)
-        return snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
-
-    def _modulate(self, shot: Snapshot, index: int, part: slice, out: NDArray[np.unsignedinteger]) -> None:
-        """Fill the words of some channels."""
-        mics = np.flatnonzero((shot.channels >= part.start) & (shot.channels < part.stop))
-        if not len(mics):
-            out[:] = 0
-            return
-        chosen = slice(mics[0], mics[-1] + 1)
-        electronics, recording = self.sensor.electronics, self.sensor.recording
-        modulator = Modulator(
-            _part(self._layout, part),
-            self._keys(index, len(shot.channels))[chosen],
-            np.full(len(mics), self._noise_rms()),
-            order=electronics.modulator_order,
-            dither=electronics.dither,
-            band=min(self.sensor.call.high_frequency_hz / recording.pdm_rate_hz, 0.25),
-            threads=self._threads,
-        )
-        for first, block in zip(_begins(len(out)), self._signals(shot.of_mics(chosen), index), strict=True):
-            words = np.empty_like(out[first : first + synthesis.BLOCK], order="C")
-            with self.clock("modulation"):
-                modulator.process(block, out=words)
-            out[first : first + len(words)] = words
-
-    def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
-        active, recording = self.plan.active, self.sensor.recording
-        arrived = arrivals(shot, active, self._node_hz, self.clock)
-        blocks = synthesis.signals(
-            arrived,
-            n_samples=recording.n_samples,
-            rate_hz=recording.pdm_rate_hz,
-            n_mics=len(shot.channels),
-            clock=self.clock,
-        )
-        gain, _ = gains(shot, active, self.clock)
-        seed = self.scene.seed, index, self.scene.sensors.index(self.sensor)
-        fields = []
-        if "ambient_noise" in active and self.scene.ambient is not None:
-            fields.append(("ambient_noise", effect("ambient_noise")(shot, self.scene.ambient, (*seed, 0))))
-        if "interference" in active:
-            noise_of = effect("interference", "noise_of")
-            fields += [
-                ("interference", noise_of(shot, noise, (*seed, 1 + number)))
-                for number, noise in enumerate(self.scene.noises)
-            ]
-        tones = self.scene.tones if "interference" in active else ()
-        for first, block in zip(_begins(recording.n_samples), blocks, strict=True):
-            if fields or tones:
-                more = np.zeros((len(block), min(synthesis.BLOCK, recording.n_samples - first)))
-                for name, field in fields:
-                    with self.clock(name):
-                        field.add_to(more, first)
-                with self.clock("interference"):
-                    for tone in tones:
-                        effect("interference", "add_tone")(shot, tone, more, first)
-                block[:, : more.shape[1]] += gain[:, None] * more
-            yield block
-
-    def _noise_rms(self) -> float:
-        level = self.sensor.electronics.noise_dbfs
-        if level is None or "microphone_noise" not in self.plan.active:
-            return 0.0
-        return float(effect("microphone_noise")(level))
-
-    def _keys(self, index: int, n_mics: int) -> NDArray[np.uint64]:
-        number = self.scene.sensors.index(self.sensor)
-        seeds = np.random.SeedSequence((self.scene.seed, index, number)).spawn(n_mics)
-        return np.array([seed.generate_state(1, np.uint64)[0] for seed in seeds])
-
-    def _stamp(self, shot: Snapshot, index: int) -> Stamp:
-        later_ns = _SYNC_STEP_NS * shot.number if "sync_delay" in self.plan.active else 0
-        return Stamp(
-            sensor=self.sensor.name,
-            sequence=index,
-            sync_count=index,
-            timestamp_ns=round(index * 1e9 / self.scene.rate_hz) + later_ns,
-        )
+        super().__init__(scene, scene.sensor(sensor), self.plan.active, threads=threads)
 
 
 def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measurement:
     """Return one measurement of a scene, of its first sensor by default; see `Simulator` for more of them."""
     return Simulator(scene, sensor=sensor).render(index)
-
-
-def _begins(n_samples: int) -> range:
-    return range(0, n_samples, synthesis.BLOCK)
-
-
-def _part(layout: Layout, part: slice) -> Layout:
-    return Layout(
-        name=layout.name,
-        positions_m=layout.positions_m[part],
-        enabled=layout.enabled[part],
-        gain=layout.gain[part],
-        delay_s=layout.delay_s[part],
-        word_bits=layout.word_bits,
-    )

@@ -72,7 +72,9 @@ class Scene(Document, frozen=True, kw_only=True):
         for name, wanted in self.effects.items():
             checks.choice("effect", name, EFFECTS)
             if name in INDISPENSABLE and not wanted:
-                raise ArgumentError(f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); take it out of effects")
+                raise ArgumentError(
+                    f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); take it out of effects"
+                )
         if not self.sensors:
             raise ArgumentError("scene has no sensors; give at least one")
         names = [sensor.name for sensor in self.sensors]

@@ -2,29 +2,34 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
-from ertis_numba.simulation.arrivals import echoes, responses
+from ertis_numba.simulation.arrivals import echoes, effect, responses
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
-from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, matched_filter, matched_guard_s
+from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, matched_filter
 
-__all__ = ["Echoes", "Sight", "change_db"]
+__all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
 _NODES = 65
-_LAG_NODES = 256  # resolves lags of several milliseconds
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among side lobes
+_SIDE_LOBE = 0.5  # of an array of a few dozen microphones
+_CUT = 0.05
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by their root mean square
-_SAME_RANGE_M = 0.05
+_TWICE = 6.0  # two renderings differ by the noise of both, which is some decibels higher at high levels
+SAME_RANGE_M = 0.05
+"""Echoes so close in range count as at the same range."""
 _MODULATOR_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}  # white noise of the same level in a call's band
 
 
@@ -50,6 +55,16 @@ class Echoes:
     def __len__(self) -> int:
         return len(self.names)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return the echoes of all parts."""
+        return cls(
+            names=tuple(name for part in parts for name in part.names),
+            gain=np.concatenate([np.zeros((0, _NODES)), *(part.gain for part in parts)]),
+            delay_s=np.concatenate([np.zeros(0), *(part.delay_s for part in parts)]),
+            direction=np.concatenate([np.zeros((0, 3)), *(part.direction for part in parts)]),
+        )
+
 
 class Sight:
     """The image of one sensor at one time, with some effects.
@@ -74,44 +89,51 @@ class Sight:
         self.frequency_hz, self.power = _band(self.settings)
 
     @functools.cached_property
-    def own(self) -> Echoes:
-        """The echoes of the sensor's own call."""
-        return self.echoes(self.shot.number, self.active)
+    def heard(self) -> Echoes:
+        """What arrives of calls: the own one, and those of other sensors where cross-emission is simulated."""
+        return self.echoes(self.active)
 
     @functools.cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which of its own echoes the image shows: (path,) bool."""
-        level = self.levels(self.own)
+        """Which echoes the image shows: (path,) bool."""
+        level = self.levels(self.heard)
         weakest = max(self.noise, float(level.max(initial=0.0)) * 10 ** (-_SHOWN_DB / 20))
-        return np.asarray((level > weakest) & self.inside(self.own.delay_s))
+        return np.asarray((level > weakest) & self.inside(self.heard.delay_s))
 
     @functools.cached_property
     def floor(self) -> float:
-        """The weakest reflector that the image shows, or its noise where it shows none."""
-        return float(np.min(self.levels(self.own)[self.shown], initial=np.inf)) if self.shown.any() else self.noise
+        """The weakest reflector that the image shows, or what noise leaves where it shows none."""
+        return float(np.min(self.levels(self.heard)[self.shown], initial=np.inf)) if self.shown.any() else self.noise
 
     @functools.cached_property
     def noise(self) -> float:
-        """Highest amplitude that the modulators' noise reaches in the image."""
-        return self.of_white_noise(_MODULATOR_DBFS[self.shot.sensor.electronics.modulator_order])
+        """What the modulators' noise changes by the tolerance already: nothing weaker can be held to it."""
+        highest = self.of_white_noise(_MODULATOR_DBFS[self.shot.sensor.electronics.modulator_order])
+        return float(_TWICE * highest / (10 ** (self.shot.scene.tolerance_db / 20) - 1))
 
-    def echoes(self, number: int, active: frozenset[str]) -> Echoes:
-        """Return the echoes of an emitter's call with other effects."""
-        found = [
-            self._seen(paths, number, active)
-            for paths in self.paths(number, active)
-        ]
-        return Echoes(
-            names=tuple(name for entry in found for name in entry.names),
-            gain=np.concatenate([np.zeros((0, _NODES)), *(entry.gain for entry in found)]),
-            delay_s=np.concatenate([np.zeros(0), *(entry.delay_s for entry in found)]),
-            direction=np.concatenate([np.zeros((0, 3)), *(entry.direction for entry in found)]),
+    def echoes(self, active: frozenset[str]) -> Echoes:
+        """Return what arrives of calls with other effects."""
+        return Echoes.joined([self.of_emitter(number, active) for number in self.emitters(active)])
+
+    def emitters(self, active: frozenset[str]) -> list[int]:
+        """Return the numbers of the sensors whose calls arrive with some effects."""
+        own = [] if self.shot.sensor.emitter.silent else [self.shot.number]
+        return own + (effect("cross_emission")(self.shot) if "cross_emission" in active else [])
+
+    def of_emitter(self, number: int, active: frozenset[str]) -> Echoes:
+        """Return what arrives of one sensor's call; another call than the own one shows but weakly."""
+        found = Echoes.joined([self._seen(paths, number, active) for paths in self.paths(number, active)])
+        if number == self.shot.number:
+            return found
+        other = self.shot.scene.sensors[number]
+        return replace(
+            found,
+            names=tuple(f"{other.name}: {name}" for name in found.names),
+            gain=self.likeness(other.call) * found.gain,
         )
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
-        """Return the ways of an emitter's call, none of a silent one's."""
-        if self.shot.scene.sensors[number].emitter.silent:
-            return []
+        """Return the ways of an emitter's call to the middle of the array."""
         return echoes(self._middle, active, number, Stopwatch())
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
@@ -130,22 +152,32 @@ class Sight:
 
     def inside(self, delay_s: Floats) -> NDArray[np.bool_]:
         """Return whether echoes lie in the image's range window: (path,) bool."""
-        first_m, last_m = self.settings.processing.range_m
-        range_m = delay_s * self.shot.speed_m_s / 2
-        return np.asarray((range_m >= first_m) & (range_m <= last_m))
+        return np.asarray(self._outside_s(delay_s) == 0)
+
+    def reach(self, delay_s: Floats) -> Floats:
+        """Return how much of echoes reaches into the range window: (path,) float64.
+
+        1 of those in it; of others the highest range side lobe of the call beyond their distance from it.
+        """
+        lag_s, envelope = _pulse(self.settings)
+        return np.asarray(np.interp(self._outside_s(delay_s), lag_s, np.maximum.accumulate(envelope[::-1])[::-1]))
+
+    def _outside_s(self, delay_s: Floats) -> Floats:
+        first_s, last_s = (2 * range_m / self.shot.speed_m_s for range_m in self.settings.processing.range_m)
+        return np.maximum(np.maximum(first_s - delay_s, delay_s - last_s), 0.0)
 
     def beside(self, delay_s: Floats, after: Echoes | None = None) -> Floats:
         """Return the strongest of the image at the ranges of some delays, at least its floor: (path,) float64.
 
         With the same echoes under another effect, the weaker of the two counts.
         """
-        level = self.levels(self.own) * self.shown
+        level = self.levels(self.heard) * self.shown
         floor = self.floor
         if after is not None:
             level = np.minimum(level, self.levels(after))
             floor = max(float(np.min(level[self.shown], initial=floor)), self.noise)
-        apart_m = np.abs(delay_s[:, None] - self.own.delay_s) * self.shot.speed_m_s / 2
-        return np.maximum(np.max(np.where(apart_m < _SAME_RANGE_M, level, 0.0), axis=1, initial=0.0), floor)
+        apart_m = np.abs(delay_s[:, None] - self.heard.delay_s) * self.shot.speed_m_s / 2
+        return np.maximum(np.max(np.where(apart_m < SAME_RANGE_M, level, 0.0), axis=1, initial=0.0), floor)
 
     def coverage(self, direction: Floats) -> Floats:
         """Return how much of a wave from a direction the best beam takes: (path,) float64, at most 1."""
@@ -154,7 +186,9 @@ class Sight:
         waves = np.exp(1j * wave * (direction @ self._positions_m.T))
         return np.asarray(np.max(np.abs(beams @ waves.T), axis=0, initial=0.0) / len(self._positions_m))
 
-    def of_white_noise(self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None) -> float:
+    def of_white_noise(
+        self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
+    ) -> float:
         """Return the highest amplitude that noise reaches in the image.
 
         Parameters
@@ -178,8 +212,10 @@ class Sight:
         """Return the amplitude of a tone in the image."""
         matched, rate_hz, n_fft = _matched(self.settings)
         place = round(frequency_hz * n_fft / rate_hz) - matched.first_bin
-        inside = 0 <= place < len(matched.values)
-        return float(amplitude * abs(matched.values[place]) / 2) if inside else 0.0
+        response = np.abs(matched.values)
+        inside = 0 <= place < len(response)
+        # Outside of the band the cut from record to window is heard.
+        return float(amplitude / 2 * (response[place] if inside else _CUT * response.max()))
 
     def likeness(self, call: Call) -> float:
         """Return the amplitude of another call, 1 at the microphones, in the image; that of the own call is 1."""
@@ -193,28 +229,26 @@ class Sight:
         spectrum[bins] = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins] * mine.values
         return float(np.abs(np.fft.ifft(spectrum)).max())
 
-    def pulse_over_s(self) -> float:
-        """Return how long after its beginning nothing of a sound that lasts as the call is left in the image."""
-        return self.settings.call.duration_s + matched_guard_s(self.settings.call)
-
-    def lags_s(self) -> Floats:
-        """Return times from the beginning of the image until the direct sound is over: (time,) float64."""
-        begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
-        return np.linspace(begin_s, max(begin_s, self.pulse_over_s()), _LAGS)
-
-    def near_field(self, amplitude: Floats, delay_s: Floats) -> Floats:
-        """Return the most that beams take, at `lags_s`, of what comes from within the array: (time,) float64.
+    def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
+        """Return what beams take at the most, after the image begins, of a sound from within the array.
 
         Parameters
         ----------
         amplitude, delay_s : (mic,) float64
+
+        Returns
+        -------
+        time_s, level : (time,) float64
         """
-        frequency_hz, power = _band(self.settings, _LAG_NODES)
+        begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
+        time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
         every = max(1, len(_directions(self.settings)) // _LAG_DIRECTIONS)
         early_s = _directions(self.settings)[::every] @ self._positions_m.T / self.shot.speed_m_s
-        wave = 2j * math.pi * frequency_hz
-        beams = np.einsum("dmf,m->df", np.exp(-wave * (delay_s + early_s)[..., None]), amplitude / len(amplitude))
-        return np.asarray(np.max(np.abs(np.exp(wave * self.lags_s()[:, None]) @ (beams * power).T), axis=1))
+        lag_s, pulse = _complex_pulse(self.settings)
+        at_s = time_s[:, None, None] - (delay_s + early_s)
+        carrier = np.exp(2j * math.pi * float(self.frequency_hz @ self.power) * at_s)
+        heard = (np.interp(at_s, lag_s, pulse.real) + 1j * np.interp(at_s, lag_s, pulse.imag)) * carrier
+        return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
     def beam_change(self, directions: Floats, weight: NDArray[np.complex128]) -> float:
         """Return by how much beams on reflectors change, beside the reflector, when microphones are weighted.
@@ -241,21 +275,44 @@ class Sight:
     def _positions_m(self) -> Floats:
         return self.shot.layout.positions_m[self.shot.channels]
 
-    def envelope_change(self, before: Echoes, after: Echoes) -> Floats:
-        """Return by how much envelopes differ at the most: (path,) float64, for the same paths with other effects."""
+    def envelope_change(self, before: Echoes, after: Echoes, turn_s: Floats | None = None) -> Floats:
+        """Return by how much the same paths with other effects change the image at the most: (path,) float64.
+
+        By their own envelopes, and, where they meet the side lobes of others, by the turn of their carriers, which is
+        that of the shift where no other is given.
+        """
         if not len(before):
             return np.zeros(0)
         shift_s = after.delay_s - before.delay_s
+        turn_s = np.abs(shift_s) if turn_s is None else turn_s
+        centre_hz = float(self.frequency_hz @ self.power)
+        turn = np.where(turn_s * centre_hz < 0.5, 2 * np.abs(np.sin(math.pi * centre_hz * turn_s)), 2.0)
         near_s = np.linspace(-1.5, 1.5, 61) / np.ptp(self.frequency_hz)
         # Beyond a few pulses the two no longer meet, and the nodes would repeat them.
         shift_s = np.clip(shift_s, -8 / np.ptp(self.frequency_hz), 8 / np.ptp(self.frequency_hz))
-        change = np.zeros(len(before))
+        change = turn * self._met(before)
         for centre_s in (np.zeros_like(shift_s), shift_s):
             time_s = centre_s[:, None] + near_s
             was = self._envelope(before.gain, time_s)
             is_now = self._envelope(after.gain, time_s - shift_s[:, None])
-            change = np.maximum(change, np.max(np.abs(is_now - was), axis=1))
-        return np.asarray(change * self.coverage(before.direction))
+            own = np.max(np.abs(is_now - was), axis=1) * self.coverage(before.direction)
+            change = np.maximum(change, own)
+        return np.asarray(change)
+
+    def turn_change(self, seen: Echoes, angle_rad: Floats) -> Floats:
+        """Return what the image changes when echoes come from a little aside: (path,) float64."""
+        aperture_m = math.sqrt(float(np.mean(np.sum(self._positions_m**2, axis=1))))
+        wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
+        return np.asarray(self.levels(seen) * np.minimum(wave * aperture_m * angle_rad, 1.0))
+
+    def _met(self, seen: Echoes) -> Floats:
+        """Return the strongest that paths and side lobes of others have in one place: (path,) float64."""
+        level, others = self.levels(seen)[:, None], self.levels(self.heard)
+        apart_s = np.abs(seen.delay_s[:, None] - self.heard.delay_s)
+        lag_s, envelope = _pulse(self.settings)
+        lobes = np.interp(apart_s, lag_s, np.maximum.accumulate(envelope[::-1])[::-1])
+        same = (apart_s == 0) & np.all(seen.direction[:, None] == self.heard.direction, axis=-1)
+        return np.max(np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes), axis=1, initial=0.0)
 
     def _envelope(self, gain: Floats, time_s: Floats) -> Floats:
         turns = np.exp(2j * math.pi * time_s[..., None] * (self.frequency_hz - self.frequency_hz.mean()))
@@ -281,13 +338,35 @@ def _matched(settings: Settings) -> tuple[MatchedFilter, float, int]:
 
 
 @functools.lru_cache(maxsize=16)
-def _band(settings: Settings, n_nodes: int = _NODES) -> tuple[Floats, Floats]:
+def _complex_pulse(settings: Settings) -> tuple[Floats, NDArray[np.complex128]]:
+    """Return the matched call without its carrier, by lag: (lag,) float64 seconds, (lag,) complex128."""
+    rate_hz = settings.signal_rate_hz
+    n_fft = 2 ** math.ceil(math.log2(8 * settings.call.duration_s * rate_hz))
+    matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
+    bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    spectrum = np.zeros(n_fft, dtype=np.complex128)
+    spectrum[bins] = np.fft.rfft(call_samples(settings.call, rate_hz=rate_hz), n_fft)[bins] * matched.values
+    lag_s = (np.arange(n_fft) - n_fft // 2) / rate_hz
+    frequency_hz, power = _band(settings)
+    carrier = np.exp(-2j * math.pi * float(frequency_hz @ power) * lag_s)
+    return lag_s, np.fft.fftshift(np.fft.ifft(spectrum)) * carrier
+
+
+@functools.lru_cache(maxsize=16)
+def _pulse(settings: Settings) -> tuple[Floats, Floats]:
+    """Return the envelope of the matched call, by lags from 0 on: both (lag,) float64."""
+    lag_s, pulse = _complex_pulse(settings)
+    middle = len(lag_s) // 2
+    return lag_s[middle:], np.abs(pulse[middle:])
+
+
+@functools.lru_cache(maxsize=16)
+def _band(settings: Settings) -> tuple[Floats, Floats]:
     """Return some frequencies of the call's band, and the share of the matched call's power at each."""
     rate_hz, n_fft = settings.signal_rate_hz, 32_768  # bins much narrower than a node
     matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
-    edges = np.linspace(*matched_band_hz(settings.call), n_nodes + 1)
+    edges = np.linspace(*matched_band_hz(settings.call), _NODES + 1)
     # S H is what the image sums; between the edges of its window H is conj(S).
     power, _ = np.histogram(frequency_hz, edges, weights=np.abs(matched.values) ** 2)
     return (edges[:-1] + edges[1:]) / 2, power / power.sum()
-

@@ -132,9 +132,7 @@ def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
     return np.asarray(scipy.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
 
 
-def _stretched(
-    call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
-) -> NDArray[np.complex128]:
+def _stretched(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int) -> NDArray[np.complex128]:
     """Return the spectra of a call whose seconds last longer or shorter: (mic, bin) complex128.
 
     Sampled as slowly as its band allows.

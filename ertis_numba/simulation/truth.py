@@ -24,21 +24,22 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
     call's band, below the strongest; its velocity is relative to the sensor, and only along the line of sight where
     walls are involved.
     """
-    sight = Sight(shot, active)
+    sight = Sight(shot, active - {"cross_emission"})
+    own = sight.heard
     level = _levels(shot, sight)
     if not len(level) or not level.max():
         return []
-    velocity_m_s = np.concatenate([_velocity_m_s(paths) for paths in sight.paths(shot.number, active)])
+    velocity_m_s = np.concatenate([_velocity_m_s(paths) for paths in sight.paths(shot.number, sight.active)])
     found = [
         Reflector(
-            name=sight.own.names[k],
+            name=own.names[k],
             azimuth_deg=float(np.degrees(np.arctan2(direction[1], direction[0]))),
             elevation_deg=float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
-            range_m=float(sight.own.delay_s[k] * shot.speed_m_s / 2),
+            range_m=float(own.delay_s[k] * shot.speed_m_s / 2),
             level_db=float(20 * np.log10(level[k] / level.max())),
             velocity_m_s=(float(velocity_m_s[k, 0]), float(velocity_m_s[k, 1]), float(velocity_m_s[k, 2])),
         )
-        for k, direction in enumerate(sight.own.direction / np.linalg.norm(sight.own.direction, axis=1, keepdims=True))
+        for k, direction in enumerate(own.direction / np.linalg.norm(own.direction, axis=1, keepdims=True))
         if level[k] > _SILENT * level.max()
     ]
     return sorted(found, key=lambda reflector: -reflector.level_db)

@@ -46,7 +46,5 @@ def _distance(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
 
 
-def _slowed(
-    way: NDArray[np.float64], velocity_m_s: NDArray[np.float64], speed_m_s: float
-) -> NDArray[np.float64]:
+def _slowed(way: NDArray[np.float64], velocity_m_s: NDArray[np.float64], speed_m_s: float) -> NDArray[np.float64]:
     return np.asarray(1 - np.sum(way * velocity_m_s, axis=-1) / speed_m_s)

@@ -1,0 +1,183 @@
+"""Draw and measure the scenes of ``scenes/`` for ``docs/gallery.md``: a part of ``make data``.
+
+Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
+``<!-- /scene NAME -->``. All else on the page is written by hand.
+"""
+
+# ruff: noqa: INP001 - a script, not a package
+
+import io
+import itertools
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+import ertis_numba as ertis
+from ertis_numba.simulation import Scene
+from ertis_numba.simulation.plan import Plan, make_plan
+from ertis_numba.stages.compare import errors_of
+
+ROOT = Path(__file__).parents[2]
+SCENES = Path(__file__).parent / "scenes"
+PAGE = ROOT / "docs" / "gallery.md"
+PICTURES = ROOT / "docs" / "pictures" / "gallery"
+Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
+_MIN_LEVELS_DB = (-10.0, -30.0)
+_MOST_MARKS = 8
+_COLOURS = 256  # of a picture: so a byte per pixel is enough
+_SHEET = (1.0, 100)  # the share of a figure's width that is shown, and dots per inch
+_FRAME = (0.76, 84)  # the same of the figures of a strip: without colour bar and list
+_IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What is shown of a scene.
+
+    Attributes
+    ----------
+    frames : tuple of (sensor, index)
+        The measurements in its picture.
+    dynamic_range_db : float
+    healthy : bool
+        Another picture shows the same with the microphones in order.
+    """
+
+    frames: tuple[tuple[str, int], ...]
+    dynamic_range_db: float = 30.0
+    healthy: bool = False
+
+
+SHOWN = {
+    "corridor": Shown(frames=(("robot", 0), ("robot", 1), ("robot", 2))),
+    "shelf_of_bottles": Shown(frames=(("gripper", 0),), dynamic_range_db=20.0),
+    "moving_person": Shown(frames=(("door", 0), ("door", 2), ("door", 4))),
+    "two_facing_sensors": Shown(frames=(("west", 0), ("east", 0)), dynamic_range_db=40.0),
+    "faulty_array": Shown(frames=(("worn", 0),), healthy=True),
+}
+"""The gallery, in its order."""
+
+
+def main() -> None:
+    """Draw the pictures and write the tables, of all scenes or of those named on the command line."""
+    PICTURES.mkdir(exist_ok=True)
+    for name in sys.argv[1:] or SHOWN:
+        scene = ertis.load_scene(SCENES / f"{name}.toml")
+        plan = make_plan(scene)
+        takes = take(scene, plan)
+        stems = [name]
+        draw(name, takes, SHOWN[name])
+        if SHOWN[name].healthy:
+            stems.append(f"{name}_healthy")
+            healthy = scene.replace(effects=_IN_ORDER)
+            draw(stems[-1], take(healthy, make_plan(healthy)), SHOWN[name])
+        pictures = [f"![{stem.replace('_', ' ')}](pictures/gallery/{stem}.png)" for stem in stems]
+        text = "\n\n".join([*pictures, effects_table(plan), errors_table(takes)])
+        PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
+
+
+def take(scene: Scene, plan: Plan) -> Takes:
+    """Return images and truth of all measurements of all sensors."""
+    takes = {}
+    for sensor in scene.sensors:
+        simulator, pipeline = ertis.Simulator(scene, sensor=sensor.name, plan=plan), ertis.Pipeline(sensor.settings())
+        takes[sensor.name] = [
+            (pipeline.process(simulator.render(index)), simulator.reflectors(index)) for index in range(scene.count)
+        ]
+    return takes
+
+
+def draw(stem: str, takes: Takes, shown: Shown) -> None:
+    """Draw the picture of a scene."""
+    figures = []
+    for sensor, index in shown.frames:
+        image, truth = takes[sensor][index]
+        found = ertis.compare(image, truth).matched
+        # What stands there itself, not what walls show of it.
+        marks = [match.peak for match in found if ">" not in match.reflector.name][:_MOST_MARKS]
+        figures.append(ertis.plot(image, dynamic_range_db=shown.dynamic_range_db, peaks=marks))
+    save(figures, PICTURES / f"{stem}.png")
+
+
+def save(figures: Sequence[Figure], path: Path) -> None:
+    """Save figures side by side."""
+    share, dpi = _SHEET if len(figures) == 1 else _FRAME
+    parts = [_raster(figure, dpi) for figure in figures]
+    widths = [round(share * part.width) for part in parts]
+    strip = Image.new("RGB", (sum(widths), parts[0].height))
+    for number, part in enumerate(parts):
+        strip.paste(part.crop((0, 0, widths[number], part.height)), (sum(widths[:number]), 0))
+    strip.quantize(_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def _raster(figure: Figure, dpi: int) -> Image.Image:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    return Image.open(file).convert("RGB")
+
+
+def effects_table(plan: Plan) -> str:
+    """Return what ``--explain`` says of the effects for which the scene has something, as Markdown."""
+    rows = [
+        (
+            f"`{verdict.name}`",
+            "on" if verdict.on else "off",
+            "" if verdict.estimate_db is None else f"{verdict.estimate_db:.2g} dB",
+            verdict.reason.replace("|", "\\|"),
+        )
+        for verdict in plan.verdicts
+        if verdict.on or verdict.estimate_db is not None
+    ]
+    return _table(("effect", "", "change", "why"), "llrl", rows)
+
+
+def errors_table(takes: Takes) -> str:
+    """Return the errors of each sensor, for two levels down to which things count, as Markdown."""
+    cells = []
+    for sensor, level_db in itertools.product(takes, _MIN_LEVELS_DB):
+        errors = errors_of(ertis.compare(image, truth, min_level_db=level_db) for image, truth in takes[sensor])
+        cells.append(
+            (
+                sensor,
+                f"−{-level_db:g} dB",
+                f"{errors.measurements}",
+                f"{errors.matched}",
+                f"{errors.missed}",
+                f"{errors.false}",
+                _number(errors.angle_rms_deg, 2, "°"),
+                _number(errors.range_bias_m, 1, " mm", 1000),
+                _number(errors.range_rms_m, 1, " mm", 1000),
+                _number(errors.level_rms_db, 2, " dB"),
+            )
+        )
+    head = ("sensor", "down to", "images", "found", "missed", "false", "angle", "range, bias", "range", "level")
+    return _table(head, "l" + 9 * "r", cells)
+
+
+def _number(value: float | None, digits: int, unit: str, scale: float = 1.0) -> str:
+    if value is None:
+        return "–"
+    text = f"{scale * value:.{digits}f}"
+    return (text.removeprefix("-") if not float(text) else text.replace("-", "−")) + unit
+
+
+def _table(head: Sequence[str], align: str, rows: Iterable[Sequence[str]]) -> str:
+    rule = [{"l": "---", "r": "---:"}[side] for side in align]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+def replaced(page: str, marker: str, text: str) -> str:
+    """Return a page with a text between its two markers."""
+    head, begin, rest = page.partition(f"<!-- {marker} -->")
+    _, end, tail = rest.partition(f"<!-- /{marker} -->")
+    if not (begin and end):
+        raise SystemExit(f"the page has no place for {marker!r}; give it <!-- {marker} --> and <!-- /{marker} -->")
+    return f"{head}{begin}\n{text}\n{end}{tail}"
+
+
+if __name__ == "__main__":
+    main()

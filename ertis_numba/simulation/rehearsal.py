@@ -1,0 +1,62 @@
+"""Two renderings compared: what an effect really changes in an image."""
+
+import math
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.scene import Scene
+from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
+from ertis_numba.simulation.snapshot import snapshot
+
+__all__ = ["image_change_db", "rehearse"]
+
+
+def rehearse(scene: Scene, index: int, others: frozenset[str], name: str) -> float:
+    """Return by how much an effect changes the images of all sensors at the most, in decibels.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : int
+        Of the measurement that is rendered.
+    others : frozenset of str
+        The other effects.
+    name : str
+    """
+    changes_db = []
+    for sensor in scene.sensors:
+        pipeline = Pipeline(sensor.settings())
+        shot = snapshot(scene, sensor, index / scene.rate_hz)
+        with_it = others | {name}
+        images = [pipeline.process(Engine(scene, sensor, active).render(index)).energy for active in (others, with_it)]
+        spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+        floor = min(Sight(shot, active).floor for active in (others, with_it))
+        changes_db.append(image_change_db(images[0], images[1], spacing_m=spacing_m, floor=floor))
+    return max(changes_db)
+
+
+def image_change_db(
+    before: NDArray[np.float32], after: NDArray[np.float32], *, spacing_m: float, floor: float
+) -> float:
+    """Return by how much two images differ at the most.
+
+    At each place the difference is taken beside the strongest, over all directions and 5 cm of range, that both
+    images have there, and at least beside ``floor``: ``20 log10(1 + |Δ| / beside)``. So what hides among
+    the side lobes of a stronger echo does not count.
+
+    Parameters
+    ----------
+    before, after : (direction, range) float32
+    spacing_m : float
+        Of the ranges.
+    floor : float
+        The weakest reflector that is to be kept.
+    """
+    both = np.minimum(before, after).max(axis=0)
+    near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(both))) + 1
+    beside = np.maximum(scipy.ndimage.maximum_filter1d(both, near), floor)
+    return float(20 * np.log10(1 + np.max(np.abs(after - before) / beside, initial=0.0)))
