@@ -76,6 +76,6 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
 def _vapour(air: Air) -> float:
     """Return the molar share of water vapour."""
     kelvin = _ZERO_C_K + air.temperature_c
-    saturation = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)
+    saturation: float = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)
     share = air.humidity_percent / 100 * saturation * _REFERENCE_PRESSURE_PA / air.pressure_pa
     return min(share, 1.0)  # hot and thin air is all steam, never more

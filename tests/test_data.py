@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import importlib.util
 import json
 import os
 import re
@@ -123,6 +124,17 @@ def test_gallery_shows_all_scenes():
     folder = ROOT / "docs" / "pictures" / "gallery"
     assert {ROOT / "docs" / picture for picture in pictures} == set(folder.iterdir())
     assert max(path.stat().st_size for path in folder.iterdir()) <= 150_000
+
+
+def test_page_without_markers_is_refused():
+    spec = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    assert sorted(gallery.SHOWN) == SCENES
+    told = gallery.replaced("a <!-- scene x -->old<!-- /scene x --> b", "scene x", "new")
+    assert told == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"
+    with pytest.raises(SystemExit, match="the page has no place for 'scene y'; give it <!-- scene y --> and"):
+        gallery.replaced(told, "scene y", "new")
 
 
 @functools.cache

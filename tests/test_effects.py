@@ -13,11 +13,13 @@ from ertis_numba.settings import Air, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Sphere, Wall
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import (
+    BAND_HZ,
     EAR,
     SENSOR,
     SPEED_M_S,
     bits_of,
     error_db,
+    filtered,
     heard,
     line_array,
     only,

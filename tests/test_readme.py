@@ -1,4 +1,4 @@
-"""What the README says runs."""
+"""What the README and the pages on simulation say runs."""
 
 import importlib.metadata
 import os
@@ -9,9 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from ertis_cli.main import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+SIMULATION = (ROOT / "docs" / "simulation.md").read_text()
+PAGES = ("README.md", "docs/gallery.md", "docs/simulation.md", "docs/formats.md")
 
 
 @pytest.fixture
@@ -36,17 +39,38 @@ def test_python_lines(place):
     assert (place / "image.png").stat().st_size > 10_000
 
 
+def commands_in(page):
+    return re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
+
+
 def test_commands(place):
-    commands = re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", README, re.MULTILINE)
-    assert len(commands) >= 6
-    for command in commands:
+    assert {command.split()[0] for command in commands_in(README)} == {*COMMANDS} - {"bench"}
+    for command in commands_in(README):
         arguments = command.split()
         if (place / "REC.h5").exists() and "REC.h5" in arguments and arguments[0] in {"import", "simulate"}:
             (place / "REC.h5").unlink()  # each of the two ways to a recording is shown
         run(place, sys.executable, "-m", "ertis_cli.main", *arguments)
     assert (place / "picture.png").stat().st_size > 10_000
+    assert (place / "shelf.png").stat().st_size > 10_000
 
 
-def test_files_named_are_there():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        assert "://" in target or (ROOT / target).exists(), target
+def test_page_on_simulation(place):
+    (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
+    told = run(place, sys.executable, "-W", "error", "-c", code).stdout
+    assert "absorption True" in told
+    assert told.endswith("() ()\n")  # nothing missed, nothing false
+    for command in commands_in(SIMULATION):
+        told = run(place, sys.executable, "-m", "ertis_cli.main", *command.split()).stdout
+    assert "points[0]" in told
+
+
+def test_gallery_begins_as_the_readme():
+    gallery = (ROOT / "docs" / "gallery.md").read_text()
+    assert set(commands_in(gallery)) <= set(commands_in(README))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_named_are_there(page):
+    path = ROOT / page
+    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
+        assert "://" in target or (path.parent / target).exists(), target

@@ -10,15 +10,19 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.simulation import Box, Electronics, Emitter, Point, Sphere, Wall
 from ertis_numba.simulation.effects.piston import piston
 from tests.scenes import (
+    BAND_HZ,
     EAR,
     RATE_HZ,
     SENSOR,
     SPEED_M_S,
     error_db,
+    filtered,
     heard,
+    listener_and_emitter,
     scene_of,
     seen,
     sorted_ways,
+    vector,
     ways,
     written_out,
 )

@@ -1,6 +1,5 @@
 """``ertis simulate``: a scene to a recording."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +8,8 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
     from ertis_numba.frames import Measurement, Reflector
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.plan import Plan

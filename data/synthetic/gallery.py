@@ -28,13 +28,13 @@ PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
 _MOST_MARKS = 8
-_COLOURS = 256  # of a picture: so a byte per pixel is enough
-_SHEET = (1.0, 100)  # the share of a figure's width that is shown, and dots per inch
+_MOST_BYTES = 150_000  # of a picture
+_SHEET = (1.0, 92)  # the share of a figure's width that is shown, and dots per inch
 _FRAME = (0.76, 84)  # the same of the figures of a strip: without colour bar and list
 _IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
     """What is shown of a scene.
 
@@ -74,7 +74,9 @@ def main() -> None:
         if SHOWN[name].healthy:
             stems.append(f"{name}_healthy")
             healthy = scene.replace(effects=_IN_ORDER)
-            draw(stems[-1], take(healthy, make_plan(healthy)), SHOWN[name])
+            new = take(healthy, make_plan(healthy))
+            draw(stems[-1], new, SHOWN[name])
+            takes |= {f"{sensor}, as new": shots for sensor, shots in new.items()}
         pictures = [f"![{stem.replace('_', ' ')}](pictures/gallery/{stem}.png)" for stem in stems]
         text = "\n\n".join([*pictures, effects_table(plan), errors_table(takes)])
         PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
@@ -111,7 +113,9 @@ def save(figures: Sequence[Figure], path: Path) -> None:
     strip = Image.new("RGB", (sum(widths), parts[0].height))
     for number, part in enumerate(parts):
         strip.paste(part.crop((0, 0, widths[number], part.height)), (sum(widths[:number]), 0))
-    strip.quantize(_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    strip.save(path, optimize=True)
+    if path.stat().st_size > _MOST_BYTES:  # where colours are many, 256 are enough; where they are few, they show
+        strip.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def _raster(figure: Figure, dpi: int) -> Image.Image:

@@ -114,10 +114,8 @@ def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwat
             chosen = np.flatnonzero(first.exists & second.exists)
             if len(chosen) and len(first.mirrors) + len(second.mirrors) <= shot.scene.max_reflections:
                 found.append(over(first.end, second.end, shot.targets.chosen(chosen)))
-    for seen in specular:
-        if seen.exists[0] and (seen.mirrors or number != shot.number):
-            found.append(without_target(seen.end, shot.ear, shot.targets))
-    return found
+    straight = [seen.end for seen in specular if seen.exists[0] and (seen.mirrors or number != shot.number)]
+    return found + [without_target(end, shot.ear, shot.targets) for end in straight]
 
 
 def responses(

@@ -57,12 +57,10 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
     found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
     chains: list[tuple[tuple[int, ...], tuple[End, ...]]] = [((), (end,))]
     for _ in range(most):
-        chains = [
-            ((*walls, number), (*ends, reflected(ends[-1], mirror)))
-            for walls, ends in chains
-            for number, mirror in enumerate(mirrors)
-            if not walls or walls[-1] != number
-        ]
+        longer: list[tuple[tuple[int, ...], tuple[End, ...]]] = []
+        for chain in chains:
+            longer += _with_one_more(chain[0], chain[1], mirrors)
+        chains = longer
         for walls, ends in chains:
             exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m)
             if exists.any():
@@ -109,6 +107,17 @@ def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
                 crosses, _ = _crossing(start_m, stop_m, mirror)
                 stopped |= crosses
     return stopped
+
+
+def _with_one_more(
+    walls: tuple[int, ...], ends: tuple[End, ...], mirrors: Sequence[Mirror]
+) -> list[tuple[tuple[int, ...], tuple[End, ...]]]:
+    """Return a chain of images continued by each wall but the last one again."""
+    return [
+        ((*walls, number), (*ends, reflected(ends[-1], mirror)))
+        for number, mirror in enumerate(mirrors)
+        if not walls or walls[-1] != number
+    ]
 
 
 def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -39,7 +39,7 @@ class Estimate:
 
 
 def spreading(sight: Sight) -> Estimate | None:
-    """Levels by distance, against those without it."""
+    """Compare levels with those without distance."""
     if not len(sight.heard):
         return None
     longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
@@ -47,7 +47,7 @@ def spreading(sight: Sight) -> Estimate | None:
 
 
 def walls(sight: Sight) -> Estimate | None:
-    """The strongest echo over a wall."""
+    """Find the strongest echo over a wall."""
     if not sight.shot.mirrors:
         return None
     more = sight.echoes(sight.active | {"walls"})
@@ -56,7 +56,7 @@ def walls(sight: Sight) -> Estimate | None:
 
 
 def occlusion(sight: Sight) -> Estimate | None:
-    """The strongest echo that a wall hides."""
+    """Find the strongest echo that a wall hides."""
     if not sight.shot.mirrors:
         return None
     left = sight.echoes(sight.active | {"occlusion"})
@@ -76,7 +76,7 @@ def occlusion(sight: Sight) -> Estimate | None:
 
 
 def target_size(sight: Sight) -> Estimate | None:
-    """Surfaces before centres, discs that face elsewhere."""
+    """Compare surfaces with centres, and discs with points."""
     targets = sight.shot.targets
     if not (np.any(targets.radius_m) or np.any(targets.diameter_m)):
         return None
@@ -84,7 +84,7 @@ def target_size(sight: Sight) -> Estimate | None:
 
 
 def absorption(sight: Sight) -> Estimate | None:
-    """Absorption over the longest way."""
+    """Compare echoes with those through air without absorption."""
     if not len(sight.heard):
         return None
     own = sight.heard
@@ -95,12 +95,13 @@ def absorption(sight: Sight) -> Estimate | None:
     return _filtered(
         sight,
         after,
-        f"{longest_m:.2f} m of air take {from_air[0] * longest_m:.2g} to {from_air[-1] * longest_m:.2g} dB over the band",
+        f"{longest_m:.2f} m of air take {from_air[0] * longest_m:.2g} dB at the lower end of the band and "
+        f"{from_air[-1] * longest_m:.2g} dB at the upper",
     )
 
 
 def emitter_directivity(sight: Sight) -> Estimate | None:
-    """How far off the emitters' axes the targets are."""
+    """Ask how far off the emitters' axes the targets are."""
     sensors = sight.shot.scene.sensors
     diameter_m = max((sensors[number].emitter.diameter_m for number in sight.emitters(sight.active)), default=0.0)
     if not (diameter_m and len(sight.heard)):
@@ -113,7 +114,7 @@ def emitter_directivity(sight: Sight) -> Estimate | None:
 
 
 def microphone_directivity(sight: Sight) -> Estimate | None:
-    """How far off the microphones' axis the sounds arrive."""
+    """Ask how far off the microphones' axis the sounds arrive."""
     diameter_m = sight.shot.sensor.electronics.microphone_diameter_m
     if not (diameter_m and len(sight.heard)):
         return None
@@ -125,10 +126,10 @@ def microphone_directivity(sight: Sight) -> Estimate | None:
 
 
 def doppler(sight: Sight) -> Estimate | None:
-    """How far the motion of targets and sensors shifts the pulses.
+    """Ask how far the motion of targets and sensors shifts the pulses.
 
-    A call of hyperbolic frequency modulation, stretched by s, is the call shifted by ``-(s - 1) p₀ / p'``, p₀ being its first
-    period and p' the growth of its periods with time.
+    A call of hyperbolic frequency modulation, stretched by s, is the call shifted by ``-(s - 1) p₀ / p'``, p₀
+    being its first period and p' the growth of its periods with time.
     """
     shot = sight.shot
     scene = shot.scene
@@ -173,7 +174,7 @@ def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
 
 
 def cross_emission(sight: Sight) -> Estimate | None:
-    """The strongest that is heard of another sensor's call, walls included."""
+    """Find the strongest that is heard of another sensor's call, walls included."""
     if not effect("cross_emission")(sight.shot):
         return None
     more = sight.echoes(sight.active | {"cross_emission", *(["walls"] if sight.shot.mirrors else [])})
@@ -183,7 +184,7 @@ def cross_emission(sight: Sight) -> Estimate | None:
 
 
 def sync_delay(sight: Sight) -> Estimate | None:
-    """How far the calls of others shift, where they are heard."""
+    """Ask how far the calls of others shift, where they are heard."""
     if "cross_emission" not in sight.active:
         return None
     worst = Estimate(change_db=0.0, reason="nothing of another sensor is heard")
@@ -202,7 +203,7 @@ def sync_delay(sight: Sight) -> Estimate | None:
 
 
 def direct_sound(sight: Sight) -> Estimate | None:
-    """What is left of the direct sound where the image begins."""
+    """Ask what is left of the direct sound where the image begins."""
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
@@ -219,7 +220,7 @@ def direct_sound(sight: Sight) -> Estimate | None:
 
 
 def interference(sight: Sight) -> Estimate | None:
-    """The loudest of tones, noises and other sonars."""
+    """Find the loudest of tones, noises and other sonars."""
     scene, shot = sight.shot.scene, sight.shot
     if not (scene.tones or scene.noises or scene.sonars):
         return None
@@ -240,12 +241,13 @@ def interference(sight: Sight) -> Estimate | None:
                 level = amplitude * sight.likeness(source.call) * float(np.max(sight.reach(calls_s), initial=0.0))
             if level * part > loudest:
                 loudest = level * part
-                reason = f"{kind}[{number}] is heard with {20 * math.log10(loudest / sight.floor):+.1f} dB beside the weakest"
+                level_db = 20 * math.log10(loudest / sight.floor)
+                reason = f"{kind}[{number}] is heard with {level_db:+.1f} dB beside the weakest reflector"
     return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.floor])), reason=reason, sure=6.0)
 
 
 def ambient_noise(sight: Sight) -> Estimate | None:
-    """Diffuse noise against the weakest reflector."""
+    """Compare diffuse noise with the weakest reflector."""
     ambient = sight.shot.scene.ambient
     if ambient is None:
         return None
@@ -254,7 +256,7 @@ def ambient_noise(sight: Sight) -> Estimate | None:
 
 
 def microphone_noise(sight: Sight) -> Estimate | None:
-    """White noise against the weakest reflector."""
+    """Compare white noise with the weakest reflector."""
     dbfs = sight.shot.sensor.electronics.noise_dbfs
     if dbfs is None:
         return None
@@ -262,7 +264,7 @@ def microphone_noise(sight: Sight) -> Estimate | None:
 
 
 def microphone_spread(sight: Sight) -> Estimate | None:
-    """What unknown gains and delays do to main lobe and side lobes."""
+    """Ask what unknown gains and delays do to main lobe and side lobes."""
     electronics = sight.shot.sensor.electronics
     if not (electronics.gain_spread_db or electronics.delay_spread_s):
         return None
@@ -275,7 +277,7 @@ def microphone_spread(sight: Sight) -> Estimate | None:
 
 
 def microphone_faults(sight: Sight) -> Estimate | None:
-    """What missing microphones do to main lobe and side lobes."""
+    """Ask what missing microphones do to main lobe and side lobes."""
     faulty = sight.shot.sensor.electronics.faulty_channels
     if not faulty:
         return None

@@ -45,7 +45,8 @@ class Placed(Table, frozen=True, kw_only=True):
         polar = [value for value in (self.azimuth_deg, self.elevation_deg, self.range_m) if value is not None]
         if (self.position_m is not None) + bool(polar) + bool(self.waypoints) != 1:
             raise ArgumentError(
-                f"{name} has not one place; give position_m, or range_m with azimuth_deg and elevation_deg, or waypoints"
+                f"{name} has not one place; give position_m, or range_m with azimuth_deg and elevation_deg, or "
+                "waypoints"
             )
         if polar:
             if self.range_m is None:
@@ -87,7 +88,7 @@ class Placed(Table, frozen=True, kw_only=True):
         """Return the velocity at a time of the scene: (axis,) float64."""
         for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
             if before_s <= time_s < after_s:
-                return (np.array(b) - np.array(a)) / (after_s - before_s)
+                return np.asarray((np.array(b) - np.array(a)) / (after_s - before_s))
         return np.array(_STILL if self.waypoints else self.velocity_m_s)
 
     def _start_m(self) -> NDArray[np.float64]:

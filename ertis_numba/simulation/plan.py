@@ -63,8 +63,9 @@ def make_plan(scene: Scene) -> Plan:
 
     All sensors are asked, at the beginning, at the end and in between; the greatest change counts. Effects are
     estimated one after the other, each in the light of those before it: geometry first, then what filters
-    echoes, then what adds to them; and again in the light of all others, until nothing changes. Where an estimate is not sure
-    enough, the measurement where it is greatest is rendered and processed with the effect and without.
+    echoes, then what adds to them; and again in the light of all others, until nothing changes. Where an
+    estimate is not sure enough, the measurement where it is greatest is rendered and processed with the effect
+    and without.
     """
     indices = [0]
     if scene.moves and scene.count > 1:

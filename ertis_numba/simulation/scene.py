@@ -7,6 +7,8 @@ keep all PDM bits at one value.
 from pathlib import Path
 from typing import Self
 
+import msgspec
+
 from ertis_numba import checks
 from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
@@ -52,7 +54,7 @@ class Scene(Document, frozen=True, kw_only=True):
     count: int = 1
     tolerance_db: float = 0.1
     max_reflections: int = 2
-    effects: dict[str, bool] = {}
+    effects: dict[str, bool] = msgspec.field(default_factory=dict)
     sensors: tuple[Sensor, ...] = (Sensor(),)
     points: tuple[Point, ...] = ()
     spheres: tuple[Sphere, ...] = ()

@@ -177,7 +177,8 @@ class Sight:
             level = np.minimum(level, self.levels(after))
             floor = max(float(np.min(level[self.shown], initial=floor)), self.noise)
         apart_m = np.abs(delay_s[:, None] - self.heard.delay_s) * self.shot.speed_m_s / 2
-        return np.maximum(np.max(np.where(apart_m < SAME_RANGE_M, level, 0.0), axis=1, initial=0.0), floor)
+        near = np.where(apart_m < SAME_RANGE_M, level, 0.0)
+        return np.asarray(np.maximum(np.max(near, axis=1, initial=0.0), floor))
 
     def coverage(self, direction: Floats) -> Floats:
         """Return how much of a wave from a direction the best beam takes: (path,) float64, at most 1."""
@@ -312,7 +313,8 @@ class Sight:
         lag_s, envelope = _pulse(self.settings)
         lobes = np.interp(apart_s, lag_s, np.maximum.accumulate(envelope[::-1])[::-1])
         same = (apart_s == 0) & np.all(seen.direction[:, None] == self.heard.direction, axis=-1)
-        return np.max(np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes), axis=1, initial=0.0)
+        met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes)
+        return np.asarray(np.max(met, axis=1, initial=0.0))
 
     def _envelope(self, gain: Floats, time_s: Floats) -> Floats:
         turns = np.exp(2j * math.pi * time_s[..., None] * (self.frequency_hz - self.frequency_hz.mean()))

@@ -29,7 +29,7 @@ _DEAF = 10 ** (-90 / 20)  # what lies so far below the top of a call's spectrum 
 
 def node_frequencies(top_hz: float) -> Floats:
     """Return where filters are to be evaluated: (node,) float64, from 0 on."""
-    return np.arange(math.ceil(top_hz / NODE_HZ) + 1) * NODE_HZ
+    return np.asarray(np.arange(math.ceil(top_hz / NODE_HZ) + 1) * NODE_HZ, dtype=np.float64)
 
 
 @functools.cache
@@ -109,7 +109,7 @@ def _add(
     spectra: NDArray[np.complex128],
 ) -> int:
     """Add some paths to the spectra of their block; return how many bins they occupy."""
-    n_bins = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
+    n_bins: int = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
     out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
     turns, amplitude = delay_samples / n_fft, np.ascontiguousarray(entry.amplitude[chosen])
     add_paths, nodes_per_bin = kernels.load("cpu").add_paths, rate_hz / n_fft / NODE_HZ

@@ -1,0 +1,186 @@
+"""Only what the scene calls for: 200 random scenes, each effect left out and put in, and what the images say of it."""
+
+import dataclasses
+import functools
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air, Array, Call, Processing, Recording
+from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
+from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.plan import Plan, make_plan
+from ertis_numba.simulation.rehearsal import image_change_db
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import snapshot
+
+OCTET = Array(
+    layout="octet",
+    positions_m=tuple(
+        (0.0, 0.004 * (mic - 3.5) + 0.0007 * ((7 * mic) % 5 - 2), 0.004 * ((5 * mic) % 7 - 3)) for mic in range(8)
+    ),
+    word_bits=8,
+)
+BATCHES = 10
+
+
+class Dice:
+    """Seeded draws for scenes."""
+
+    def __init__(self, seed):
+        self.random = np.random.default_rng(seed)
+
+    def chance(self, part):
+        return self.random.random() < part
+
+    def between(self, low, high):
+        return float(self.random.uniform(low, high))
+
+    def decades(self, low, high):
+        return float(np.exp(self.random.uniform(np.log(low), np.log(high))))
+
+    def place(self):
+        return {
+            "azimuth_deg": self.between(-60, 60),
+            "elevation_deg": self.between(-3, 3),
+            "range_m": self.between(0.35, 1.05),
+        }
+
+
+def random_scene(seed):
+    """A scene of some of everything, from far too weak to matter to strong, that overloads no modulator."""
+    dice = Dice(seed)
+    points = []
+    for _ in range(dice.random.integers(1, 4)):
+        place = dice.place()
+        more = {}
+        if dice.chance(0.3):
+            more["velocity_m_s"] = tuple((dice.random.normal(size=3) * dice.decades(1e-3, 3)).tolist())
+        if dice.chance(0.3):
+            more["diameter_m"] = dice.decades(1e-3, 0.1)
+        echo_db = dice.between(-18, -3) + 40 * np.log10(place["range_m"])
+        points.append(Point(**place, strength_db=float(echo_db), **more))
+    spheres = []
+    if dice.chance(0.3):
+        place, radius_m = dice.place(), dice.decades(2e-3, 0.2)
+        echo_db = dice.between(-18, -3) + 40 * np.log10(place["range_m"]) - 20 * np.log10(radius_m / 2)
+        spheres.append(Sphere(**place, radius_m=radius_m, reflection_db=min(0.0, float(echo_db))))
+    walls = []
+    if dice.chance(0.3):
+        aside_m = dice.between(0.6, 1.4) * (1 if dice.chance(0.5) else -1)
+        size_m = None if dice.chance(0.5) else (dice.decades(0.2, 3), 2.0)
+        walls.append(
+            Wall(position_m=(0, aside_m, 0), facing_deg=(90, 0), reflection_db=dice.between(-65, -5), size_m=size_m)
+        )
+    if dice.chance(0.2):
+        place = (dice.between(0.3, 1.2), dice.between(-0.5, 0.5), 0.0)
+        size_m = (dice.decades(0.01, 0.5), 0.5)
+        walls.append(Wall(position_m=place, facing_deg=(180, 0), reflection_db=dice.between(-65, -5), size_m=size_m))
+    sensors = [_sensor(dice)]
+    if dice.chance(0.25):
+        sensors.append(
+            sensors[0].replace(
+                name="other",
+                position_m=(dice.between(0.6, 1.1), dice.between(-0.4, 0.4), 0.0),
+                yaw_deg=180.0,
+                emitter=Emitter(level_db=dice.between(-100, -20)),
+                electronics=Electronics(),
+            )
+        )
+    more = {}
+    if dice.chance(0.2):
+        more["tones"] = (
+            Tone(**dice.place(), frequency_hz=dice.decades(15e3, 90e3), level_db=dice.between(-100, -30)),
+        )
+    if dice.chance(0.2):
+        more["noises"] = (Noise(**dice.place(), level_db=dice.between(-100, -30)),)
+    if dice.chance(0.2):
+        call = Call() if dice.chance(0.5) else Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)
+        level_db, offset_s = dice.between(-100, -30), dice.between(0, 0.05)
+        more["sonars"] = (Sonar(**dice.place(), level_db=level_db, offset_s=offset_s, call=call),)
+    if dice.chance(0.3):
+        more["ambient"] = Ambient(level_dbfs=dice.between(-110, -30))
+    return Scene(
+        seed=seed, sensors=tuple(sensors), points=tuple(points), spheres=tuple(spheres), walls=tuple(walls), **more
+    )
+
+
+def _sensor(dice):
+    electronics, emitter = {}, {"level_db": -15.0}
+    if dice.chance(0.5):
+        electronics["noise_dbfs"] = dice.between(-90, -20)
+    if dice.chance(0.3):
+        electronics["gain_spread_db"] = dice.decades(1e-3, 3)
+    if dice.chance(0.2):
+        electronics["delay_spread_s"] = dice.decades(1e-9, 3e-6)
+    if dice.chance(0.1):
+        electronics["dead_channels"] = (int(dice.random.integers(8)),)
+    if dice.chance(0.4):
+        electronics["microphone_diameter_m"] = dice.decades(5e-4, 8e-3)
+    if dice.chance(0.4):
+        emitter["diameter_m"] = dice.decades(1e-3, 0.04)
+    if dice.chance(0.3):
+        emitter["direct_sound_db"] = dice.between(-100, -50)
+    return Sensor(
+        array=OCTET,
+        recording=Recording(n_samples=34_000),
+        air=Air(temperature_c=dice.between(-20, 45), humidity_percent=dice.between(0, 100)),
+        processing=Processing(directions="2d:61", range_m=(0.3, 1.15) if dice.chance(0.5) else (0.55, 1.15)),
+        electronics=Electronics(**electronics),
+        emitter=Emitter(**emitter),
+    )
+
+
+@functools.lru_cache(maxsize=2)
+def pipeline(settings):
+    return Pipeline(settings)
+
+
+def images(scene, plan):
+    """One energyscape per sensor, through PDM bits."""
+    measured = [Simulator(scene, sensor=sensor.name, plan=plan).render(0) for sensor in scene.sensors]
+    return [pipeline(measurement.settings).process(measurement).energy for measurement in measured]
+
+
+def with_one(plan, name, *, on):
+    return Plan(
+        tuple(dataclasses.replace(verdict, on=on) if verdict.name == name else verdict for verdict in plan.verdicts)
+    )
+
+
+def measured_db(scene, plan, name, planned):
+    """By how much images change when the verdict on one effect is turned round."""
+    is_on = name in plan.active
+    turned = images(scene, with_one(plan, name, on=not is_on))
+    changes_db = []
+    for sensor, before, after in zip(scene.sensors, planned, turned, strict=True):
+        shot = snapshot(scene, sensor, 0.0)
+        floor = min(Sight(shot, plan.active | {name}).floor, Sight(shot, plan.active - {name}).floor)
+        spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+        changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
+    return max(changes_db)
+
+
+@pytest.mark.parametrize("batch", range(BATCHES))
+def test_what_is_left_out_changes_less_and_what_is_needed_more(batch):
+    """The one promise of the planner, on 200 scenes and through the whole chain."""
+    wrong = []
+    for seed in range(batch * 200 // BATCHES, (batch + 1) * 200 // BATCHES):
+        scene = random_scene(seed)
+        plan = make_plan(scene)
+        planned = images(scene, plan)
+        for verdict in plan.verdicts:
+            if verdict.estimate_db is None:
+                continue  # indispensable, or nothing in the scene that it could act upon
+            change_db = measured_db(scene, plan, verdict.name, planned)
+            if verdict.on and change_db <= scene.tolerance_db and not verdict.coupled:
+                wrong.append((seed, verdict.name, "needed, yet it changes", change_db))
+            if not verdict.on and change_db >= scene.tolerance_db:
+                wrong.append((seed, verdict.name, "left out, yet it changes", change_db))
+    assert not wrong
