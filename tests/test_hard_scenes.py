@@ -90,7 +90,6 @@ def test_a_target_at_emitter_or_microphone_is_bounded(place_m):
     assert np.abs(signals).max() < 1.001 * 10 ** (-90 / 20) * 1e4
 
 
-@pytest.mark.xfail(reason="the truth divides by the distance of a target in the middle of the array")
 def test_the_truth_of_a_target_in_the_middle_of_the_array():
     [reflector] = seen(scene_of(Point(position_m=(0.0, 0.0, 0.0))), "spreading")
     assert reflector.range_m == 0

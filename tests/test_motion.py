@@ -151,7 +151,6 @@ def test_the_image_in_a_wall_moves_twice_as_fast(speed_m_s):
     assert echo.stretch[0, 0] == pytest.approx(1 - 2 * speed_m_s / SPEED_M_S, abs=2.5 * (speed_m_s / SPEED_M_S) ** 2)
 
 
-@pytest.mark.xfail(reason="images move from the start of the call rather than from when the sound meets the wall")
 @pytest.mark.parametrize("speed_m_s", [3.0, -3.0])
 def test_a_wall_that_comes_is_met_where_it_then_is(speed_m_s):
     """Straight on it is as far as a point that comes as fast; within 0.02 samples at 450 kHz."""

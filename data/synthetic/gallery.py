@@ -98,11 +98,18 @@ def draw(stem: str, takes: Takes, shown: Shown) -> None:
     figures = []
     for sensor, index in shown.frames:
         image, truth = takes[sensor][index]
-        found = ertis.compare(image, truth).matched
+        told = ertis.compare(image, truth)
+        reflectors = [*(match.reflector for match in told.matched), *told.missed]
         # What stands there itself, not what walls show of it.
-        marks = [match.peak for match in found if ">" not in match.reflector.name][:_MOST_MARKS]
-        figures.append(ertis.plot(image, dynamic_range_db=shown.dynamic_range_db, peaks=marks))
+        figures.append(_figure(image, [each for each in reflectors if ">" not in each.name], shown.dynamic_range_db))
     save(figures, PICTURES / f"{stem}.png")
+
+
+def _figure(image: ertis.Energyscape, reflectors: Sequence[ertis.Reflector], dynamic_range_db: float) -> Figure:
+    strongest = sorted(reflectors, key=lambda reflector: -reflector.level_db)[:_MOST_MARKS]
+    places = ("azimuth_deg", "elevation_deg", "range_m", "level_db")
+    marks = [ertis.Peak(**{name: getattr(reflector, name) for name in places}) for reflector in strongest]
+    return ertis.plot(image, dynamic_range_db=dynamic_range_db, peaks=marks)
 
 
 def save(figures: Sequence[Figure], path: Path) -> None:

@@ -98,9 +98,9 @@ def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwat
         with clock("walls"):
             firsts, seconds, specular = effect("walls")(shot, mouth)
     else:
-        firsts = images(mouth, shot.targets.positions_m, (), 0)
-        seconds = images(shot.ear, shot.targets.positions_m, (), 0)
-        specular = images(mouth, shot.ear.centre_m[None], (), 0)
+        firsts = tuple(images(mouth, shot.targets.positions_m, (), 0))
+        seconds = tuple(images(shot.ear, shot.targets.positions_m, (), 0))
+        specular = tuple(images(mouth, shot.ear.centre_m[None], (), 0))
     if "occlusion" in active:
         with clock("occlusion"):
             hide = effect("occlusion")
@@ -113,9 +113,13 @@ def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwat
         for second in seconds:
             chosen = np.flatnonzero(first.exists & second.exists)
             if len(chosen) and len(first.mirrors) + len(second.mirrors) <= shot.scene.max_reflections:
-                found.append(over(first.end, second.end, shot.targets.chosen(chosen)))
-    straight = [seen.end for seen in specular if seen.exists[0] and (seen.mirrors or number != shot.number)]
-    return found + [without_target(end, shot.ear, shot.targets) for end in straight]
+                found.append(over(first, second, shot.targets, chosen))
+    here = np.arange(1)
+    return found + [
+        without_target(seen.end, shot.ear, shot.targets, seen.to_corners_m(here))
+        for seen in specular
+        if seen.exists[0] and (seen.mirrors or number != shot.number)
+    ]
 
 
 def responses(

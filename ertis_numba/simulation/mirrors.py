@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,12 @@ __all__ = ["Seen", "blocked", "images", "reflected"]
 Floats = NDArray[np.float64]
 End = TypeVar("End", Mouth, Ear)
 _SKIN = 1e-9  # of a leg's length: what touches a wall does not cross it
+# A sensor that hears itself over two walls hears through their very edge; a little aside, one order of the
+# two walls is right in a corner of a room, and none at the corner of a box.
+_NUDGE_M = np.array([1.1e-7, 1.7e-7, 2.3e-7])
+
+
+_Chain = tuple[tuple[int, ...], tuple[Any, ...]]  # walls, and the end with its images in them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +43,11 @@ class Seen(Generic[End]):
     corners_m: Floats
     mirrors: tuple[int, ...]
 
+    def to_corners_m(self, places: NDArray[np.intp]) -> Floats:
+        """Return how far the mirror points are from the end, along the way to some places: (wall, place) float64."""
+        legs_m = np.sqrt(np.sum(np.diff(self.corners_m[:, places], axis=0) ** 2, axis=-1))
+        return np.asarray(np.cumsum(legs_m, axis=0)[:-1])
+
 
 def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> list[Seen[End]]:
     """Return an end and its images of up to ``most`` reflections that some place sees.
@@ -55,14 +66,16 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
     n_places = len(places_m)
     straight = np.stack([np.broadcast_to(_position(end), places_m.shape), places_m])
     found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
-    chains: list[tuple[tuple[int, ...], tuple[End, ...]]] = [((), (end,))]
+    chains: list[_Chain] = [((), (end,))]
     for _ in range(most):
-        longer: list[tuple[tuple[int, ...], tuple[End, ...]]] = []
-        for chain in chains:
-            longer += _with_one_more(chain[0], chain[1], mirrors)
-        chains = longer
+        chains = [
+            ((*before, number), (*ends, reflected(ends[-1], mirror)))
+            for before, ends in chains
+            for number, mirror in enumerate(mirrors)
+            if before[-1:] != (number,)
+        ]
         for walls, ends in chains:
-            exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m)
+            exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m + _NUDGE_M)
             if exists.any():
                 found.append(Seen(ends[-1], exists, corners_m, walls))
     return found
@@ -70,8 +83,10 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
 
 def reflected(end: End, mirror: Mirror) -> End:
     """Return the image of an end in one more wall."""
-    normal = mirror.axes[0]
-    velocity_m_s = mirror.velocity_m_s + _turned(end.velocity_m_s - mirror.velocity_m_s, normal)
+    normal: Floats = mirror.axes[0]
+    sway_m_s = 2 * (mirror.velocity_m_s @ normal) * normal
+    velocity_m_s = _turned(end.velocity_m_s, normal) + sway_m_s
+    sways_m_s = (*(_turned(earlier, normal) for earlier in end.sways_m_s), sway_m_s)
     reflection = end.reflection * mirror.reflection
     # The sound meets the walls in the order of the images from an emitter, and against it to a microphone.
     if isinstance(end, Mouth):
@@ -80,6 +95,7 @@ def reflected(end: End, mirror: Mirror) -> End:
             position_m=_image(end.position_m, mirror),
             velocity_m_s=velocity_m_s,
             facing=_turned(end.facing, normal),
+            sways_m_s=sways_m_s,
             walls=(*end.walls, mirror.name),
             reflection=reflection,
         )
@@ -89,6 +105,7 @@ def reflected(end: End, mirror: Mirror) -> End:
         centre_m=_image(end.centre_m, mirror),
         velocity_m_s=velocity_m_s,
         axes=_turned(end.axes, normal),
+        sways_m_s=sways_m_s,
         walls=(mirror.name, *end.walls),
         reflection=reflection,
     )
@@ -104,20 +121,9 @@ def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
     for leg, (start_m, stop_m) in enumerate(zip(seen.corners_m[:-1], seen.corners_m[1:], strict=True)):
         for number, mirror in enumerate(mirrors):
             if number not in touched[leg : leg + 2]:
-                crosses, _ = _crossing(start_m, stop_m, mirror)
-                stopped |= crosses
+                share, point_m = _crossing(start_m, stop_m, mirror)
+                stopped |= _crossed(share, point_m, mirror)
     return stopped
-
-
-def _with_one_more(
-    walls: tuple[int, ...], ends: tuple[End, ...], mirrors: Sequence[Mirror]
-) -> list[tuple[tuple[int, ...], tuple[End, ...]]]:
-    """Return a chain of images continued by each wall but the last one again."""
-    return [
-        ((*walls, number), (*ends, reflected(ends[-1], mirror)))
-        for number, mirror in enumerate(mirrors)
-        if not walls or walls[-1] != number
-    ]
 
 
 def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
@@ -125,22 +131,30 @@ def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> 
     exists = np.ones(len(places_m), dtype=np.bool_)
     corners_m = [places_m]
     for image, mirror in zip(ends[:0:-1], walls[::-1], strict=True):
-        hit, point_m = _crossing(corners_m[-1], np.broadcast_to(_position(image), places_m.shape), mirror)
-        exists &= hit
+        share, point_m = _crossing(corners_m[-1], np.broadcast_to(_position(image), places_m.shape), mirror)
+        exists &= _crossed(share, point_m, mirror)
         corners_m.append(point_m)
     corners_m.append(np.broadcast_to(_position(ends[0]), places_m.shape))
     return exists, np.stack(corners_m[::-1])
 
 
-def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[NDArray[np.bool_], Floats]:
-    """Return whether legs cross a wall, and where: (place,) bool, (place, axis) float64."""
+def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[Floats, Floats]:
+    """Return where lines cross the plane of a wall, as share of the way, and the point.
+
+    (place,) and (place, axis) float64; the share is -1 of those that never do.
+    """
     before = (start_m - mirror.point_m) @ mirror.axes[0]
     after = (stop_m - mirror.point_m) @ mirror.axes[0]
     apart = before - after
     share = np.divide(before, apart, out=np.full_like(before, -1.0), where=apart != 0)
-    point_m = start_m + share[:, None] * (stop_m - start_m)
-    inside = np.all(np.abs((point_m - mirror.point_m) @ mirror.axes[1:].T) <= mirror.half_size_m, axis=-1)
-    return inside & (share > _SKIN) & (share < 1 - _SKIN), point_m
+    return share, start_m + share[:, None] * (stop_m - start_m)
+
+
+def _crossed(share: Floats, point_m: Floats, mirror: Mirror) -> NDArray[np.bool_]:
+    """Return whether lines really cross the wall, by what `_crossing` returned: (place,) bool."""
+    aside_m = np.abs((point_m - mirror.point_m) @ mirror.axes[1:].T)
+    inside = np.all(aside_m <= mirror.half_size_m, axis=-1)
+    return np.asarray(inside & (share > _SKIN) & (share < 1 - _SKIN))
 
 
 def _position(end: Mouth | Ear) -> Floats:

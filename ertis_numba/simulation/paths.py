@@ -6,9 +6,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.snapshot import Ear, Mouth, Targets
 
-__all__ = ["Paths", "by_targets", "unit", "without_target"]
+__all__ = ["Paths", "by_targets", "turning", "unit", "without_target"]
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +28,8 @@ class Paths:
         Lengths of the legs before and after the target.
     leaving, arriving : (path, mic, axis) float64
         Unit vectors along the first and the last leg, as the sound goes, among the images.
+    mouth_corners_m, ear_corners_m : (wall, path) float64
+        How far the mirror points are from either end, along the way.
     surface : bool
         Legs end on the surface of spheres, rather than in their centres.
     """
@@ -38,6 +41,8 @@ class Paths:
     second_m: Floats
     leaving: Floats
     arriving: Floats
+    mouth_corners_m: Floats
+    ear_corners_m: Floats
     surface: bool = False
 
     def __len__(self) -> int:
@@ -67,35 +72,62 @@ class Paths:
         return replace(self, ear=replace(self.ear, positions_m=self.ear.positions_m[mics]), **cut)
 
 
-def by_targets(mouth: Mouth, ear: Ear, targets: Targets, *, corners_m: Floats | None = None) -> Paths:
-    """Return the paths over targets, at least one.
+def by_targets(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: NDArray[np.intp]) -> Paths:
+    """Return the paths over some targets, at least one.
+
+    Parameters
+    ----------
+    first, second : Seen
+        Emitter and microphones, or their images.
+    targets : Targets
+        All of them.
+    chosen : (path,) int
+        Which of them.
+    """
+    return turning(first, second, targets, chosen, targets.positions_m[chosen, None, :], surface=False)
+
+
+def turning(
+    first: Seen[Mouth],
+    second: Seen[Ear],
+    targets: Targets,
+    chosen: NDArray[np.intp],
+    turns_m: Floats,
+    *,
+    surface: bool,
+) -> Paths:
+    """Return the paths that turn at (path, mic, axis) places; the other arguments are those of `by_targets`."""
+    mouth, ear = first.end, second.end
+    there_m = turns_m - mouth.position_m
+    back_m = ear.positions_m - turns_m
+    shape = back_m.shape[:2]
+    return Paths(
+        mouth=mouth,
+        ear=ear,
+        targets=targets.chosen(chosen),
+        first_m=np.broadcast_to(_length(there_m), shape),
+        second_m=_length(back_m),
+        leaving=np.broadcast_to(unit(there_m), back_m.shape),
+        arriving=unit(back_m),
+        mouth_corners_m=first.to_corners_m(chosen),
+        ear_corners_m=second.to_corners_m(chosen),
+        surface=surface,
+    )
+
+
+def without_target(mouth: Mouth, ear: Ear, targets: Targets, corners_m: Floats | None = None) -> Paths:
+    """Return the one path from an emitter or its image straight to the microphones.
 
     Parameters
     ----------
     mouth : Mouth
     ear : Ear
     targets : Targets
-    corners_m : (path, mic, axis) float64, optional
-        Where the paths turn; the targets' positions by default.
+        All of them.
+    corners_m : (wall, 1) float64, optional
+        How far the mirror points are from the emitter, along the way.
     """
-    places_m = targets.positions_m[:, None, :] if corners_m is None else corners_m
-    there_m = places_m - mouth.position_m
-    back_m = ear.positions_m - places_m
-    shape = back_m.shape[:2]
-    return Paths(
-        mouth=mouth,
-        ear=ear,
-        targets=targets,
-        first_m=np.broadcast_to(_length(there_m), shape),
-        second_m=_length(back_m),
-        leaving=np.broadcast_to(unit(there_m), back_m.shape),
-        arriving=unit(back_m),
-        surface=corners_m is not None,
-    )
-
-
-def without_target(mouth: Mouth, ear: Ear, targets: Targets) -> Paths:
-    """Return the one path from an emitter or its image straight to the microphones."""
+    none = np.zeros((0, 1))
     way_m = (ear.positions_m - mouth.position_m)[None]
     return Paths(
         mouth=mouth,
@@ -105,6 +137,8 @@ def without_target(mouth: Mouth, ear: Ear, targets: Targets) -> Paths:
         second_m=_length(way_m),
         leaving=unit(way_m),
         arriving=unit(way_m),
+        mouth_corners_m=none if corners_m is None else corners_m,
+        ear_corners_m=none,
     )
 
 

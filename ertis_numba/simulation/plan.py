@@ -10,7 +10,7 @@ from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import Sight
-from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
 __all__ = ["Plan", "Verdict", "make_plan"]
 
@@ -70,12 +70,13 @@ def make_plan(scene: Scene) -> Plan:
     indices = [0]
     if scene.moves and scene.count > 1:
         indices = [int(index) for index in np.unique(np.linspace(0, scene.count - 1, _INSTANTS).round())]
+    shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     verdicts: dict[str, Verdict] = {}
     rehearsed = functools.cache(functools.partial(_rehearsed_db, scene))
     for _ in range(_ROUNDS):
         before = _active(verdicts)
         for name in EFFECTS:
-            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, indices, rehearsed)
+            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearsed)
         if _active(verdicts) == before:
             return Plan(tuple(verdicts.values()))
     waiting = _active(verdicts) ^ before  # one matters only with the other, which matters only without it
@@ -91,38 +92,42 @@ def _decided(
     scene: Scene,
     name: str,
     others: frozenset[str],
-    indices: list[int],
-    rehearsed: Callable[[int, frozenset[str], str], float],
+    shots: list[tuple[int, Snapshot]],
+    rehearsed: Callable[[int, frozenset[str], str], float | None],
 ) -> Verdict:
     """Return the verdict on one effect beside others."""
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     forced = scene.effects.get(name)
-    worst, index = _worst(scene, name, others, indices)
+    worst, index = _worst(name, others, shots)
     if worst is None:
         reason = f"the scene has nothing for it: {EFFECTS[name]}"
         return Verdict(name=name, on=bool(forced), reason=reason, forced=forced is not None)
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
-    sure = not worst.change_db / worst.sure < scene.tolerance_db < worst.change_db * worst.sure
-    change_db = worst.change_db if sure else rehearsed(index, others, name)
+    unsure = worst.change_db / worst.sure < scene.tolerance_db < worst.change_db * worst.sure
+    measured_db = rehearsed(index, others, name) if unsure else None
+    change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
-        name=name, on=change_db > scene.tolerance_db, reason=worst.reason, estimate_db=change_db, rehearsed=not sure
+        name=name,
+        on=change_db > scene.tolerance_db,
+        reason=worst.reason,
+        estimate_db=change_db,
+        rehearsed=measured_db is not None,
     )
 
 
-def _worst(scene: Scene, name: str, active: frozenset[str], indices: list[int]) -> tuple[Estimate | None, int]:
+def _worst(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> tuple[Estimate | None, int]:
     """Return the estimate of the greatest change, and the measurement it is about."""
     worst, where = None, 0
-    for index in indices:
-        for sensor in scene.sensors:
-            estimate = ESTIMATES[name](Sight(snapshot(scene, sensor, index / scene.rate_hz), active))
-            if estimate is not None and (worst is None or estimate.change_db > worst.change_db):
-                worst, where = estimate, index
+    for index, shot in shots:
+        estimate = ESTIMATES[name](Sight(shot, active))
+        if estimate is not None and (worst is None or estimate.change_db > worst.change_db):
+            worst, where = estimate, index
     return worst, where
 
 
-def _rehearsed_db(scene: Scene, index: int, others: frozenset[str], name: str) -> float:
+def _rehearsed_db(scene: Scene, index: int, others: frozenset[str], name: str) -> float | None:
     # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
     from ertis_numba.simulation.rehearsal import rehearse  # noqa: PLC0415
 

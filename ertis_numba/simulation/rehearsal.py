@@ -1,12 +1,15 @@
 """Two renderings compared: what an effect really changes in an image."""
 
+import functools
 import math
 
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
@@ -15,8 +18,10 @@ from ertis_numba.simulation.snapshot import snapshot
 __all__ = ["image_change_db", "rehearse"]
 
 
-def rehearse(scene: Scene, index: int, others: frozenset[str], name: str) -> float:
+def rehearse(scene: Scene, index: int, others: frozenset[str], name: str) -> float | None:
     """Return by how much an effect changes the images of all sensors at the most, in decibels.
+
+    None where a sensor's settings give no image, as with a range window beyond the end of its record.
 
     Parameters
     ----------
@@ -29,7 +34,10 @@ def rehearse(scene: Scene, index: int, others: frozenset[str], name: str) -> flo
     """
     changes_db = []
     for sensor in scene.sensors:
-        pipeline = Pipeline(sensor.settings())
+        try:
+            pipeline = _pipeline(sensor.settings())
+        except ArgumentError:
+            return None
         shot = snapshot(scene, sensor, index / scene.rate_hz)
         with_it = others | {name}
         images = [pipeline.process(Engine(scene, sensor, active).render(index)).energy for active in (others, with_it)]
@@ -60,3 +68,8 @@ def image_change_db(
     near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(both))) + 1
     beside = np.maximum(scipy.ndimage.maximum_filter1d(both, near), floor)
     return float(20 * np.log10(1 + np.max(np.abs(after - before) / beside, initial=0.0)))
+
+
+@functools.lru_cache(maxsize=8)
+def _pipeline(settings: Settings) -> Pipeline:
+    return Pipeline(settings)

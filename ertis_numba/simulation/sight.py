@@ -83,7 +83,7 @@ class Sight:
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
         self.shot = shot
         # Paths end in the middle of the array: what microphones hear differs by parts of a percent.
-        self._middle = replace(shot, ear=replace(shot.ear, positions_m=shot.ear.centre_m[None]))
+        self._middle = _middle(shot)
         self.active = active
         self.settings = shot.sensor.settings()
         self.frequency_hz, self.power = _band(self.settings)
@@ -319,6 +319,11 @@ class Sight:
     def _envelope(self, gain: Floats, time_s: Floats) -> Floats:
         turns = np.exp(2j * math.pi * time_s[..., None] * (self.frequency_hz - self.frequency_hz.mean()))
         return np.asarray(np.abs(np.einsum("ptn,pn->pt", turns, gain * self.power)))
+
+
+@functools.lru_cache(maxsize=64)
+def _middle(shot: Snapshot) -> Snapshot:
+    return replace(shot, ear=replace(shot.ear, positions_m=shot.ear.centre_m[None]))
 
 
 def change_db(part: Floats, beside: Floats) -> float:

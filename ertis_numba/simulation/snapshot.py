@@ -25,6 +25,8 @@ class Mouth:
     position_m, velocity_m_s : (axis,) float64
     facing : (axis,) float64
         Unit vector.
+    sways_m_s : tuple of (axis,) float64
+        What the motion of each wall adds to the velocity of the image, from the emitter on.
     walls : tuple of str
         Which the sound meets, in its order.
     reflection : float
@@ -34,6 +36,7 @@ class Mouth:
     position_m: Floats
     velocity_m_s: Floats
     facing: Floats
+    sways_m_s: tuple[Floats, ...] = ()
     walls: tuple[str, ...] = ()
     reflection: float = 1.0
 
@@ -48,6 +51,8 @@ class Ear:
     centre_m, velocity_m_s : (axis,) float64
     axes : (3, axis) float64
         The sensor's x, y and z as unit vectors; the image of a right hand is a left one.
+    sways_m_s : tuple of (axis,) float64
+        What the motion of each wall adds to the velocity of the image, from the microphones on.
     walls : tuple of str
         Which the sound meets, in its order.
     reflection : float
@@ -58,6 +63,7 @@ class Ear:
     centre_m: Floats
     velocity_m_s: Floats
     axes: Floats
+    sways_m_s: tuple[Floats, ...] = ()
     walls: tuple[str, ...] = ()
     reflection: float = 1.0
 

@@ -96,4 +96,4 @@ class Ambient(Table, frozen=True, kw_only=True):
 def _check_band(name: str, band_hz: tuple[float, float]) -> None:
     checks.interval(name, band_hz, 1.0, _HIGHEST_HZ)
     if band_hz[0] == band_hz[1]:
-        raise ArgumentError(f"{name} is {band_hz[0]:g} Hz wide of nothing; give two different frequencies")
+        raise ArgumentError(f"{name} runs from {band_hz[0]:g} Hz to itself; give two different frequencies")

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Reflector
 from ertis_numba.simulation.arrivals import echoes, responses
-from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.paths import Paths, unit
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
@@ -39,7 +39,7 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
             level_db=float(20 * np.log10(level[k] / level.max())),
             velocity_m_s=(float(velocity_m_s[k, 0]), float(velocity_m_s[k, 1]), float(velocity_m_s[k, 2])),
         )
-        for k, direction in enumerate(own.direction / np.linalg.norm(own.direction, axis=1, keepdims=True))
+        for k, direction in enumerate(unit(own.direction))
         if level[k] > _SILENT * level.max()
     ]
     return sorted(found, key=lambda reflector: -reflector.level_db)

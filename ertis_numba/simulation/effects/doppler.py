@@ -3,48 +3,69 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.paths import Paths, unit
+from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.snapshot import Ear, Mouth
 
 __all__ = ["doppler"]
 
-_ROUNDS = 6  # each makes the error smaller by v / c
+Floats = NDArray[np.float64]
+_ROUNDS = 8  # each makes the error smaller by v / c
+_STEP_S = 1e-4
 
 
-def doppler(paths: Paths, speed_m_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     """Return when the call's beginning arrives, and how long its seconds last: both (path, mic) float64.
 
-    Everything moves steadily. What leaves at 0 meets the target at ``t₁``, where it then is, and the
-    microphone at ``t₂``: ``c t₁ = |p + v t₁ - s|`` and so on. From there on the call is stretched by
-    ``dt₂/dt₀ = (1 - e₁·vₛ/c) / (1 - e₁·v/c) · (1 - e₂·v/c) / (1 - e₂·vₘ/c)``, e₁ and e₂ being the directions in
-    which the sound goes and vₛ, v, vₘ the velocities of emitter, target and microphone (P. M. Morse, K. U. Ingard,
-    Theoretical Acoustics, 1968, chapter 11). Images in walls move as images do.
+    Everything moves steadily. What leaves at t₀ meets the target at t₁, where it then is, and the microphone at
+    t₂: ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|`` and so on; walls are where they are when the sound meets them. The call
+    is stretched by dt₂/dt₀ at its beginning, which is the product of the Doppler factors of all that moves
+    (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
     """
+    earlier_s, arrival_s, later_s = (_arrival_s(paths, start_s, speed_m_s) for start_s in (-_STEP_S, 0.0, _STEP_S))
+    return arrival_s, (later_s - earlier_s) / (2 * _STEP_S)
+
+
+def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
+    """Return when what is sent at some time arrives: (path, mic) float64."""
     mouth, ear = paths.mouth, paths.ear
-    start_m = mouth.position_m
-    ear_m, ear_m_s = ear.positions_m, ear.velocity_m_s
-    if not len(paths.targets):
-        arrival_s = paths.second_m / speed_m_s
-        for _ in range(_ROUNDS):
-            arrival_s = _distance(ear_m + arrival_s[..., None] * ear_m_s - start_m) / speed_m_s
-        way = unit(ear_m + arrival_s[..., None] * ear_m_s - start_m)
-        return arrival_s, _slowed(way, mouth.velocity_m_s, speed_m_s) / _slowed(way, ear_m_s, speed_m_s)
-    target_m_s = paths.targets.velocities_m_s[:, None, :]
-    corner_m = start_m + paths.first_m[..., None] * paths.leaving
-    there_s = paths.first_m / speed_m_s
+    sent_m = mouth.position_m + start_s * _own_m_s(mouth)
+    target_m = mouth.position_m + paths.first_m[..., None] * paths.leaving
+    met_s = start_s + paths.first_m / speed_m_s
+    arrival_s = met_s + paths.second_m / speed_m_s
     for _ in range(_ROUNDS):
-        there_s = _distance(corner_m + there_s[..., None] * target_m_s - start_m) / speed_m_s
-    met_m = corner_m + there_s[..., None] * target_m_s
-    arrival_s = there_s + paths.second_m / speed_m_s
-    for _ in range(_ROUNDS):
-        arrival_s = there_s + _distance(ear_m + arrival_s[..., None] * ear_m_s - met_m) / speed_m_s
-    first, second = unit(met_m - start_m), unit(ear_m + arrival_s[..., None] * ear_m_s - met_m)
-    stretch = _slowed(first, mouth.velocity_m_s, speed_m_s) / _slowed(first, target_m_s, speed_m_s)
-    return arrival_s, stretch * _slowed(second, target_m_s, speed_m_s) / _slowed(second, ear_m_s, speed_m_s)
+        # A wall is met when the same part of the way is done as if nothing moved.
+        done = (met_s if len(paths.targets) else arrival_s) - start_s
+        whole_m = paths.first_m if len(paths.targets) else paths.second_m
+        from_m = sent_m + _swayed_m(mouth, start_s + paths.mouth_corners_m * _mean(done, whole_m))
+        met_m = from_m
+        if len(paths.targets):
+            met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
+            met_s = start_s + _length(met_m - from_m) / speed_m_s
+        ear_m = ear.positions_m + arrival_s[..., None] * _own_m_s(ear)
+        back = _mean(arrival_s - met_s, paths.second_m)
+        ear_m = ear_m + _swayed_m(ear, np.mean(arrival_s, axis=1) - paths.ear_corners_m * back)
+        arrival_s = (met_s if len(paths.targets) else start_s) + _length(ear_m - met_m) / speed_m_s
+    return arrival_s
 
 
-def _distance(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _own_m_s(end: Mouth | Ear) -> Floats:
+    """Return the velocity of an image without what the walls add."""
+    return np.asarray(end.velocity_m_s - sum(end.sways_m_s, np.zeros(3)))
+
+
+def _swayed_m(end: Mouth | Ear, met_s: Floats) -> Floats:
+    """Return how far walls have moved an image when the sound meets them, (wall, path): (path, 1, axis) float64."""
+    sway_m = np.zeros((met_s.shape[1], 1, 3))
+    for velocity_m_s, at_s in zip(end.sways_m_s, met_s, strict=True):
+        sway_m += at_s[:, None, None] * velocity_m_s
+    return sway_m
+
+
+def _mean(time_s: Floats, length_m: Floats) -> Floats:
+    """Return the mean time per length of each path: (path,) float64."""
+    total_m = np.sum(length_m, axis=1)
+    return np.divide(np.sum(time_s, axis=1), total_m, out=np.zeros_like(total_m), where=total_m > 0)
+
+
+def _length(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
-
-
-def _slowed(way: NDArray[np.float64], velocity_m_s: NDArray[np.float64], speed_m_s: float) -> NDArray[np.float64]:
-    return np.asarray(1 - np.sum(way * velocity_m_s, axis=-1) / speed_m_s)

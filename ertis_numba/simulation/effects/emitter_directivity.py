@@ -14,12 +14,13 @@ __all__ = ["emitter_directivity"]
 def emitter_directivity(
     paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return what the emitter sends into the directions of the paths: (path, 1, frequency) float64.
+    """Return what the emitter sends into the directions of the paths: (path, mic, frequency) float64.
 
-    A circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``; nothing behind it. The
-    direction is that towards the middle of the array.
+    A circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``; nothing behind it. One for all
+    microphones where they hear the same target.
     """
-    cos = np.mean(paths.leaving, axis=1) @ paths.mouth.facing
+    leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
+    cos = leaving @ paths.mouth.facing
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
-    pattern = piston(math.pi * diameter_m / speed_m_s * sin[:, None] * frequency_hz)
-    return np.asarray(np.where(cos[:, None] >= 0, pattern, 0.0)[:, None, :])
+    pattern = piston(math.pi * diameter_m / speed_m_s * sin[..., None] * frequency_hz)
+    return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))

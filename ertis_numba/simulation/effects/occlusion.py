@@ -1,6 +1,6 @@
 """Walls stand between."""
 
-from collections.abc import Sequence
+import functools
 
 from ertis_numba.simulation.mirrors import End, Seen, blocked
 from ertis_numba.simulation.snapshot import Mirror
@@ -8,6 +8,7 @@ from ertis_numba.simulation.snapshot import Mirror
 __all__ = ["occlusion"]
 
 
-def occlusion(seen: Sequence[Seen[End]], mirrors: Sequence[Mirror]) -> list[Seen[End]]:
+@functools.lru_cache(maxsize=128)
+def occlusion(seen: tuple[Seen[End], ...], mirrors: tuple[Mirror, ...]) -> tuple[Seen[End], ...]:
     """Take away the ways on which a wall stands: no sound goes through it or around its edge."""
-    return [Seen(way.end, way.exists & ~blocked(way, mirrors), way.corners_m, way.mirrors) for way in seen]
+    return tuple(Seen(way.end, way.exists & ~blocked(way, mirrors), way.corners_m, way.mirrors) for way in seen)
