@@ -68,12 +68,7 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
     found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
     chains: list[_Chain] = [((), (end,))]
     for _ in range(most):
-        chains = [
-            ((*before, number), (*ends, reflected(ends[-1], mirror)))
-            for before, ends in chains
-            for number, mirror in enumerate(mirrors)
-            if before[-1:] != (number,)
-        ]
+        chains = _longer(chains, mirrors)
         for walls, ends in chains:
             exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m + _NUDGE_M)
             if exists.any():
@@ -124,6 +119,16 @@ def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
                 share, point_m = _crossing(start_m, stop_m, mirror)
                 stopped |= _crossed(share, point_m, mirror)
     return stopped
+
+
+def _longer(chains: list[_Chain], mirrors: Sequence[Mirror]) -> list[_Chain]:
+    """Return every chain with one more image, in each wall but its last."""
+    return [
+        ((*walls, number), (*ends, reflected(ends[-1], mirror)))
+        for walls, ends in chains
+        for number, mirror in enumerate(mirrors)
+        if walls[-1:] != (number,)
+    ]
 
 
 def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -10,7 +10,7 @@ __all__ = ["doppler"]
 
 Floats = NDArray[np.float64]
 _ROUNDS = 8  # each makes the error smaller by v / c
-_STEP_S = 1e-4
+_STEP_S = 1e-5
 
 
 def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
@@ -64,7 +64,7 @@ def _swayed_m(end: Mouth | Ear, met_s: Floats) -> Floats:
 def _mean(time_s: Floats, length_m: Floats) -> Floats:
     """Return the mean time per length of each path: (path,) float64."""
     total_m = np.sum(length_m, axis=1)
-    return np.divide(np.sum(time_s, axis=1), total_m, out=np.zeros_like(total_m), where=total_m > 0)
+    return np.asarray(np.divide(np.sum(time_s, axis=1), total_m, out=np.zeros_like(total_m), where=total_m > 0))
 
 
 def _length(vectors: Floats) -> Floats:

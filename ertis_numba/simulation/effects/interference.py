@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._noise import NoiseField
+from ertis_numba.simulation.effects._frames import FRAME, Frames, band_bins, drawn, window
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.paths import Paths, without_target
 from ertis_numba.simulation.placed import Placed
@@ -35,16 +36,26 @@ def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: in
     signals += np.outer(amplitude * np.sin(start_rad), np.cos(swing_rad))
 
 
-def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> NoiseField:
-    """Return the noise of one source: the same for all microphones but for delay and ``1 / r``."""
-    way = way_from(shot, noise)
-    return NoiseField(
-        seed,
-        delay_s=(way.length_m - np.linalg.norm(way.mouth.position_m - shot.ear.centre_m)) / shot.speed_m_s,
-        amplitude=10 ** (noise.level_db / 20) * spreading(way),
-        band_hz=noise.band_hz,
-        rate_hz=shot.sensor.recording.pdm_rate_hz,
-    )
+def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> Frames:
+    """Return the noise of one source: the same for all microphones but for delay and ``1 / r``.
+
+    The frame is delayed window and all, so that microphones far apart hear the same.
+    """
+    way, rate_hz = way_from(shot, noise), shot.sensor.recording.pdm_rate_hz
+    apart_m = way.length_m[0] - np.linalg.norm(way.mouth.position_m - shot.ear.centre_m)
+    late_samples = apart_m / shot.speed_m_s * rate_hz
+    amplitude = 10 ** (noise.level_db / 20) * spreading(way)[0]
+    margin = math.ceil(np.abs(late_samples).max()) + 1
+    n_fft = int(scipy.fft.next_fast_len(FRAME + 2 * margin, real=True))
+    bins = band_bins(noise.band_hz, rate_hz)
+    alone = np.ones((len(bins), 1, 1))
+    turned = np.exp(-2j * math.pi / n_fft * (late_samples[:, None] + margin) * np.arange(n_fft // 2 + 1))
+
+    def heard(random: np.random.Generator) -> NDArray[np.float64]:
+        spectrum = scipy.fft.rfft(drawn(random, bins, alone)[0] * window(), n_fft)
+        return np.asarray(amplitude[:, None] * scipy.fft.irfft(spectrum * turned, n_fft))
+
+    return Frames(seed, heard, margin=margin)
 
 
 def calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:

@@ -1,0 +1,82 @@
+"""Noise without end, made in frames."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+__all__ = ["FRAME", "Frames", "band_bins", "drawn", "window"]
+
+Floats = NDArray[np.float64]
+
+FRAME = 16_384
+"""Samples of a frame: some milliseconds."""
+_EARLIEST = 2**32  # frames begin before the record, and a seed is no negative number
+_SHARED = 3  # frames that reach from one block into the next
+
+
+class Frames:
+    """Sums frames of half overlap; under `window` their powers add up to 1.
+
+    Parameters
+    ----------
+    seed : tuple of int
+        Decides the noise, together with the number of the frame.
+    make : function
+        Returns what the microphones hear of one frame, (mic, sample) float64, from a generator.
+    margin : int
+        Samples by which that begins earlier and ends later than the frame.
+    """
+
+    def __init__(
+        self, seed: tuple[int, ...], make: Callable[[np.random.Generator], Floats], *, margin: int = 0
+    ) -> None:
+        self._seed, self._make, self._margin = seed, make, margin
+        self._frames: dict[int, Floats] = {}
+
+    def add_to(self, signals: Floats, first: int) -> None:
+        """Add the noise of samples ``first`` and on: (mic, sample) float64, in place."""
+        hop, stop = FRAME // 2, first + signals.shape[1]
+        for number in range((first - self._margin) // hop - 1, -(-(stop + self._margin) // hop)):
+            begin = number * hop - self._margin
+            low, high = max(begin, first), min(begin + FRAME + 2 * self._margin, stop)
+            if low < high:
+                signals[:, low - first : high - first] += self._frame(number)[:, low - begin : high - begin]
+
+    def _frame(self, number: int) -> Floats:
+        if number not in self._frames:
+            random = np.random.default_rng(np.random.SeedSequence((*self._seed, number + _EARLIEST)))
+            kept = {earlier: frame for earlier, frame in self._frames.items() if earlier > number - _SHARED}
+            self._frames = {**kept, number: self._make(random)}
+        return self._frames[number]
+
+
+def window() -> Floats:
+    """Return half a sine, whose squares add up to 1 over frames of half overlap: (sample,) float64."""
+    return np.asarray(np.sin(math.pi * (np.arange(FRAME) + 0.5) / FRAME))
+
+
+def band_bins(band_hz: tuple[float, float], rate_hz: float) -> NDArray[np.int64]:
+    """Return the bins of a frame's spectrum within a band, at least one: (bin,) int64."""
+    low = math.ceil(band_hz[0] * FRAME / rate_hz)
+    high = math.floor(min(band_hz[1], rate_hz / 2) * FRAME / rate_hz)
+    return np.arange(low, max(low, high) + 1)
+
+
+def drawn(random: np.random.Generator, bins: NDArray[np.int64], mix: NDArray[np.float64]) -> Floats:
+    """Return frames of noise of root mean square 1 in some bins: (row, sample) float64.
+
+    Parameters
+    ----------
+    random : numpy.random.Generator
+    bins : (bin,) int64
+    mix : (bin, row, source) float64
+        Amplitudes by which independent sources make up the rows at each frequency.
+    """
+    n_sources = mix.shape[2]
+    parts = random.standard_normal((2, len(bins), n_sources, 1))
+    spectra = np.zeros((mix.shape[1], FRAME // 2 + 1), dtype=np.complex128)
+    spectra[:, bins] = FRAME / math.sqrt(4 * len(bins)) * (mix @ parts[0] + 1j * (mix @ parts[1]))[..., 0].T
+    return np.asarray(scipy.fft.irfft(spectra, FRAME))
