@@ -2,18 +2,14 @@
 
 import dataclasses
 import functools
-import json
-import subprocess
-import sys
+import math
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
-from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.rehearsal import image_change_db
 from ertis_numba.simulation.render import Simulator
@@ -49,66 +45,76 @@ class Dice:
         return {
             "azimuth_deg": self.between(-60, 60),
             "elevation_deg": self.between(-3, 3),
-            "range_m": self.between(0.35, 1.05),
+            "range_m": self.between(0.35, 0.95),
         }
 
 
 def random_scene(seed):
     """A scene of some of everything, from far too weak to matter to strong, that overloads no modulator."""
     dice = Dice(seed)
-    points = []
-    for _ in range(dice.random.integers(1, 4)):
-        place = dice.place()
-        more = {}
-        if dice.chance(0.3):
-            more["velocity_m_s"] = tuple((dice.random.normal(size=3) * dice.decades(1e-3, 3)).tolist())
-        if dice.chance(0.3):
-            more["diameter_m"] = dice.decades(1e-3, 0.1)
-        echo_db = dice.between(-18, -3) + 40 * np.log10(place["range_m"])
-        points.append(Point(**place, strength_db=float(echo_db), **more))
-    spheres = []
+    points = tuple(_point(dice) for _ in range(dice.random.integers(1, 4)))
+    spheres = (_sphere(dice),) if dice.chance(0.3) else ()
+    walls = _walls(dice)
+    sensor = _sensor(dice)
+    other = sensor.replace(
+        name="other",
+        position_m=(dice.between(0.6, 1.1), dice.between(-0.4, 0.4), 0.0),
+        yaw_deg=180.0,
+        emitter=Emitter(level_db=dice.between(-100, -20)),
+        electronics=Electronics(),
+    )
+    return Scene(
+        seed=seed,
+        sensors=(sensor, other) if dice.chance(0.25) else (sensor,),
+        points=points,
+        spheres=spheres,
+        walls=walls,
+        **_sources(dice),
+    )
+
+
+def _point(dice):
+    place = dice.place()
+    more = {}
     if dice.chance(0.3):
-        place, radius_m = dice.place(), dice.decades(2e-3, 0.2)
-        echo_db = dice.between(-18, -3) + 40 * np.log10(place["range_m"]) - 20 * np.log10(radius_m / 2)
-        spheres.append(Sphere(**place, radius_m=radius_m, reflection_db=min(0.0, float(echo_db))))
+        more["velocity_m_s"] = tuple((dice.random.normal(size=3) * dice.decades(1e-3, 3)).tolist())
+    if dice.chance(0.3):
+        more["diameter_m"] = dice.decades(1e-3, 0.1)
+    return Point(**place, strength_db=dice.between(-18, -3) + 40 * math.log10(place["range_m"]), **more)
+
+
+def _sphere(dice):
+    place, radius_m = dice.place(), dice.decades(2e-3, 0.2)
+    echo_db = dice.between(-18, -3) + 40 * math.log10(place["range_m"]) - 20 * math.log10(radius_m / 2)
+    return Sphere(**place, radius_m=radius_m, reflection_db=min(0.0, echo_db))
+
+
+def _walls(dice):
     walls = []
     if dice.chance(0.3):
-        aside_m = dice.between(0.6, 1.4) * (1 if dice.chance(0.5) else -1)
+        place = (0.0, dice.between(0.6, 1.4) * (1 if dice.chance(0.5) else -1), 0.0)
         size_m = None if dice.chance(0.5) else (dice.decades(0.2, 3), 2.0)
-        walls.append(
-            Wall(position_m=(0, aside_m, 0), facing_deg=(90, 0), reflection_db=dice.between(-65, -5), size_m=size_m)
-        )
+        walls.append(Wall(position_m=place, facing_deg=(90, 0), reflection_db=dice.between(-65, -5), size_m=size_m))
     if dice.chance(0.2):
-        place = (dice.between(0.3, 1.2), dice.between(-0.5, 0.5), 0.0)
-        size_m = (dice.decades(0.01, 0.5), 0.5)
+        place, size_m = (dice.between(0.3, 1.2), dice.between(-0.5, 0.5), 0.0), (dice.decades(0.01, 0.5), 0.5)
         walls.append(Wall(position_m=place, facing_deg=(180, 0), reflection_db=dice.between(-65, -5), size_m=size_m))
-    sensors = [_sensor(dice)]
-    if dice.chance(0.25):
-        sensors.append(
-            sensors[0].replace(
-                name="other",
-                position_m=(dice.between(0.6, 1.1), dice.between(-0.4, 0.4), 0.0),
-                yaw_deg=180.0,
-                emitter=Emitter(level_db=dice.between(-100, -20)),
-                electronics=Electronics(),
-            )
-        )
-    more = {}
+    return tuple(walls)
+
+
+def _sources(dice):
+    found = {}
     if dice.chance(0.2):
-        more["tones"] = (
-            Tone(**dice.place(), frequency_hz=dice.decades(15e3, 90e3), level_db=dice.between(-100, -30)),
-        )
+        tone = Tone(**dice.place(), frequency_hz=dice.decades(15e3, 90e3), level_db=dice.between(-100, -30))
+        found["tones"] = (tone,)
     if dice.chance(0.2):
-        more["noises"] = (Noise(**dice.place(), level_db=dice.between(-100, -30)),)
+        found["noises"] = (Noise(**dice.place(), level_db=dice.between(-100, -30)),)
     if dice.chance(0.2):
         call = Call() if dice.chance(0.5) else Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)
         level_db, offset_s = dice.between(-100, -30), dice.between(0, 0.05)
-        more["sonars"] = (Sonar(**dice.place(), level_db=level_db, offset_s=offset_s, call=call),)
+        found["sonars"] = (Sonar(**dice.place(), level_db=level_db, offset_s=offset_s, call=call),)
     if dice.chance(0.3):
-        more["ambient"] = Ambient(level_dbfs=dice.between(-110, -30))
-    return Scene(
-        seed=seed, sensors=tuple(sensors), points=tuple(points), spheres=tuple(spheres), walls=tuple(walls), **more
-    )
+        found["ambient"] = Ambient(level_dbfs=dice.between(-110, -30))
+    return found
 
 
 def _sensor(dice):
@@ -129,9 +135,9 @@ def _sensor(dice):
         emitter["direct_sound_db"] = dice.between(-100, -50)
     return Sensor(
         array=OCTET,
-        recording=Recording(n_samples=34_000),
+        recording=Recording(n_samples=32_768),
         air=Air(temperature_c=dice.between(-20, 45), humidity_percent=dice.between(0, 100)),
-        processing=Processing(directions="2d:61", range_m=(0.3, 1.15) if dice.chance(0.5) else (0.55, 1.15)),
+        processing=Processing(directions="2d:61", range_m=(0.3, 1.05) if dice.chance(0.5) else (0.55, 1.05)),
         electronics=Electronics(**electronics),
         emitter=Emitter(**emitter),
     )
@@ -146,6 +152,11 @@ def images(scene, plan):
     """One energyscape per sensor, through PDM bits."""
     measured = [Simulator(scene, sensor=sensor.name, plan=plan).render(0) for sensor in scene.sensors]
     return [pipeline(measurement.settings).process(measurement).energy for measurement in measured]
+
+
+def overloads(scene, plan):
+    """Whether a modulator is driven out of its range, where the smallest change turns all its bits round."""
+    return any(np.abs(Simulator(scene, sensor=each.name, plan=plan).signals(0)).max() > 0.6 for each in scene.sensors)
 
 
 def with_one(plan, name, *, on):
@@ -170,14 +181,21 @@ def measured_db(scene, plan, name, planned):
 @pytest.mark.parametrize("batch", range(BATCHES))
 def test_what_is_left_out_changes_less_and_what_is_needed_more(batch):
     """The one promise of the planner, on 200 scenes and through the whole chain."""
-    wrong = []
-    for seed in range(batch * 200 // BATCHES, (batch + 1) * 200 // BATCHES):
+    wrong, seeds, count = [], range(batch * 1000, (batch + 1) * 1000), 0
+    for seed in seeds:
         scene = random_scene(seed)
         plan = make_plan(scene)
+        if overloads(scene, plan):
+            continue
+        if count == 200 // BATCHES:
+            break
+        count += 1
         planned = images(scene, plan)
         for verdict in plan.verdicts:
             if verdict.estimate_db is None:
                 continue  # indispensable, or nothing in the scene that it could act upon
+            if verdict.rehearsed and batch:
+                continue  # measured in the same way already: the first batch shows that this is so
             change_db = measured_db(scene, plan, verdict.name, planned)
             if verdict.on and change_db <= scene.tolerance_db and not verdict.coupled:
                 wrong.append((seed, verdict.name, "needed, yet it changes", change_db))

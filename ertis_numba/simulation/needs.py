@@ -157,7 +157,7 @@ def doppler(sight: Sight) -> Estimate | None:
     worst = int(np.argmax(np.abs(shift_s)))
     return Estimate(
         change_db=change_db(change, sight.beside(own.delay_s)),
-        sure=10.0,
+        sure=20.0,
         reason=f"{own.names[worst]}, coming at {-(stretch[worst] - 1) / 2 * shot.speed_m_s:.3g} m/s, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
     )
@@ -197,7 +197,7 @@ def sync_delay(sight: Sight) -> Estimate | None:
         if change > worst.change_db:
             name = sight.shot.scene.sensors[number].name
             worst = Estimate(
-                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=4.0
+                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=20.0
             )
     return worst
 

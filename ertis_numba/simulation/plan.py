@@ -72,11 +72,11 @@ def make_plan(scene: Scene) -> Plan:
         indices = [int(index) for index in np.unique(np.linspace(0, scene.count - 1, _INSTANTS).round())]
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     verdicts: dict[str, Verdict] = {}
-    rehearsed = functools.cache(functools.partial(_rehearsed_db, scene))
+    rehearse = functools.cache(lambda: _rehearsals(scene))
     for _ in range(_ROUNDS):
         before = _active(verdicts)
         for name in EFFECTS:
-            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearsed)
+            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
         if _active(verdicts) == before:
             return Plan(tuple(verdicts.values()))
     waiting = _active(verdicts) ^ before  # one matters only with the other, which matters only without it
@@ -93,7 +93,7 @@ def _decided(
     name: str,
     others: frozenset[str],
     shots: list[tuple[int, Snapshot]],
-    rehearsed: Callable[[int, frozenset[str], str], float | None],
+    rehearse: Callable[[], Callable[[int, frozenset[str], str], float | None]],
 ) -> Verdict:
     """Return the verdict on one effect beside others."""
     if name in INDISPENSABLE:
@@ -106,7 +106,7 @@ def _decided(
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
     unsure = worst.change_db / worst.sure < scene.tolerance_db < worst.change_db * worst.sure
-    measured_db = rehearsed(index, others, name) if unsure else None
+    measured_db = rehearse()(index, others, name) if unsure else None
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
         name=name,
@@ -127,11 +127,11 @@ def _worst(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]])
     return worst, where
 
 
-def _rehearsed_db(scene: Scene, index: int, others: frozenset[str], name: str) -> float | None:
+def _rehearsals(scene: Scene) -> Callable[[int, frozenset[str], str], float | None]:
     # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
-    from ertis_numba.simulation.rehearsal import rehearse  # noqa: PLC0415
+    from ertis_numba.simulation.rehearsal import Rehearsal  # noqa: PLC0415
 
-    return rehearse(scene, index, others, name)
+    return functools.cache(Rehearsal(scene).change_db)
 
 
 def _active(verdicts: dict[str, Verdict]) -> frozenset[str]:

@@ -15,36 +15,51 @@ from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 
-__all__ = ["image_change_db", "rehearse"]
+__all__ = ["Rehearsal", "image_change_db"]
 
 
-def rehearse(scene: Scene, index: int, others: frozenset[str], name: str) -> float | None:
-    """Return by how much an effect changes the images of all sensors at the most, in decibels.
-
-    None where a sensor's settings give no image, as with a range window beyond the end of its record.
+class Rehearsal:
+    """Renders and processes measurements of a scene with some effects and with others.
 
     Parameters
     ----------
     scene : Scene
-    index : int
-        Of the measurement that is rendered.
-    others : frozenset of str
-        The other effects.
-    name : str
     """
-    changes_db = []
-    for sensor in scene.sensors:
-        try:
-            pipeline = _pipeline(sensor.settings())
-        except ArgumentError:
-            return None
-        shot = snapshot(scene, sensor, index / scene.rate_hz)
-        with_it = others | {name}
-        images = [pipeline.process(Engine(scene, sensor, active).render(index)).energy for active in (others, with_it)]
-        spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
-        floor = min(Sight(shot, active).floor for active in (others, with_it))
-        changes_db.append(image_change_db(images[0], images[1], spacing_m=spacing_m, floor=floor))
-    return max(changes_db)
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._image = functools.lru_cache(maxsize=8)(self._rendered)
+
+    def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
+        """Return by how much an effect changes the images of all sensors at the most, in decibels.
+
+        None where a sensor's settings give no image, as with a range window beyond the end of its record.
+
+        Parameters
+        ----------
+        index : int
+            Of the measurement.
+        others : frozenset of str
+            The other effects.
+        name : str
+        """
+        changes_db = []
+        for sensor in self._scene.sensors:
+            both = others, others | {name}
+            try:
+                before, after = (self._image(sensor.name, index, active) for active in both)
+            except ArgumentError:
+                return None
+            shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
+            spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+            floor = min(Sight(shot, active).floor for active in both)
+            changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
+        return max(changes_db)
+
+    def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float32]:
+        sensor = self._scene.sensor(name)
+        pipeline = _pipeline(sensor.settings())  # first, for it may refuse the settings
+        return pipeline.process(Engine(self._scene, sensor, active).render(index)).energy
 
 
 def image_change_db(
