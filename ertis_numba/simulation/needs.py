@@ -38,7 +38,7 @@ class Estimate:
     sure: float = 4.0
 
 
-def spreading(sight: Sight) -> Estimate | None:
+def _spreading(sight: Sight) -> Estimate | None:
     """Compare levels with those without distance."""
     if not len(sight.heard):
         return None
@@ -46,7 +46,7 @@ def spreading(sight: Sight) -> Estimate | None:
     return _filtered(sight, "spreading", f"on ways of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
 
 
-def walls(sight: Sight) -> Estimate | None:
+def _walls(sight: Sight) -> Estimate | None:
     """Find the strongest echo over a wall."""
     if not sight.shot.mirrors:
         return None
@@ -55,7 +55,7 @@ def walls(sight: Sight) -> Estimate | None:
     return _ghosts(sight, more, new, "heard by {name} at {range:.2f} m, {level:+.1f} dB beside what is there")
 
 
-def occlusion(sight: Sight) -> Estimate | None:
+def _occlusion(sight: Sight) -> Estimate | None:
     """Find the strongest echo that a wall hides."""
     if not sight.shot.mirrors:
         return None
@@ -75,7 +75,7 @@ def occlusion(sight: Sight) -> Estimate | None:
     )
 
 
-def target_size(sight: Sight) -> Estimate | None:
+def _target_size(sight: Sight) -> Estimate | None:
     """Compare surfaces with centres, and discs with points."""
     targets = sight.shot.targets
     if not (np.any(targets.radius_m) or np.any(targets.diameter_m)):
@@ -83,7 +83,7 @@ def target_size(sight: Sight) -> Estimate | None:
     return _filtered(sight, "target_size", "{name} has a size: its echo changes by {change:.2f} dB")
 
 
-def absorption(sight: Sight) -> Estimate | None:
+def _absorption(sight: Sight) -> Estimate | None:
     """Compare echoes with those through air without absorption."""
     if not len(sight.heard):
         return None
@@ -91,7 +91,7 @@ def absorption(sight: Sight) -> Estimate | None:
     from_air = absorption_db_m(sight.shot.sensor.air, sight.frequency_hz)
     length_m = own.delay_s * sight.shot.speed_m_s
     after = replace(own, gain=own.gain * 10 ** (-length_m[:, None] * from_air / 20))
-    longest_m = float(np.max(length_m, where=sight.shown, initial=0.0))
+    longest_m = float(np.max(length_m, where=sight.reach(own.delay_s) > 0.1, initial=0.0))
     return _filtered(
         sight,
         after,
@@ -100,7 +100,7 @@ def absorption(sight: Sight) -> Estimate | None:
     )
 
 
-def emitter_directivity(sight: Sight) -> Estimate | None:
+def _emitter_directivity(sight: Sight) -> Estimate | None:
     """Ask how far off the emitters' axes the targets are."""
     sensors = sight.shot.scene.sensors
     diameter_m = max((sensors[number].emitter.diameter_m for number in sight.emitters(sight.active)), default=0.0)
@@ -113,7 +113,7 @@ def emitter_directivity(sight: Sight) -> Estimate | None:
     )
 
 
-def microphone_directivity(sight: Sight) -> Estimate | None:
+def _microphone_directivity(sight: Sight) -> Estimate | None:
     """Ask how far off the microphones' axis the sounds arrive."""
     diameter_m = sight.shot.sensor.electronics.microphone_diameter_m
     if not (diameter_m and len(sight.heard)):
@@ -125,7 +125,7 @@ def microphone_directivity(sight: Sight) -> Estimate | None:
     )
 
 
-def doppler(sight: Sight) -> Estimate | None:
+def _doppler(sight: Sight) -> Estimate | None:
     """Ask how far the motion of targets and sensors shifts the pulses.
 
     A call of hyperbolic frequency modulation, stretched by s, is the call shifted by ``-(s - 1) p₀ / p'``, p₀
@@ -157,7 +157,7 @@ def doppler(sight: Sight) -> Estimate | None:
     worst = int(np.argmax(np.abs(shift_s)))
     return Estimate(
         change_db=change_db(change, sight.beside(own.delay_s)),
-        sure=20.0,
+        sure=200.0,
         reason=f"{own.names[worst]}, coming at {-(stretch[worst] - 1) / 2 * shot.speed_m_s:.3g} m/s, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
     )
@@ -173,7 +173,7 @@ def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s / paths.second_m[:, 0])
 
 
-def cross_emission(sight: Sight) -> Estimate | None:
+def _cross_emission(sight: Sight) -> Estimate | None:
     """Find the strongest that is heard of another sensor's call, walls included."""
     if not effect("cross_emission")(sight.shot):
         return None
@@ -183,7 +183,7 @@ def cross_emission(sight: Sight) -> Estimate | None:
     return _ghosts(sight, more, foreign, "{name} is heard at {range:.2f} m, {level:+.1f} dB beside what is there")
 
 
-def sync_delay(sight: Sight) -> Estimate | None:
+def _sync_delay(sight: Sight) -> Estimate | None:
     """Ask how far the calls of others shift, where they are heard."""
     if "cross_emission" not in sight.active:
         return None
@@ -197,12 +197,12 @@ def sync_delay(sight: Sight) -> Estimate | None:
         if change > worst.change_db:
             name = sight.shot.scene.sensors[number].name
             worst = Estimate(
-                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=20.0
+                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=200.0
             )
     return worst
 
 
-def direct_sound(sight: Sight) -> Estimate | None:
+def _direct_sound(sight: Sight) -> Estimate | None:
     """Ask what is left of the direct sound where the image begins."""
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
@@ -219,7 +219,7 @@ def direct_sound(sight: Sight) -> Estimate | None:
     )
 
 
-def interference(sight: Sight) -> Estimate | None:
+def _interference(sight: Sight) -> Estimate | None:
     """Find the loudest of tones, noises and other sonars."""
     scene, shot = sight.shot.scene, sight.shot
     if not (scene.tones or scene.noises or scene.sonars):
@@ -246,7 +246,7 @@ def interference(sight: Sight) -> Estimate | None:
     return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.floor])), reason=reason, sure=6.0)
 
 
-def ambient_noise(sight: Sight) -> Estimate | None:
+def _ambient_noise(sight: Sight) -> Estimate | None:
     """Compare diffuse noise with the weakest reflector."""
     ambient = sight.shot.scene.ambient
     if ambient is None:
@@ -255,7 +255,7 @@ def ambient_noise(sight: Sight) -> Estimate | None:
     return _noise(sight, level, f"{ambient.level_dbfs:g} dBFS at each microphone")
 
 
-def microphone_noise(sight: Sight) -> Estimate | None:
+def _microphone_noise(sight: Sight) -> Estimate | None:
     """Compare white noise with the weakest reflector."""
     dbfs = sight.shot.sensor.electronics.noise_dbfs
     if dbfs is None:
@@ -263,7 +263,7 @@ def microphone_noise(sight: Sight) -> Estimate | None:
     return _noise(sight, sight.of_white_noise(dbfs), f"{dbfs:g} dBFS in each microphone")
 
 
-def microphone_spread(sight: Sight) -> Estimate | None:
+def _microphone_spread(sight: Sight) -> Estimate | None:
     """Ask what unknown gains and delays do to main lobe and side lobes."""
     electronics = sight.shot.sensor.electronics
     if not (electronics.gain_spread_db or electronics.delay_spread_s):
@@ -276,7 +276,7 @@ def microphone_spread(sight: Sight) -> Estimate | None:
     )
 
 
-def microphone_faults(sight: Sight) -> Estimate | None:
+def _microphone_faults(sight: Sight) -> Estimate | None:
     """Ask what missing microphones do to main lobe and side lobes."""
     faulty = sight.shot.sensor.electronics.faulty_channels
     if not faulty:
@@ -343,24 +343,21 @@ def _unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estim
 
 
 ESTIMATES: Final[dict[str, Callable[[Sight], Estimate | None]]] = {
-    function.__name__: function
-    for function in (
-        spreading,
-        walls,
-        occlusion,
-        target_size,
-        absorption,
-        emitter_directivity,
-        microphone_directivity,
-        doppler,
-        cross_emission,
-        sync_delay,
-        direct_sound,
-        interference,
-        ambient_noise,
-        microphone_noise,
-        microphone_spread,
-        microphone_faults,
-    )
+    "spreading": _spreading,
+    "walls": _walls,
+    "occlusion": _occlusion,
+    "target_size": _target_size,
+    "absorption": _absorption,
+    "emitter_directivity": _emitter_directivity,
+    "microphone_directivity": _microphone_directivity,
+    "doppler": _doppler,
+    "cross_emission": _cross_emission,
+    "sync_delay": _sync_delay,
+    "direct_sound": _direct_sound,
+    "interference": _interference,
+    "ambient_noise": _ambient_noise,
+    "microphone_noise": _microphone_noise,
+    "microphone_spread": _microphone_spread,
+    "microphone_faults": _microphone_faults,
 }
 """What is asked about each effect that can be left out."""

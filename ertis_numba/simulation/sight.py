@@ -20,6 +20,7 @@ from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, m
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
+_GEOMETRY = frozenset({"walls", "occlusion", "target_size"})  # on which ways of the sound depend
 _NODES = 65
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
@@ -134,7 +135,7 @@ class Sight:
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the ways of an emitter's call to the middle of the array."""
-        return echoes(self._middle, active, number, Stopwatch())
+        return _paths(self._middle, active & _GEOMETRY, number)
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
         emitter = self.shot.scene.sensors[number].emitter
@@ -292,11 +293,12 @@ class Sight:
         # Beyond a few pulses the two no longer meet, and the nodes would repeat them.
         shift_s = np.clip(shift_s, -8 / np.ptp(self.frequency_hz), 8 / np.ptp(self.frequency_hz))
         change = turn * self._met(before)
-        for centre_s in (np.zeros_like(shift_s), shift_s):
-            time_s = centre_s[:, None] + near_s
-            was = self._envelope(before.gain, time_s)
-            is_now = self._envelope(after.gain, time_s - shift_s[:, None])
-            own = np.max(np.abs(is_now - was), axis=1) * self.coverage(before.direction)
+        turns = np.exp(2j * math.pi * np.outer(self.frequency_hz - self.frequency_hz.mean(), near_s))
+        later = np.exp(-2j * math.pi * np.outer(shift_s, self.frequency_hz - self.frequency_hz.mean()))
+        was, is_now = before.gain * self.power, after.gain * self.power
+        coverage = self.coverage(before.direction)
+        for one, other in ((was, is_now * later), (was / later, is_now)):  # about the one pulse, and about the other
+            own = np.max(np.abs(np.abs(one @ turns) - np.abs(other @ turns)), axis=1) * coverage
             change = np.maximum(change, own)
         return np.asarray(change)
 
@@ -316,9 +318,10 @@ class Sight:
         met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes)
         return np.asarray(np.max(met, axis=1, initial=0.0))
 
-    def _envelope(self, gain: Floats, time_s: Floats) -> Floats:
-        turns = np.exp(2j * math.pi * time_s[..., None] * (self.frequency_hz - self.frequency_hz.mean()))
-        return np.asarray(np.abs(np.einsum("ptn,pn->pt", turns, gain * self.power)))
+
+@functools.lru_cache(maxsize=64)
+def _paths(shot: Snapshot, geometry: frozenset[str], number: int) -> list[Paths]:
+    return echoes(shot, geometry, number, Stopwatch())
 
 
 @functools.lru_cache(maxsize=64)

@@ -10,6 +10,7 @@ __all__ = ["doppler"]
 
 Floats = NDArray[np.float64]
 _ROUNDS = 8  # each makes the error smaller by v / c
+_ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
 
@@ -41,10 +42,13 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
         if len(paths.targets):
             met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
             met_s = start_s + _length(met_m - from_m) / speed_m_s
+        before_s = arrival_s
         ear_m = ear.positions_m + arrival_s[..., None] * _own_m_s(ear)
         back = _mean(arrival_s - met_s, paths.second_m)
         ear_m = ear_m + _swayed_m(ear, np.mean(arrival_s, axis=1) - paths.ear_corners_m * back)
         arrival_s = (met_s if len(paths.targets) else start_s) + _length(ear_m - met_m) / speed_m_s
+        if np.abs(arrival_s - before_s).max() < _ENOUGH_S:
+            break
     return arrival_s
 
 
