@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import checks, machine, paper, scaling, subject, tables, timing
+from ertis_bench import checks, machine, paper, scaling, simulation, subject, tables, timing
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.simulation.names import EFFECTS
 from tests.cases import SHORT, noise
 
 MARKED = "# Mine\n\n<!-- ertis bench {0} -->\nold\n<!-- /ertis bench {0} -->\n\nrest\n"
@@ -186,3 +187,26 @@ def test_generated_readme_has_both_tables(name):
     text = (Path(__file__).parents[1] / "bench" / "README.md").read_text("utf-8")
     table = text.partition(f"<!-- ertis bench {name} -->")[2].partition(f"<!-- /ertis bench {name} -->")[0]
     assert "| ---: |" in table
+
+
+def test_simulation_times_a_free_field_and_everything(monkeypatch, tmp_path):
+    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
+    target = tmp_path / "README.md"
+    target.write_text(MARKED.format("simulation"), "utf-8")
+    result = CliRunner().invoke(cli, ["bench", "simulation", "--count", "1", "--json", "--update", str(target)])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    needed, everything = report["rows"]
+    assert needed["on"] == ["propagation", "spreading", "absorption", "modulation"]
+    assert set(needed["cost_ms"]) <= set(needed["on"])  # what is not needed costs nothing
+    assert set(everything["on"]) == {*EFFECTS} - {"microphone_faults"}
+    assert report["change_db"] < 0.1
+    assert report["times_faster"] > 3
+    assert needed["median_ms"] < 200  # 5 measurements per second
+    assert "What the scene calls for takes" in target.read_text("utf-8")
+
+
+def test_simulation_refuses_to_time_images_that_differ(monkeypatch):
+    monkeypatch.setattr(simulation, "image_change_db", lambda *_, **__: 9.0)
+    with pytest.raises(DataError, match=r"change the image by 9\.00 dB, allowed are .* dB; do not trust these times"):
+        simulation.run(count=1, say=lambda _: None)

@@ -66,6 +66,18 @@ def scaling(**given: Any) -> None:
     _run("scaling", benchmark, **given)
 
 
+@bench.command()
+@_count(30)
+@_update
+@options.quiet
+@options.as_json
+def simulation(**given: Any) -> None:
+    """Scene to bits, with the effects that a scene calls for and with all."""
+    from ertis_bench import simulation as benchmark
+
+    _run("simulation", benchmark, **given)
+
+
 def _run(
     name: str, benchmark: ModuleType, *, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool
 ) -> None:

@@ -15,6 +15,7 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 __all__ = ["Plan", "Verdict", "make_plan"]
 
 _INSTANTS = 9  # at which a scene in motion is asked
+_MOST_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
 _ROUNDS = 6  # two are the rule; effects that wait for each other take more
 
 
@@ -105,7 +106,8 @@ def _decided(
         return Verdict(name=name, on=bool(forced), reason=reason, forced=forced is not None)
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
-    unsure = worst.change_db / worst.sure < scene.tolerance_db < worst.change_db * worst.sure
+    high_db, low_db = worst.change_db * worst.sure, worst.change_db / min(worst.sure, _MOST_TOO_HIGH)
+    unsure = low_db < scene.tolerance_db < high_db
     measured_db = rehearse()(index, others, name) if unsure else None
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(

@@ -1,0 +1,131 @@
+"""What a simulated measurement costs with the effects that its scene calls for, and with all of them."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ertis_bench import machine, timing
+from ertis_numba.errors import DataError
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.simulation import (
+    Ambient,
+    Electronics,
+    Emitter,
+    Noise,
+    Point,
+    Scene,
+    Sensor,
+    Sonar,
+    Sphere,
+    Tone,
+    Wall,
+)
+from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.plan import Plan, make_plan
+from ertis_numba.simulation.rehearsal import image_change_db
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import snapshot
+
+__all__ = ["free_field", "run"]
+
+_NOBODY_HEARS_DB = -180.0
+_FORCED = [name for name in EFFECTS if name != "microphone_faults"]  # a missing microphone always matters
+
+
+def free_field() -> Scene:
+    """Return ten points before a default eRTIS sensor, and with them something for every effect, too weak to matter."""
+    weak = _NOBODY_HEARS_DB
+    points = tuple(
+        Point(azimuth_deg=-60.0 + 12 * n, range_m=0.8 + 0.35 * n, strength_db=-20.0 + 2 * n) for n in range(9)
+    )
+    still_moving = Point(
+        azimuth_deg=48.0, range_m=3.95, strength_db=-2.0, diameter_m=1e-4, velocity_m_s=(0.0, 0.0, 1e-7)
+    )
+    sensor = Sensor(
+        emitter=Emitter(diameter_m=1e-5, direct_sound_db=weak),
+        electronics=Electronics(noise_dbfs=-150.0, gain_spread_db=1e-7, microphone_diameter_m=1e-5),
+    )
+    return Scene(
+        sensors=(sensor, Sensor(name="far", position_m=(5.0, 0.0, 0.0), emitter=Emitter(level_db=weak))),
+        points=(*points, still_moving),
+        spheres=(Sphere(position_m=(3.0, 1.0, 0.0), radius_m=0.01, reflection_db=weak),),
+        walls=tuple(Wall(position_m=(0.0, y, 0.0), facing_deg=(90.0, 0.0), reflection_db=weak) for y in (-4.0, 4.0)),
+        tones=(Tone(position_m=(2.0, 0.0, 0.0), frequency_hz=40_000.0, level_db=weak),),
+        noises=(Noise(position_m=(2.0, 1.0, 0.0), level_db=weak),),
+        sonars=(Sonar(position_m=(2.0, -1.0, 0.0), level_db=weak),),
+        ambient=Ambient(level_dbfs=weak),
+    )
+
+
+def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Time measurements of `free_field`, modulators included.
+
+    Parameters
+    ----------
+    count : int
+        Measurements each.
+    say : callable
+        Told what goes on.
+
+    Raises
+    ------
+    DataError
+        The two images differ by more than the effects are allowed to change.
+    """
+    scene = free_field()
+    say("deciding")
+    plan = make_plan(scene)
+    everything = make_plan(scene.replace(effects=dict.fromkeys(_FORCED, True)))
+    say("checking")
+    change_db = _change_db(scene, plan, everything)
+    allowed_db = scene.tolerance_db * len(everything.active - plan.active)
+    if change_db > allowed_db:
+        raise DataError(
+            f"effects that are not called for change the image by {change_db:.2f} dB, allowed are {allowed_db:.1f} dB; "
+            "do not trust these times"
+        )
+    say(f"timing {count} of each")
+    simulators = {"called for": Simulator(scene, plan=plan), "everything": Simulator(scene, plan=everything)}
+    for simulator in simulators.values():
+        simulator.render()
+        simulator.clock.cost_ms.clear()
+    rendered = dict.fromkeys(simulators, 0)
+
+    def render(name: str) -> None:
+        simulators[name].render(rendered[name] % 2)
+        rendered[name] += 1
+
+    times_ms = timing.round_robin({name: functools.partial(render, name) for name in simulators}, count=count)
+    medians_ms = [float(np.median(times_ms[name])) for name in simulators]
+    rows = [
+        {
+            "effects": name,
+            "on": sorted(simulator.plan.active, key=list(EFFECTS).index),
+            **timing.summary(times_ms[name]),
+            "cost_ms": {
+                effect: round(cost_ms / rendered[name], 3) for effect, cost_ms in simulator.clock.cost_ms.items()
+            },
+        }
+        for name, simulator in simulators.items()
+    ]
+    return {
+        "machine": machine.describe(),
+        "rows": rows,
+        "count": count,
+        "words": scene.sensors[0].recording.n_samples,
+        "change_db": round(change_db, 4),
+        "times_faster": round(medians_ms[1] / medians_ms[0], 2),
+    }
+
+
+def _change_db(scene: Scene, plan: Plan, everything: Plan) -> float:
+    """Return by how much the images of both plans differ."""
+    sensor = scene.sensors[0]
+    pipeline = Pipeline(sensor.settings())
+    images = [pipeline.process(Simulator(scene, plan=each).render()).energy for each in (plan, everything)]
+    shot = snapshot(scene, sensor, 0.0)
+    spacing_m = float(pipeline.range_m[1] - pipeline.range_m[0])
+    return image_change_db(images[0], images[1], spacing_m=spacing_m, floor=Sight(shot, plan.active).floor)
