@@ -50,15 +50,19 @@ class Document(Table, frozen=True, kw_only=True):
         """
         try:
             return msgspec.toml.decode(text, type=cls)
-        except msgspec.DecodeError as error:
-            place = source or cls.__name__.lower()
-            reason, _, path = str(error).replace("Object contains unknown field", "unknown key").partition(" - at `$")
-            if isinstance(error, msgspec.ValidationError):  # syntax errors name their lines themselves
-                place += f", line {_line_to_blame(cls, text, error)}"
-            if path:
-                place += f", {path.strip('.`')}"
-            remedy = "" if ";" in reason else "; correct it or take it out"
-            raise SettingsError(f"{place}: {reason}{remedy}") from error
+        except msgspec.ValidationError as error:
+            line = _line_to_blame(cls, text, error)
+            raise SettingsError(_told(cls, source, error, f", line {line}" if line else "")) from error
+        except msgspec.DecodeError as error:  # a syntax error, which names its line itself
+            raise SettingsError(_told(cls, source, error)) from error
+
+    @classmethod
+    def from_tables(cls, tables: dict[str, Any], source: str | None = None) -> Self:
+        """Read what a TOML parser returns; errors are those of `from_toml`, without a line."""
+        try:
+            return msgspec.convert(tables, type=cls)
+        except msgspec.ValidationError as error:
+            raise SettingsError(_told(cls, source, error)) from error
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -87,6 +91,17 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_none(item) for item in value]
     return value
+
+
+def _told(kind: type[Document], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
+    """Return an error in the words of this package: where, what came, the remedy."""
+    reason, _, path = str(error).partition(" - at `$")
+    path = f", {path.strip('.`')}" if path.strip(".`") else ""
+    reason = reason.replace("Object contains unknown field", "unknown key")
+    if reason.startswith("Object missing required field "):
+        reason = f"{reason.removeprefix('Object missing required field ')} is missing; give it"
+    remedy = "" if ";" in reason else "; correct it or take it out"
+    return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
 
 
 def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationError) -> int:

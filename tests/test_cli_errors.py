@@ -81,7 +81,11 @@ CASES = {
     "unknown device": ("process rec.h5 -o out.h5 --device cuda", 2, "'cuda' is not one of 'auto', 'cpu', 'numpy'"),
     "unknown method": ("process rec.h5 -o out.h5 --method quick", 2, "'quick' is not one of 'fast', 'paper'"),
     "no threads": ("process rec.h5 -o out.h5 --threads 0", 1, "threads is 0; give a whole number from 1"),
-    "unknown key": ("process rec.h5 -o out.h5 --settings key.toml", 1, "key.toml: unknown key `tempreature_c`"),
+    "unknown key": (
+        "process rec.h5 -o out.h5 --settings key.toml",
+        1,
+        "key.toml, line 2, air: unknown key `tempreature_c`",
+    ),
     "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv: "),
     "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: [Errno 2] No such file"),
     "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "make the pipeline from the recording's own"),

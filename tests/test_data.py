@@ -52,7 +52,9 @@ def test_recording_is_its_scene(name):
     assert_array_equal(measurement.words, simulator.render().words)
     (told,) = report["sensors"]
     assert hashlib.sha256(measurement.words.tobytes()).hexdigest() == told["words_sha256"]
-    assert Scene.from_toml(truth.scene) == scene
+    decided = Scene.from_toml(truth.scene)
+    assert decided.replace(effects=scene.effects) == scene
+    assert {effect for effect, on in decided.effects.items() if on} == simulator.plan.active
     assert (truth.seed, report["seed"]) == (scene.seed, scene.seed)
     reflectors = simulator.reflectors()
     assert len(scene.points) == len(reflectors) == len(told["reflectors"])

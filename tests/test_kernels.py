@@ -23,6 +23,7 @@ CONTRACTS = {
     "delay_and_sum_envelope": _contract.DelayAndSumEnvelope,
     "quantise_tiles": _contract.QuantiseTiles,
     "delay_and_sum_envelope_int16": _contract.DelayAndSumEnvelopeInt16,
+    "add_paths": _contract.AddPaths,
     "modulate_pdm": _contract.ModulatePdm,
 }
 FLOAT32 = 1e-5  # relative to the largest number that goes in
@@ -294,3 +295,33 @@ def test_results_do_not_depend_on_the_number_of_threads():
             )
         results.append(energy.tobytes() + demodulated.tobytes())
     assert len(set(results)) == 1
+
+
+def add_paths_plainly(call, turns, amplitude, first_bin, nodes_per_bin, out):
+    """The equation of `AddPaths`, bin by bin."""
+    n_nodes = amplitude.shape[2]
+    for path, mic, k in np.ndindex(*turns.shape, out.shape[1]):
+        place = min((first_bin + k) * nodes_per_bin, n_nodes - 1)
+        low = min(int(place), max(n_nodes - 2, 0))
+        high = min(low + 1, n_nodes - 1)
+        gain = amplitude[path, mic, low] + (place - low) * (amplitude[path, mic, high] - amplitude[path, mic, low])
+        turned = np.exp(-2j * np.pi * turns[path, mic] * (first_bin + k))
+        out[mic, k] += gain * call[mic if len(call) > 1 else 0, k] * turned
+
+
+@pytest.mark.parametrize("one_call", [True, False])
+@pytest.mark.parametrize(
+    ("n_paths", "n_mics", "n_bins", "n_nodes", "first_bin"),
+    [(0, 2, 5, 1, 0), (1, 1, 1, 1, 0), (3, 2, 21, 1, 7), (2, 3, 100, 5, 0), (1, 2, 333, 40, 11)],
+)
+def test_add_paths(kernel_set, one_call, n_paths, n_mics, n_bins, n_nodes, first_bin):
+    random = np.random.default_rng(4)
+    call = random.standard_normal((2, 1 if one_call else n_mics, n_bins))
+    call = call[0] + 1j * call[1]
+    turns = random.uniform(-0.5, 3.0, (n_paths, n_mics))
+    amplitude = random.standard_normal((n_paths, n_mics, n_nodes))
+    before = random.standard_normal((n_mics, n_bins)) * (1 + 1j)
+    out, wanted = before.copy(), before.copy()
+    kernel_set.add_paths(call, turns, amplitude, first_bin, 0.1, out)
+    add_paths_plainly(call, turns, amplitude, first_bin, 0.1, wanted)
+    np.testing.assert_allclose(out, wanted, rtol=0, atol=1e-10)

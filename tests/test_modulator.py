@@ -264,7 +264,7 @@ def test_modulator_is_the_same_for_any_threads_and_blocks():
     [
         ({"keys": keys_of(4)}, r"keys has shape \(4,\); give shape \(3,\)"),
         ({"noise_rms": np.zeros(1)}, r"noise_rms has shape \(1,\); give shape \(3,\)"),
-        ({"signals": np.zeros((3, 11))}, r"signals has shape \(3, 11\); give shape \(3, 10\)"),
+        ({"signals": np.zeros((3, 9))}, r"signals has shape \(3, 9\); give shape \(3, 10\)"),
         ({"out": np.zeros((10, 1), np.uint16)}, r"out, in bytes, has shape \(10, 2\); give shape \(10, 1\)"),
     ],
 )

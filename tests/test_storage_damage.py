@@ -112,7 +112,9 @@ def test_settings_that_cannot_be_used(path):
     with h5py.File(path, "r+") as file:
         text = file[f"{GROUP}/settings"]
         text[()] = text[()].replace(b"duration_s = 0.0025", b"duration_s = nan")
-    with pytest.raises(DataError, match=r"rec.h5: settings: call.duration_s is nan; give a finite number"):
+    with pytest.raises(
+        DataError, match=r"rec.h5: settings, line \d+, call: call.duration_s is nan; give a finite number"
+    ):
         open_recording(path)
 
 

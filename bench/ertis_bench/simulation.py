@@ -49,7 +49,7 @@ def free_field() -> Scene:
         electronics=Electronics(noise_dbfs=-150.0, gain_spread_db=1e-7, microphone_diameter_m=1e-5),
     )
     return Scene(
-        sensors=(sensor, Sensor(name="far", position_m=(5.0, 0.0, 0.0), emitter=Emitter(level_db=weak))),
+        sensors=(sensor, Sensor(name="far", position_m=(300.0, 0.0, 0.0), emitter=Emitter(level_db=weak))),
         points=(*points, still_moving),
         spheres=(Sphere(position_m=(3.0, 1.0, 0.0), radius_m=0.01, reflection_db=weak),),
         walls=tuple(Wall(position_m=(0.0, y, 0.0), facing_deg=(90.0, 0.0), reflection_db=weak) for y in (-4.0, 4.0)),

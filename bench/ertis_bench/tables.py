@@ -159,11 +159,11 @@ def simulation(report: dict[str, Any]) -> str:
 def _scene_conditions(report: dict[str, Any]) -> str:
     return (
         f"{report['count']} measurements each, in turns of {timing.BURST}: {report['words']:,} words of 32 "
-        "microphones, ten points in free field, and in the same scene a second sensor, walls, a sphere, a disc, motion, "
-        "tones, noise, another sonar and unequal microphones, all too weak to matter. Included: everything from the "
-        "scene to the words in memory. Not included: deciding which effects matter, compilation, and calls to warm "
-        f"up. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts the "
-        "transforms that all echoes share."
+        "microphones, ten points in free field, and in the same scene a second sensor, walls, a sphere, a disc, "
+        "motion, tones, noise, another sonar and unequal microphones, all too weak to matter. Included: everything "
+        "from the scene to the words in memory. Not included: deciding which effects matter, compilation, and calls "
+        f"to warm up. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts "
+        "the transforms that all echoes share."
     )
 
 

@@ -157,11 +157,10 @@ def settings_with(recorded: "Settings", *, settings_file: Path | None = None, **
 
 
 def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
-    import tomli_w
-
     from ertis_numba.errors import SettingsError
     from ertis_numba.settings import Settings
 
+    Settings.load(path)  # by itself first: then errors name the line
     try:
         changes = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
@@ -170,7 +169,7 @@ def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
     for name, table in changes.items():
         whole = name == "array" or not isinstance(table, dict)
         tables[name] = table if whole else {**tables.get(name, {}), **table}
-    return Settings.from_toml(tomli_w.dumps(tables), str(path))
+    return Settings.from_tables(tables, str(path))
 
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":

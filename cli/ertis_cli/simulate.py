@@ -111,10 +111,12 @@ def _truth(simulator: "Simulator") -> "Truth":
     from ertis_numba.storage import Truth
 
     scene = simulator.scene
+    # With the verdicts written out, so that the words can be made again where a rehearsal would come out otherwise.
+    decided = scene.replace(effects={verdict.name: verdict.on for verdict in simulator.plan.verdicts})
     reflectors = [tuple(simulator.reflectors(0))] * scene.count
     if scene.moves:
         reflectors[1:] = [tuple(simulator.reflectors(index)) for index in range(1, scene.count)]
-    return Truth(scene=scene.to_toml(), seed=scene.seed, reflectors=tuple(reflectors))
+    return Truth(scene=decided.to_toml(), seed=scene.seed, reflectors=tuple(reflectors))
 
 
 def _mounting(simulator: "Simulator") -> Any:
