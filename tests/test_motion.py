@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Call, Recording
-from ertis_numba.simulation import Box, Emitter, Noise, Point, Scene, Sonar, Sphere, Tone, Wall
+from ertis_numba.simulation import Box, Emitter, Noise, Point, Scene, Sonar, Sphere, Tone, Wall, synthesis
 from tests.scenes import (
     EAR,
     SENSOR,
@@ -299,3 +299,15 @@ def test_measurements_follow_the_rate_of_the_scene():
 def test_a_negative_index_is_refused():
     with pytest.raises(ArgumentError, match="index is -2; give a whole number of at least 0"):
         heard(scene_of(), index=-2)
+
+
+def test_calls_of_all_microphones_follow_from_those_of_a_few():
+    """Spectra of stretched calls by interpolation over the stretch, against those of each stretch by itself."""
+    call = Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0)
+    n_fft = 48_640
+    n_bins = int(synthesis.highest_hz(call, RATE_HZ) * n_fft / RATE_HZ)
+    for half in (0.0, 1e-6, 1e-4, 4e-4, 1e-2):  # the last is too wide, so that each has its own spectrum
+        stretch = 1.003 + half * np.linspace(-1, 1, 9)
+        wanted = synthesis._spectra(call, stretch, RATE_HZ, n_fft, n_bins)
+        given = synthesis._stretched(call, stretch, RATE_HZ, n_fft, n_bins)
+        assert np.linalg.norm(given - wanted) < 1e-5 * np.linalg.norm(wanted)
