@@ -38,7 +38,9 @@ def test_summary_is_mean_deviation_and_median():
     assert timing.summary(np.array([1.0, 2.0, 6.0])) == {"mean_ms": 3.0, "std_ms": 2.16, "median_ms": 2.0}
 
 
-def test_paper_command_reports_and_updates(tmp_path):
+def test_paper_command_reports_and_updates(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_WARM_UP", 1)
+    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("paper"), "utf-8")
     other = tmp_path / "other.md"
@@ -190,6 +192,7 @@ def test_generated_readme_has_both_tables(name):
 
 
 def test_simulation_times_a_free_field_and_everything(monkeypatch, tmp_path):
+    monkeypatch.setattr(timing, "_WARM_UP", 1)
     monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("simulation"), "utf-8")
