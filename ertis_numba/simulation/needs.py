@@ -35,7 +35,7 @@ class Estimate:
 
     change_db: float
     reason: str
-    sure: float = 4.0
+    sure: float = 20.0
 
 
 def _spreading(sight: Sight) -> Estimate | None:
@@ -69,7 +69,6 @@ def _occlusion(sight: Sight) -> Estimate | None:
     beside = open_sight.beside(sight.heard.delay_s)
     return Estimate(
         change_db=change_db(level, beside),
-        sure=5.0,
         reason=f"a wall hides {sight.heard.names[worst]}"
         + (f" and {int(hidden.sum()) - 1} more" if hidden.sum() > 1 else ""),
     )
@@ -215,7 +214,6 @@ def _direct_sound(sight: Sight) -> Estimate | None:
         change_db=change_db(level, sight.beside(time_s)),
         reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, over at {over_m:.2f} m; "
         f"the image begins at {sight.settings.processing.range_m[0]:.2f} m",
-        sure=10.0,
     )
 
 
@@ -243,7 +241,7 @@ def _interference(sight: Sight) -> Estimate | None:
                 loudest = level * part
                 level_db = 20 * math.log10(loudest / sight.floor)
                 reason = f"{kind}[{number}] is heard with {level_db:+.1f} dB beside the weakest reflector"
-    return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.floor])), reason=reason, sure=6.0)
+    return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.quietest])), reason=reason)
 
 
 def _ambient_noise(sight: Sight) -> Estimate | None:
@@ -299,7 +297,6 @@ def _ghosts(sight: Sight, seen: Echoes, new: NDArray[np.bool_], wording: str) ->
             range=seen.delay_s[worst] * sight.shot.speed_m_s / 2,
             level=20 * math.log10(max(level[worst] / beside[worst], 1e-15)),
         ),
-        sure=5.0,
     )
 
 
@@ -319,13 +316,13 @@ def _filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
     ratio = sight.envelope_change(own, after) * sight.reach(own.delay_s) / sight.beside(own.delay_s, after)
     worst = int(np.argmax(ratio))
     found = 20 * math.log10(1 + ratio[worst])
-    return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found), sure=5.0)
+    return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found))
 
 
 def _noise(sight: Sight, level: float, reason: str) -> Estimate:
     ratio_db = 20 * math.log10(max(level / sight.floor, 1e-15))
     return Estimate(
-        change_db=change_db(np.array([level]), np.array([sight.floor])),
+        change_db=change_db(np.array([level]), np.array([sight.quietest])),
         reason=f"{reason}: {ratio_db:+.1f} dB beside the weakest reflector of the image",
     )
 

@@ -7,19 +7,22 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
-from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.stages.fast import FastChain
 
 __all__ = ["Rehearsal", "image_change_db"]
 
 
 class Rehearsal:
     """Renders and processes measurements of a scene with some effects and with others.
+
+    The modulators are left out: they answer to any change with other noise, which is no change of the image.
 
     Parameters
     ----------
@@ -29,6 +32,7 @@ class Rehearsal:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._image = functools.lru_cache(maxsize=8)(self._rendered)
+        self._chain = functools.lru_cache(maxsize=8)(_chain)
 
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
         """Return by how much an effect changes the images of all sensors at the most, in decibels.
@@ -47,9 +51,10 @@ class Rehearsal:
         for sensor in self._scene.sensors:
             both = others, others | {name}
             try:
-                before, after = (self._image(sensor.name, index, active) for active in both)
+                self._chain(sensor.settings())
             except ArgumentError:
                 return None
+            before, after = (self._image(sensor.name, index, active) for active in both)
             shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
             spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
             floor = min(Sight(shot, active).floor for active in both)
@@ -58,8 +63,14 @@ class Rehearsal:
 
     def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float32]:
         sensor = self._scene.sensor(name)
-        pipeline = _pipeline(sensor.settings())  # first, for it may refuse the settings
-        return pipeline.process(Engine(self._scene, sensor, active).render(index)).energy
+        signals = Engine(self._scene, sensor, active).signals(index)
+        dbfs = sensor.electronics.noise_dbfs
+        if "microphone_noise" in active and dbfs is not None:
+            signals += 10 ** (dbfs / 20) * np.random.default_rng(self._scene.seed).standard_normal(signals.shape)
+        chain = self._chain(sensor.settings())
+        image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+        chain.process_signals(signals, image)
+        return image
 
 
 def image_change_db(
@@ -85,6 +96,7 @@ def image_change_db(
     return float(20 * np.log10(1 + np.max(np.abs(after - before) / beside, initial=0.0)))
 
 
-@functools.lru_cache(maxsize=8)
-def _pipeline(settings: Settings) -> Pipeline:
-    return Pipeline(settings)
+def _chain(settings: Settings) -> FastChain:
+    exact = settings.processing.replace(method="fast", precision="float32")
+    kernel_set = kernels.load("cpu")
+    return FastChain(settings.replace(processing=exact), kernel_set, threads=kernel_set.max_threads)

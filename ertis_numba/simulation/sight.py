@@ -28,7 +28,6 @@ _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among sid
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by their root mean square
-_TWICE = 6.0  # two renderings differ by the noise of both, which is some decibels higher at high levels
 SAME_RANGE_M = 0.05
 """Echoes so close in range count as at the same range."""
 _MODULATOR_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}  # white noise of the same level in a call's band
@@ -103,14 +102,13 @@ class Sight:
 
     @functools.cached_property
     def floor(self) -> float:
-        """The weakest reflector that the image shows, or what noise leaves where it shows none."""
+        """The weakest reflector that the image shows, or its noise where it shows none."""
         return float(np.min(self.levels(self.heard)[self.shown], initial=np.inf)) if self.shown.any() else self.noise
 
     @functools.cached_property
     def noise(self) -> float:
-        """What the modulators' noise changes by the tolerance already: nothing weaker can be held to it."""
-        highest = self.of_white_noise(_MODULATOR_DBFS[self.shot.sensor.electronics.modulator_order])
-        return float(_TWICE * highest / (10 ** (self.shot.scene.tolerance_db / 20) - 1))
+        """The highest amplitude that the modulators' noise reaches in the image."""
+        return self.of_white_noise(_MODULATOR_DBFS[self.shot.sensor.electronics.modulator_order])
 
     def echoes(self, active: frozenset[str]) -> Echoes:
         """Return what arrives of calls with other effects."""
@@ -160,26 +158,40 @@ class Sight:
 
         1 of those in it; of others the highest range side lobe of the call beyond their distance from it.
         """
-        lag_s, envelope = _pulse(self.settings)
-        return np.asarray(np.interp(self._outside_s(delay_s), lag_s, np.maximum.accumulate(envelope[::-1])[::-1]))
+        return self._lobe(self._outside_s(delay_s))
 
     def _outside_s(self, delay_s: Floats) -> Floats:
-        first_s, last_s = (2 * range_m / self.shot.speed_m_s for range_m in self.settings.processing.range_m)
+        first_s, last_s = self._window_s()
         return np.maximum(np.maximum(first_s - delay_s, delay_s - last_s), 0.0)
 
     def beside(self, delay_s: Floats, after: Echoes | None = None) -> Floats:
         """Return the strongest of the image at the ranges of some delays, at least its floor: (path,) float64.
 
-        With the same echoes under another effect, the weaker of the two counts.
+        Range side lobes count, those of echoes outside of the window, too. With the same echoes under
+        another effect, the weaker of the two counts.
         """
-        level = self.levels(self.heard) * self.shown
-        floor = self.floor
+        level, floor = self.levels(self.heard), self.floor
         if after is not None:
             level = np.minimum(level, self.levels(after))
             floor = max(float(np.min(level[self.shown], initial=floor)), self.noise)
-        apart_m = np.abs(delay_s[:, None] - self.heard.delay_s) * self.shot.speed_m_s / 2
-        near = np.where(apart_m < SAME_RANGE_M, level, 0.0)
-        return np.asarray(np.maximum(np.max(near, axis=1, initial=0.0), floor))
+        first_s, last_s = self._window_s()
+        apart_s = np.abs(np.clip(delay_s, first_s, last_s)[:, None] - self.heard.delay_s)
+        apart_s = np.maximum(apart_s - 2 * SAME_RANGE_M / self.shot.speed_m_s, 0.0)
+        return np.asarray(np.maximum(np.max(level * self._lobe(apart_s), axis=1, initial=0.0), floor))
+
+    @functools.cached_property
+    def quietest(self) -> float:
+        """The least that any range of the image shows, its floor at least."""
+        return float(np.min(self.beside(np.linspace(*self._window_s(), _LAGS))))
+
+    def _window_s(self) -> tuple[float, float]:
+        first_m, last_m = self.settings.processing.range_m
+        return 2 * first_m / self.shot.speed_m_s, 2 * last_m / self.shot.speed_m_s
+
+    def _lobe(self, lag_s: Floats) -> Floats:
+        """Return the highest range side lobe of the call at a lag and beyond, 1 at its peak."""
+        lags_s, envelope = _pulse(self.settings)
+        return np.asarray(np.interp(lag_s, lags_s, np.maximum.accumulate(envelope[::-1])[::-1]))
 
     def coverage(self, direction: Floats) -> Floats:
         """Return how much of a wave from a direction the best beam takes: (path,) float64, at most 1."""
@@ -312,8 +324,7 @@ class Sight:
         """Return the strongest that paths and side lobes of others have in one place: (path,) float64."""
         level, others = self.levels(seen)[:, None], self.levels(self.heard)
         apart_s = np.abs(seen.delay_s[:, None] - self.heard.delay_s)
-        lag_s, envelope = _pulse(self.settings)
-        lobes = np.interp(apart_s, lag_s, np.maximum.accumulate(envelope[::-1])[::-1])
+        lobes = self._lobe(apart_s)
         same = (apart_s == 0) & np.all(seen.direction[:, None] == self.heard.direction, axis=-1)
         met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes)
         return np.asarray(np.max(met, axis=1, initial=0.0))

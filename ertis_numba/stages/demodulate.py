@@ -1,4 +1,4 @@
-"""From PDM words to signals: unpack, low-pass, decimate, group delay removed."""
+"""From PDM words, or what would be modulated, to signals: low-pass, decimate, group delay removed."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ class Demodulate:
         *,
         taps: NDArray[np.int16],
     ) -> None:
-        self._kernel = kernels.demodulate_words
+        self._kernel, self._decimate = kernels.demodulate_words, kernels.decimate
         self._taps = taps
         self._scale = np.float32(1 / taps.sum(dtype=np.int64))
         self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
@@ -45,3 +45,17 @@ class Demodulate:
         self._kernel(
             words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
         )
+
+    def filtered(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
+        """Fill ``out`` from signals that were never modulated, (mic, sample) at the PDM rate, full scale 1."""
+        half, ahead = len(self._taps) // 2, -(-len(self._taps) // self._factor)
+        count = self._window.n_samples
+        first = (self._window.first_sample - ahead) * self._factor + half
+        here = np.arange(first, first + (count + ahead) * self._factor)
+        inside = (here >= 0) & (here < signals.shape[1])
+        heard = np.zeros((len(signals), len(here)), dtype=np.float32)
+        heard[:, inside] = signals[:, here[inside]]
+        decimated = np.empty((len(signals), count + ahead), dtype=np.float32)
+        self._decimate(heard, self._taps * self._scale, self._factor, decimated)
+        out[:, :count] = decimated[:, ahead:]
+        out[:, count:] = 0.0

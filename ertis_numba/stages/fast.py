@@ -73,8 +73,18 @@ class FastChain:
         buffers = self._take_buffers()
         with self._kernels.threads(self._threads):
             self._demodulate(words, buffers.signals)
-            self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
-            self._beamform(buffers.analytic, buffers.beamform, out)
+            self._finish(buffers, out)
+
+    def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
+        """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
+        buffers = self._take_buffers()
+        with self._kernels.threads(self._threads):
+            self._demodulate.filtered(signals, buffers.signals)
+            self._finish(buffers, out)
+
+    def _finish(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
+        self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
+        self._beamform(buffers.analytic, buffers.beamform, out)
         self._spare.put(buffers)
 
     def _take_buffers(self) -> _Buffers:
