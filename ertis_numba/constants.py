@@ -8,6 +8,7 @@ __all__ = [
     "STANDARD_HUMIDITY_PERCENT",
     "STANDARD_PRESSURE_PA",
     "STANDARD_TEMPERATURE_C",
+    "SYNC_STEP_S",
     "WORD_BITS",
 ]
 
@@ -16,6 +17,7 @@ STANDARD_HUMIDITY_PERCENT: Final = 50.0
 STANDARD_PRESSURE_PA: Final = 101_325.0  # ISO 9613-1, reference pressure
 
 ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
+SYNC_STEP_S: Final = 400e-9  # from one sensor of the SYNC chain to the next; Jansen et al., 2019
 
 MAX_MICROPHONES: Final = 1024
 WORD_BITS: Final = (8, 16, 32, 64)

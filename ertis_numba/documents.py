@@ -3,6 +3,7 @@
 A structure checks itself once, when it is made, in its ``__post_init__``. Unknown keys are refused.
 """
 
+import bisect
 import re
 from pathlib import Path
 from typing import Any, Self
@@ -111,14 +112,17 @@ def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationErr
     names.
     """
     lines = text.splitlines()
-    end = next((n for n in range(1, len(lines)) if _error(kind, lines[:n]) == str(error)), len(lines))
-    headers = [n for n, line in enumerate(lines, 1) if _HEADER.match(line)]
-    begin = max((n for n in headers if n <= end), default=1)
-    stop = min((n for n in headers if n > end), default=len(lines) + 1)
+    starts = [1, *(n for n, line in enumerate(lines, 1) if n > 1 and _HEADER.match(line))]
+    stops = [*starts[1:], len(lines) + 1]
+    # Tables are read one after the other, and what errs once keeps erring: the first one is found by halves.
+    table = bisect.bisect_left(stops[:-1], x=True, key=lambda stop: _error(kind, lines[: stop - 1]) == str(error))
+    begin, stop = starts[table], stops[table]
+    end = next((n for n in range(begin, stop) if _error(kind, lines[:n]) == str(error)), stop - 1)
     told, _, path = str(error).partition(" - at `$")
     named = {*re.findall(r"\w+", told.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
-    keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, min(stop, len(lines) + 1)))
-    return next((n for n, key in keys if key and key[1] in named), begin if headers and begin in headers else end)
+    keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
+    is_table = bool(lines and _HEADER.match(lines[begin - 1]))
+    return next((n for n, key in keys if key and key[1] in named), begin if is_table else end)
 
 
 def _error(kind: type[Document], lines: list[str]) -> str:

@@ -3,13 +3,17 @@
 import dataclasses
 import functools
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
+from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.rehearsal import image_change_db
 from ertis_numba.simulation.render import Simulator
@@ -213,3 +217,75 @@ def test_what_is_left_out_changes_less_and_what_is_needed_more(batch):
             if not verdict.on and change_db >= scene.tolerance_db:
                 wrong.append((seed, verdict.name, "left out, yet it changes", change_db))
     assert not wrong
+
+
+@pytest.mark.parametrize(
+    ("sensor", "point", "name"),
+    [
+        (Sensor(), Point(range_m=5.0, strength_db=-60.0), "absorption"),
+        (
+            Sensor(emitter=Emitter(level_db=-20.0, diameter_m=0.02)),
+            Point(azimuth_deg=60.0, range_m=1.0, strength_db=-30.0),
+            "emitter_directivity",
+        ),
+    ],
+)
+def test_weak_echoes_count_as_long_as_an_image_shows_them(sensor, point, name):
+    """Some 14 and 19 dB above the modulators' noise, and changed by 10 and 20 dB."""
+    assert name in make_plan(Scene(sensors=(sensor,), points=(point,))).active
+
+
+def test_verdicts_hold_in_images_from_bits():
+    """What is left out moves no reflector in images that went through the modulators, loud enough to be sure of it."""
+    for seed in range(6):
+        scene = random_scene(seed)
+        loud = scene.replace(points=tuple(point.replace(strength_db=-12.0) for point in scene.points), spheres=())
+        plan = make_plan(loud)
+        if overloads(loud, plan):
+            continue
+        sensor = loud.sensors[0]
+        pipeline = Pipeline(sensor.settings())
+        bits = pipeline.process(Simulator(loud, plan=plan).render()).energy.astype(float)
+        shown = Sight(snapshot(loud, sensor, 0.0), plan.active)
+        sure = shown.shown & (shown.levels(shown.heard) > 300 * shown.noise)
+        echo_ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
+        for name in {verdict.name for verdict in plan.verdicts if not verdict.on and verdict.estimate_db is not None}:
+            turned = pipeline.process(Simulator(loud, plan=with_one(plan, name, on=True)).render()).energy
+            for range_m in echo_ranges_m:
+                near = np.abs(pipeline.range_m - range_m) < 0.02
+                change_db = 20 * np.log10(turned[:, near].max() / bits[:, near].max())
+                assert abs(change_db) < loud.tolerance_db, (seed, name, range_m)
+
+
+def test_effects_that_go_in_a_circle_all_stay_on(monkeypatch):
+    """Walls matter without the facing of discs only, and that only with the walls."""
+
+    def of(name, matters):
+        return lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)
+
+    monkeypatch.setitem(ESTIMATES, "walls", of("walls", lambda active: "target_size" not in active))
+    monkeypatch.setitem(ESTIMATES, "target_size", of("size", lambda active: "walls" in active))
+    verdicts = {verdict.name: verdict for verdict in make_plan(Scene(points=(Point(range_m=1.0),))).verdicts}
+    for name in ("walls", "target_size"):
+        assert verdicts[name].on
+        assert verdicts[name].coupled
+        assert verdicts[name].reason.endswith("stays on, as others wait for it")
+
+
+def test_what_is_not_needed_is_not_imported():
+    """In a process of its own, a free field loads what its plan names, and noise of nobody is not drawn."""
+    code = """
+import sys
+from ertis_numba.simulation import Point, Scene
+from ertis_numba.simulation.render import Simulator
+simulator = Simulator(Scene(points=(Point(range_m=1.0), Point(range_m=3.0, azimuth_deg=30.0))))
+simulator.render()
+prefix = "ertis_numba.simulation.effects."
+print(sorted(name.removeprefix(prefix) for name in sys.modules if name.startswith(prefix)))
+print(sorted(simulator.plan.active))
+print(sorted(simulator.clock.cost_ms))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded, active, costs = done.stdout.splitlines()
+    assert loaded == "['absorption', 'propagation', 'spreading']"
+    assert active == costs == "['absorption', 'modulation', 'propagation', 'spreading']"

@@ -1,6 +1,7 @@
 """Scenes as TOML, and what is refused."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -292,3 +293,11 @@ def test_rotation_and_quaternion_are_one(yaw_deg, pitch_deg, roll_deg):
     assert_allclose(scipy.spatial.transform.Rotation.from_quat(sensor.quaternion()).as_matrix(), rotation, atol=1e-9)
     wanted_m = (math.cos(math.radians(pitch_deg)) * math.cos(math.radians(yaw_deg)), math.sin(math.radians(pitch_deg)))
     assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # nose to the left, then up
+
+
+def test_an_error_in_a_long_scene_is_found_soon():
+    lines = ["[[points]]\nrange_m = 1"] * 1000 + ["[[points]]\nrnage_m = 1"] + ["[[points]]\nrange_m = 1"] * 1000
+    started_s = time.perf_counter()
+    with pytest.raises(SettingsError, match=r"scene, line 2002, points\[1000\]: unknown key `rnage_m`"):
+        Scene.from_toml("\n".join(lines))
+    assert time.perf_counter() - started_s < 5

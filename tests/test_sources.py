@@ -16,6 +16,7 @@ from tests.scenes import (
     SENSOR,
     SPEED_M_S,
     arrival_s,
+    bits_of,
     error_db,
     heard,
     line_array,
@@ -290,3 +291,21 @@ def test_sources_are_not_heard_where_the_effect_is_off():
         ambient=Ambient(),
     )
     assert not heard(scene).any()
+
+
+def test_parts_of_a_large_array_hear_parts_of_one_ambient_noise():
+    """Channels are rendered 128 at a time; those of different parts are as independent as their distance makes them."""
+    sensor = LISTENS.replace(array=line_array(256, 0.01), recording=Recording(n_samples=100_000))
+    scene = scene_of(sensor=sensor, ambient=Ambient(level_dbfs=-30))
+    whole = heard(scene, "ambient_noise")
+    frequency_hz = np.fft.rfftfreq(whole.shape[1], 1 / RATE_HZ)
+    band = (frequency_hz > 20e3) & (frequency_hz < 80e3)
+    rows = np.fft.rfft(whole)[:, band]
+    found = np.fft.rfft(bits_of(Simulator(scene, plan=only("ambient_noise")).render())[[0, 72, 200]])[:, band]
+
+    def likeness(one, other):
+        return abs(np.vdot(one, other)) / np.linalg.norm(one) / np.linalg.norm(other)
+
+    assert likeness(rows[0], rows[128]) < 0.1  # 1.28 m apart
+    for row, mic in zip(found, (0, 72, 200), strict=True):
+        assert likeness(row, rows[mic]) > 0.9  # what is rendered in parts is what is rendered as a whole

@@ -67,7 +67,12 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
-    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
+    with (
+        options.note_when_slow(
+            "deciding which effects matter, and compiling kernels at the first run ...", quiet=quiet
+        ),
+        options.interrupt_later(),
+    ):
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator
 
@@ -133,6 +138,7 @@ def _effects(plan: "Plan", simulators: "Sequence[Simulator]") -> list[dict[str, 
             "on": verdict.on,
             "forced": verdict.forced,
             "rehearsed": verdict.rehearsed,
+            "coupled": verdict.coupled,
             "reason": verdict.reason,
             "estimate_db": None if verdict.estimate_db is None else round(verdict.estimate_db, 6),
             "cost_ms": round(sum(simulator.clock.cost_ms[verdict.name] for simulator in simulators) / rendered, 3),

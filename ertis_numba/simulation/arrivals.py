@@ -19,7 +19,6 @@ __all__ = ["Arrivals", "arrivals", "echoes", "effect", "gains", "responses"]
 
 Floats = NDArray[np.float64]
 _TICK_S = 1e-12
-_SPECTRAL = ("target_size", "absorption", "emitter_directivity", "microphone_directivity")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +95,7 @@ def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwat
     mouth = shot.mouths[number]
     if "walls" in active:
         with clock("walls"):
-            firsts, seconds, specular = effect("walls")(shot, mouth)
+            firsts, seconds, specular = shot.once(("walls", number), lambda: effect("walls")(shot, mouth))
     else:
         firsts = tuple(images(mouth, shot.targets.positions_m, (), 0))
         seconds = tuple(images(shot.ear, shot.targets.positions_m, (), 0))

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba import checks, kernels
+from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.simulation import synthesis
@@ -20,7 +21,6 @@ from ertis_numba.simulation.truth import reflectors
 __all__ = ["Engine"]
 
 _CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word
-_SYNC_STEP_NS = 400
 
 
 class Engine:
@@ -34,7 +34,7 @@ class Engine:
     active : frozenset of str
         The effects.
     threads : int, optional
-        For the modulators; all cores by default. The bits do not depend on it.
+        All cores by default. The bits do not depend on it.
 
     Attributes
     ----------
@@ -50,9 +50,10 @@ class Engine:
         self.sensor = sensor
         self.active = active
         self.clock = Stopwatch()
+        sensor.require_microphones()
         self._layout = microphones(self.sensor.array)
         self._settings = self.sensor.settings()
-        self._threads = threads
+        self._threads = kernels.load("cpu").max_threads if threads is None else threads
         rate_hz = self.sensor.recording.pdm_rate_hz
         calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
         self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
@@ -119,6 +120,7 @@ class Engine:
             n_samples=recording.n_samples,
             rate_hz=recording.pdm_rate_hz,
             n_mics=len(shot.channels),
+            threads=self._threads,
             clock=self.clock,
         )
         gain, _ = gains(shot, active, self.clock)
@@ -157,7 +159,7 @@ class Engine:
         return np.array([seed.generate_state(1, np.uint64)[0] for seed in seeds])
 
     def _stamp(self, shot: Snapshot, index: int) -> Stamp:
-        later_ns = _SYNC_STEP_NS * shot.number if "sync_delay" in self.active else 0
+        later_ns = round(SYNC_STEP_S * shot.number * 1e9)
         return Stamp(
             sensor=self.sensor.name,
             sequence=index,

@@ -13,7 +13,7 @@ from ertis_numba.geometry import Layout
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]
 
 _MAX_ORDER = 4
-_OUT_OF_BAND_GAIN = 1.5  # Lee's rule: a one-bit loop with no more gain than this is stable
+_OUT_OF_BAND_GAIN = 1.5  # Lee's rule of thumb: one-bit loops with no more gain are stable as a rule, and these are
 _LIMIT = 2.0  # integrators reach 1.7 at half scale; with 8 the loop no longer returns from overload
 _GAIN_STEP = 2.0**-20  # gains as short numbers: no processor's last digit can change a bit
 

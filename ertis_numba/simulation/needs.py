@@ -174,7 +174,7 @@ def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
 
 def _cross_emission(sight: Sight) -> Estimate | None:
     """Find the strongest that is heard of another sensor's call, walls included."""
-    if not effect("cross_emission")(sight.shot):
+    if len(sight.shot.scene.sensors) == 1 or not effect("cross_emission")(sight.shot):
         return None
     more = sight.echoes(sight.active | {"cross_emission", *(["walls"] if sight.shot.mirrors else [])})
     own = sight.shot.sensor.name

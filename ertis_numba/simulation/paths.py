@@ -1,7 +1,6 @@
 """The ways of the sound: from an emitter, by a target or none, to every microphone."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,11 +64,6 @@ class Paths:
     def reflection(self) -> float:
         """Amplitude that the walls leave."""
         return self.mouth.reflection * self.ear.reflection
-
-    def of_mics(self, mics: slice) -> Self:
-        """Return the paths to some of the microphones."""
-        cut = {name: getattr(self, name)[:, mics] for name in ("first_m", "second_m", "leaving", "arriving")}
-        return replace(self, ear=replace(self.ear, positions_m=self.ear.positions_m[mics]), **cut)
 
 
 def by_targets(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: NDArray[np.intp]) -> Paths:

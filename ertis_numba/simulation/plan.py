@@ -74,19 +74,22 @@ def make_plan(scene: Scene) -> Plan:
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
+    rounds = [_active(verdicts)]
     for _ in range(_ROUNDS):
-        before = _active(verdicts)
         for name in EFFECTS:
             verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
-        if _active(verdicts) == before:
+        rounds.append(_active(verdicts))
+        if rounds[-1] == rounds[-2]:
             return Plan(tuple(verdicts.values()))
-    waiting = _active(verdicts) ^ before  # one matters only with the other, which matters only without it
-    return Plan(
-        tuple(
-            replace(verdict, on=True, coupled=True) if verdict.name in waiting else verdict
-            for verdict in verdicts.values()
-        )
-    )
+    # They go in a circle: one matters only with the other, which matters only without it.
+    circle = frozenset.union(*rounds[2:]) - frozenset.intersection(*rounds[2:])
+    return Plan(tuple(_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values()))
+
+
+def _kept_on(verdict: Verdict) -> Verdict:
+    if verdict.forced:
+        return verdict
+    return replace(verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, as others wait for it")
 
 
 def _decided(
@@ -113,7 +116,7 @@ def _decided(
     return Verdict(
         name=name,
         on=change_db > scene.tolerance_db,
-        reason=worst.reason,
+        reason=worst.reason if measured_db is None else f"{worst.reason}; rehearsed",
         estimate_db=change_db,
         rehearsed=measured_db is not None,
     )

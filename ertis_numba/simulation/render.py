@@ -19,7 +19,7 @@ class Simulator(Engine):
     plan : Plan, optional
         Which effects; what the scene calls for by default.
     threads : int, optional
-        For the modulators; all cores by default. The bits do not depend on it.
+        All cores by default. The bits do not depend on it.
 
     Attributes
     ----------

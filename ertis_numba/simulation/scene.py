@@ -12,7 +12,7 @@ import msgspec
 from ertis_numba import checks
 from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import load_layout, microphones
+from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Array
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.sensors import Sensor
@@ -139,11 +139,8 @@ def load_scene(path: str | Path) -> Scene:
     path = Path(path)
     scene = Scene.load(path).with_layouts_of(path.parent)
     for sensor in scene.sensors:
-        enabled = microphones(sensor.array).enabled
-        for channel in sensor.electronics.faulty_channels:
-            if channel >= len(enabled) or not enabled[channel]:
-                raise ArgumentError(
-                    f"{path}: sensor {sensor.name!r} has no microphone on channel {channel}, which is to be faulty; "
-                    f"give one of its {len(enabled)} channels, counted from 0"
-                )
+        try:
+            sensor.require_microphones()
+        except ArgumentError as error:
+            raise ArgumentError(f"{path}: {error}") from error
     return scene

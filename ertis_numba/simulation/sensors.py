@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.placed import Placed, Vector
 
@@ -85,6 +86,11 @@ class Electronics(Table, frozen=True, kw_only=True):
         checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, _LARGEST_M)
         checks.between("electronics.gain_spread_db", self.gain_spread_db, 0.0, 20.0)
         checks.between("electronics.delay_spread_s", self.delay_spread_s, 0.0, 1e-4)
+        both = set(self.stuck_low) & set(self.stuck_high)
+        if both:
+            raise ArgumentError(
+                f"electronics has channel {min(both)} in stuck_low and in stuck_high; give it in one of them"
+            )
 
     @property
     def faulty_channels(self) -> tuple[int, ...]:
@@ -138,6 +144,22 @@ class Sensor(Settings, frozen=True, kw_only=True):
         for name in ("dead_channels", "stuck_low", "stuck_high"):
             for channel in getattr(self.electronics, name):
                 checks.whole(f"electronics.{name}", channel, 0, 1023)
+
+    def require_microphones(self) -> None:
+        """Refuse faults of channels that carry no microphone, which only the layout can tell.
+
+        Raises
+        ------
+        ArgumentError
+            There is such a channel.
+        """
+        enabled = microphones(self.array).enabled
+        for channel in self.electronics.faulty_channels:
+            if channel >= len(enabled) or not enabled[channel]:
+                raise ArgumentError(
+                    f"sensor {self.name!r} has no microphone on channel {channel}, which is to be faulty; "
+                    f"give one of its {len(enabled)} channels, counted from 0"
+                )
 
     def path(self) -> Placed:
         """Return the place of its origin, which is that of the world by default."""

@@ -83,7 +83,7 @@ class Sight:
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
         self.shot = shot
         # Paths end in the middle of the array: what microphones hear differs by parts of a percent.
-        self._middle = _middle(shot)
+        self._middle = shot.at_centre()
         self.active = active
         self.settings = shot.sensor.settings()
         self.frequency_hz, self.power = _band(self.settings)
@@ -133,7 +133,8 @@ class Sight:
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the ways of an emitter's call to the middle of the array."""
-        return _paths(self._middle, active & _GEOMETRY, number)
+        middle, geometry = self._middle, active & _GEOMETRY
+        return middle.once((number, geometry), lambda: echoes(middle, geometry, number, Stopwatch()))
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
         emitter = self.shot.scene.sensors[number].emitter
@@ -328,16 +329,6 @@ class Sight:
         same = (apart_s == 0) & np.all(seen.direction[:, None] == self.heard.direction, axis=-1)
         met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes)
         return np.asarray(np.max(met, axis=1, initial=0.0))
-
-
-@functools.lru_cache(maxsize=64)
-def _paths(shot: Snapshot, geometry: frozenset[str], number: int) -> list[Paths]:
-    return echoes(shot, geometry, number, Stopwatch())
-
-
-@functools.lru_cache(maxsize=64)
-def _middle(shot: Snapshot) -> Snapshot:
-    return replace(shot, ear=replace(shot.ear, positions_m=shot.ear.centre_m[None]))
 
 
 def change_db(part: Floats, beside: Floats) -> float:

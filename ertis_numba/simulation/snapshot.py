@@ -1,7 +1,8 @@
 """A scene at one instant, in the world frame: where everything is and how it moves."""
 
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from ertis_numba.simulation.sensors import Sensor
 __all__ = ["Ear", "Mirror", "Mouth", "Snapshot", "Targets", "snapshot"]
 
 Floats = NDArray[np.float64]
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +101,7 @@ class Targets:
 
     def chosen(self, places: NDArray[np.intp]) -> Self:
         """Return some of them: (target,) numbers."""
-        arrays = {field.name: getattr(self, field.name)[places] for field in fields(self)[1:]}
+        arrays = {each.name: getattr(self, each.name)[places] for each in fields(self)[1:]}
         return replace(self, names=tuple(self.names[k] for k in places), **arrays)
 
 
@@ -149,6 +151,8 @@ class Snapshot:
     mirrors : tuple of Mirror
     speed_m_s : float
         Of sound.
+    memory : dict
+        What was found out about this moment, and ends with it.
     """
 
     scene: Scene
@@ -161,6 +165,14 @@ class Snapshot:
     targets: Targets
     mirrors: tuple[Mirror, ...]
     speed_m_s: float
+    memory: dict[object, Any] = field(default_factory=dict, repr=False)
+
+    def once(self, key: object, make: Callable[[], Found]) -> Found:
+        """Return what ``make`` returned when it was first asked for under this key."""
+        if key not in self.memory:
+            self.memory[key] = make()
+        found: Found = self.memory[key]
+        return found
 
     @property
     def number(self) -> int:
@@ -175,7 +187,12 @@ class Snapshot:
     def of_mics(self, mics: slice) -> Self:
         """Return the same with some of the microphones."""
         ear = replace(self.ear, positions_m=self.ear.positions_m[mics])
-        return replace(self, ear=ear, channels=self.channels[mics])
+        return replace(self, ear=ear, channels=self.channels[mics], memory={})
+
+    def at_centre(self) -> Self:
+        """Return the same with one microphone, in the middle of the array."""
+        ear = replace(self.ear, positions_m=self.ear.centre_m[None])
+        return self.once("centre", lambda: replace(self, ear=ear, memory={}))
 
 
 def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:

@@ -99,8 +99,8 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     A reflector counts if the image can show it: its range lies on the range axis, its direction within
     half of the main lobe of the nearest direction, and its level is at least ``min_level_db`` below the
     strongest that counts. Peaks are assigned to those one to one, such that as many as possible lie
-    within 0.1 m and one and a half main lobes, at the least sum of squared distances (H. W. Kuhn, The
-    Hungarian method for the assignment problem, 1955). At most 100 peaks more than reflectors are
+    within 0.1 m and one and a half main lobes, at the least sum of squared distances (the
+    assignment problem, solved by SciPy after D. F. Crouse, 2016). At most 100 peaks more than reflectors are
     looked for.
 
     Parameters

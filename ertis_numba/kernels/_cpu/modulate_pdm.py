@@ -19,7 +19,8 @@ _OCTETS = LANES // 8
 _INTEGRATORS = 4
 _TILE = 256  # samples between two writes of octets: threads that write beside each other wait for each other's lines
 
-# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators, 2014)
+# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators,
+# 2014; the constants are variant 13 of D. Stafford's, as in the generators of S. Vigna)
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)

@@ -8,6 +8,7 @@ from ertis_numba.simulation.sources import Ambient
 
 __all__ = ["ambient_noise"]
 
+_OWN = 1e-6  # share of each microphone alone: below some kilohertz all hear the same, and no root would exist
 _NODE_HZ = 2000.0  # coherence of microphones 15 cm apart changes by a few hundredths from one to the next
 
 
@@ -22,10 +23,11 @@ def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> Fr
     bins = band_bins(ambient.band_hz, rate_hz)
     frequency_hz = bins * rate_hz / FRAME
     places, nodes = np.unique(np.rint(frequency_hz / _NODE_HZ), return_inverse=True)
-    positions_m = shot.ear.positions_m
+    # Parts of a large array are rendered one after the other, and have to hear parts of one field.
+    every = np.flatnonzero(shot.layout.enabled)
+    positions_m = shot.layout.positions_m[every]
     apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
     coherence = np.sinc(2 * apart_m / shot.speed_m_s * np.maximum(places, 0.5)[:, None, None] * _NODE_HZ)
-    power, vectors = np.linalg.eigh(coherence)
-    mix = vectors * np.sqrt(np.maximum(power, 0.0))[:, None, :] @ vectors.transpose(0, 2, 1)
+    mix = np.linalg.cholesky(coherence + _OWN * np.eye(len(every)))[:, np.searchsorted(every, shot.channels)]
     level = 10 ** (ambient.level_dbfs / 20)
     return Frames(seed, lambda random: level * drawn(random, bins, mix[nodes]) * window())

@@ -9,7 +9,7 @@ from ertis_numba.simulation.snapshot import Ear, Mouth
 __all__ = ["doppler"]
 
 Floats = NDArray[np.float64]
-_ROUNDS = 8  # each makes the error smaller by v / c
+_ROUNDS = 60  # each makes the error smaller by v / c, so that few are used
 _ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
@@ -18,9 +18,10 @@ def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     """Return when the call's beginning arrives, and how long its seconds last: both (path, mic) float64.
 
     Everything moves steadily. What leaves at t₀ meets the target at t₁, where it then is, and the microphone at
-    t₂: ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|`` and so on; walls are where they are when the sound meets them. The call
-    is stretched by dt₂/dt₀ at its beginning, which is the product of the Doppler factors of all that moves
-    (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
+    t₂: ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|`` and so on; walls are where they are when the sound meets them, to the
+    first order of v / c where it meets them aslant. Amplitudes are those of things at rest. The call is stretched
+    by dt₂/dt₀ at its beginning, which is the product of the Doppler factors of all that moves (P. M. Morse, K. U.
+    Ingard, Theoretical Acoustics, 1968, chapter 11).
     """
     earlier_s, arrival_s, later_s = (_arrival_s(paths, start_s, speed_m_s) for start_s in (-_STEP_S, 0.0, _STEP_S))
     return arrival_s, (later_s - earlier_s) / (2 * _STEP_S)

@@ -1,10 +1,9 @@
 """Each sensor of the SYNC chain starts later."""
 
+from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["STEP_S", "sync_delay"]
-
-STEP_S = 400e-9  # from one sensor to the next, measured by the authors of the 2019 paper
+__all__ = ["sync_delay"]
 
 
 def sync_delay(shot: Snapshot, emitter: int) -> float:
@@ -12,4 +11,4 @@ def sync_delay(shot: Snapshot, emitter: int) -> float:
 
     Sensors are chained in the order of the scene; each starts emitter and record together.
     """
-    return (emitter - shot.number) * STEP_S
+    return (emitter - shot.number) * SYNC_STEP_S

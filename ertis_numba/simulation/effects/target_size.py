@@ -32,7 +32,8 @@ def disc_pattern(paths: Paths, frequency_hz: NDArray[np.float64], speed_m_s: flo
     """Return what discs send towards the ear of what reaches them: (path, 1, frequency) float64.
 
     The far field of a plane circular mirror, ``2 J₁(v) / v`` with ``v = π d f |s| / c``, s being the sum of the
-    unit vectors towards both ends without its part along the normal (Kirchhoff's approximation; both
+    unit vectors towards both ends without its part along the normal (Kirchhoff's approximation without its
+    obliquity; both
     ends on the facing side, else nothing).
     """
     towards_ear = unit(np.mean(paths.arriving, axis=1))

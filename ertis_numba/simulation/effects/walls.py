@@ -1,14 +1,11 @@
 """Mirror images of emitters and targets in walls."""
 
-import functools
-
 from ertis_numba.simulation.mirrors import Seen, images
 from ertis_numba.simulation.snapshot import Ear, Mouth, Snapshot
 
 __all__ = ["walls"]
 
 
-@functools.lru_cache(maxsize=64)  # of one moment: an emitter is asked for again and again while effects are decided
 def walls(
     shot: Snapshot, mouth: Mouth
 ) -> tuple[tuple[Seen[Mouth], ...], tuple[Seen[Ear], ...], tuple[Seen[Mouth], ...]]:
