@@ -17,7 +17,7 @@ from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.rehearsal import image_change_db
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 from ertis_numba.stages.fast import FastChain
 
@@ -252,7 +252,7 @@ def test_verdicts_hold_in_images_from_bits():
         for name in {verdict.name for verdict in plan.verdicts if not verdict.on and verdict.estimate_db is not None}:
             turned = pipeline.process(Simulator(loud, plan=with_one(plan, name, on=True)).render()).energy
             for range_m in echo_ranges_m:
-                near = np.abs(pipeline.range_m - range_m) < 0.02
+                near = np.abs(pipeline.range_m - range_m) < SAME_RANGE_M
                 change_db = 20 * np.log10(turned[:, near].max() / bits[:, near].max())
                 assert abs(change_db) < loud.tolerance_db, (seed, name, range_m)
 
