@@ -17,7 +17,7 @@ from ertis_numba.errors import SettingsError
 __all__ = ["Document", "Table"]
 
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
-_KEY = re.compile(r"\s*([\w-]+)\s*[=.]")
+_KEY = re.compile(r"\s*([\w.-]+)\s*=")
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -75,7 +75,7 @@ class Document(Table, frozen=True, kw_only=True):
             The file cannot be read or used.
         """
         try:
-            text = Path(path).read_text(encoding="utf-8")
+            text = Path(path).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(f"{path}: {error}; give a readable {cls.__name__.lower()} file") from error
         return cls.from_toml(text, str(path))
@@ -122,7 +122,7 @@ def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationErr
     named = {*re.findall(r"\w+", told.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
     keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
     is_table = bool(lines and _HEADER.match(lines[begin - 1]))
-    return next((n for n, key in keys if key and key[1] in named), begin if is_table else end)
+    return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else end)
 
 
 def _error(kind: type[Document], lines: list[str]) -> str:

@@ -147,7 +147,7 @@ class Recording(Table, frozen=True, kw_only=True):
     n_samples: int = _WORDS["default"]
 
     def __post_init__(self) -> None:
-        checks.positive("recording.pdm_rate_hz", self.pdm_rate_hz)
+        checks.between("recording.pdm_rate_hz", self.pdm_rate_hz, 1e3, 1e9)
         checks.whole("recording.n_samples", self.n_samples, 1, _MOST_SAMPLES)
 
     @property

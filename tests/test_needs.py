@@ -289,3 +289,30 @@ print(sorted(simulator.clock.cost_ms))
     loaded, active, costs = done.stdout.splitlines()
     assert loaded == "['absorption', 'propagation', 'spreading']"
     assert active == costs == "['absorption', 'modulation', 'propagation', 'spreading']"
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {
+            "count": 20,
+            "sonars": (Sonar(position_m=(2.0, -1.0, 0.0), level_db=-30.0, offset_s=0.04, period_s=0.049),),
+        },
+        {"noises": (Noise(position_m=(2.0, -1.0, 0.0), level_db=-30.0, band_hz=(40_000.0, 40_001.0)),)},
+        {"sonars": (Sonar(position_m=(2.0, -1.0, 0.0), level_db=-85.0, offset_s=0.0),) * 30},
+    ],
+)
+def test_interference_is_found(more):
+    """Of a sonar that the first measurement does not hear, of the narrowest noise, and of many that are weak."""
+    scene = Scene(points=(Point(azimuth_deg=30.0, range_m=2.0),), **more)
+    assert "interference" in make_plan(scene).active
+
+
+def test_what_happens_between_way_points_is_found():
+    """A screen that stands in the way for a fifth of a second out of five."""
+    times_s = ((0.0, -5.0), (1.3, -5.0), (1.4, 0.0), (1.5, 0.0), (1.6, 5.0), (5.0, 5.0))
+    screen = Wall(
+        waypoints=tuple((time_s, 1.0, y, 0.0) for time_s, y in times_s), facing_deg=(180.0, 0.0), size_m=(0.5, 0.5)
+    )
+    scene = Scene(count=100, points=(Point(range_m=2.0),), walls=(screen,))
+    assert {"walls", "occlusion"} <= make_plan(scene).active

@@ -152,3 +152,21 @@ def test_it_refuses(tmp_path, text, arguments, code, message):
     assert re.search(message, result.stderr)
     assert result.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == ([path] if text is not None else [])
+
+
+def test_it_says_when_modulators_are_overloaded(tmp_path):
+    path = tmp_path / "loud.toml"
+    path.write_text(SCENE.replace(points=(SCENE.points[0].replace(strength_db=10.0),)).to_toml(), encoding="utf-8")
+    result = simulate(path)
+    assert result.exit_code == 0
+    assert "of full scale, and modulators follow up to 0.6; lower emitter.level_db" in result.stderr
+
+
+def test_it_writes_to_no_device_and_no_link(scene_file, tmp_path):
+    link = tmp_path / "link.h5"
+    link.symlink_to(tmp_path / "nowhere.h5")
+    for target in ("/dev/null", link):
+        refused = simulate(scene_file, "-o", target, "--force")
+        assert refused.exit_code == 1
+        assert "is a link or a device; give the name of a file" in refused.stderr
+    assert link.is_symlink()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["simulate"]
 
+_FOLLOWED = 0.6  # of full scale, by the modulators
 _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
 
@@ -67,15 +68,12 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
-    with (
-        options.note_when_slow(
-            "deciding which effects matter, and compiling kernels at the first run ...", quiet=quiet
-        ),
-        options.interrupt_later(),
-    ):
+    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
         from ertis_numba.simulation.plan import make_plan
-        from ertis_numba.simulation.render import Simulator
+        from ertis_numba.simulation.render import Simulator, compile_kernels
 
+        compile_kernels()
+    with options.note_when_slow("deciding which effects matter ...", quiet=quiet, after_s=3.0):
         plan = make_plan(scene)
         simulators = [Simulator(scene, sensor=name, plan=plan) for name in names]
         firsts = [simulator.render(0) for simulator in simulators]
@@ -97,6 +95,13 @@ def simulate(
             mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
         )
     options.say(_summary(target, scene, truth), quiet=quiet)
+    for simulator in simulators:
+        if simulator.loudest > _FOLLOWED:
+            options.say(
+                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, and modulators "
+                f"follow up to {_FOLLOWED:g}; lower emitter.level_db or move things away",
+                quiet=quiet,
+            )
     effects = _effects(plan, simulators)
     if as_json:
         options.print_json(_report(target, scene, truth) | ({"effects": effects} if explain else {}))

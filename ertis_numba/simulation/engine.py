@@ -20,6 +20,7 @@ from ertis_numba.simulation.truth import reflectors
 
 __all__ = ["Engine"]
 
+_EVERY = 16  # samples between those whose level is noted: a call at 80 kHz has three of them in a period
 _CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word
 
 
@@ -43,6 +44,8 @@ class Engine:
     active : frozenset of str
     clock : Stopwatch
         What each effect has cost so far.
+    loudest : float
+        The highest amplitude that a modulator has met so far; they follow up to about 0.6.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, active: frozenset[str], *, threads: int | None = None) -> None:
@@ -50,6 +53,7 @@ class Engine:
         self.sensor = sensor
         self.active = active
         self.clock = Stopwatch()
+        self.loudest = 0.0
         sensor.require_microphones()
         self._layout = microphones(self.sensor.array)
         self._settings = self.sensor.settings()
@@ -110,6 +114,7 @@ class Engine:
             words = np.empty_like(out[first : first + synthesis.BLOCK], order="C")
             with self.clock("modulation"):
                 modulator.process(block, out=words)
+                self.loudest = max(self.loudest, float(block[:, ::_EVERY].max()), -float(block[:, ::_EVERY].min()))
             out[first : first + len(words)] = words
 
     def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:

@@ -17,6 +17,7 @@ from ertis_numba.air import absorption_db_m
 from ertis_numba.simulation.arrivals import effect
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.sight import Echoes, Sight, change_db
+from ertis_numba.simulation.sources import Sonar
 
 __all__ = ["ESTIMATES", "Estimate"]
 
@@ -157,9 +158,15 @@ def _doppler(sight: Sight) -> Estimate | None:
     return Estimate(
         change_db=change_db(change, sight.beside(own.delay_s)),
         sure=200.0,
-        reason=f"{own.names[worst]}, coming at {-(stretch[worst] - 1) / 2 * shot.speed_m_s:.3g} m/s, shifts by "
+        reason=f"{own.names[worst]}, {_told_m_s(float(stretch[worst]), shot.speed_m_s)}, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
     )
+
+
+def _told_m_s(stretch: float, speed_m_s: float) -> str:
+    """Return the velocity of a reflector that stretches a call so."""
+    away_m_s = speed_m_s * (stretch - 1) / (stretch + 1)
+    return f"{'going' if away_m_s > 0 else 'coming'} at {abs(away_m_s):.3g} m/s"
 
 
 def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
@@ -223,25 +230,35 @@ def _interference(sight: Sight) -> Estimate | None:
     if not (scene.tones or scene.noises or scene.sonars):
         return None
     way_from, spread = effect("interference", "way_from"), effect("spreading")
-    loudest, reason = 0.0, "none is heard in the band"
+    total, loudest, reason = 0.0, 0.0, "none is heard in the band"
     for kind in ("tones", "noises", "sonars"):
         for number, source in enumerate(getattr(scene, kind)):
             paths = way_from(shot, source)
             amplitude = float(10 ** (source.level_db / 20) * np.mean(spread(paths)))
             direction = -np.mean(paths.arriving, axis=1) @ paths.ear.axes.T
-            part = float(sight.coverage(direction)[0])
+            level = float(sight.coverage(direction)[0])
             if kind == "tones":
-                level = sight.of_tone(amplitude, source.frequency_hz)
+                level *= sight.of_tone(amplitude, source.frequency_hz)
             elif kind == "noises":
-                level = sight.of_white_noise(20 * math.log10(amplitude), coherent=True, band_hz=source.band_hz)
+                level *= sight.of_white_noise(20 * math.log10(amplitude), coherent=True, band_hz=source.band_hz)
             else:
-                calls_s = effect("interference", "calls_of")(shot, source) + np.mean(paths.length_m) / shot.speed_m_s
-                level = amplitude * sight.likeness(source.call) * float(np.max(sight.reach(calls_s), initial=0.0))
-            if level * part > loudest:
-                loudest = level * part
+                level *= amplitude * sight.likeness(source.call) * _part_in_window(sight, source)
+            total += level
+            if level > loudest:
+                loudest = level
                 level_db = 20 * math.log10(loudest / sight.floor)
                 reason = f"{kind}[{number}] is heard with {level_db:+.1f} dB beside the weakest reflector"
-    return Estimate(change_db=change_db(np.array([loudest]), np.array([sight.quietest])), reason=reason)
+    return Estimate(change_db=change_db(np.array([total]), np.array([sight.quietest])), reason=reason)
+
+
+def _part_in_window(sight: Sight, sonar: Sonar) -> float:
+    """Return how much of a foreign call reaches into the image, in the measurement where it does most."""
+    scene, shot = sight.shot.scene, sight.shot
+    if scene.count > 1:
+        return 1.0  # nobody keeps it in step, so some measurement or other meets it
+    way = effect("interference", "way_from")(shot, sonar)
+    calls_s = effect("interference", "calls_of")(shot, sonar) + np.mean(way.length_m) / shot.speed_m_s
+    return float(np.max(sight.reach(calls_s), initial=0.0))
 
 
 def _ambient_noise(sight: Sight) -> Estimate | None:
@@ -316,6 +333,8 @@ def _filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
     ratio = sight.envelope_change(own, after) * sight.reach(own.delay_s) / sight.beside(own.delay_s, after)
     worst = int(np.argmax(ratio))
     found = 20 * math.log10(1 + ratio[worst])
+    if not ratio[worst]:
+        return Estimate(change_db=0.0, reason="no echo in reach changes")
     return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found))
 
 

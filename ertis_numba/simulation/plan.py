@@ -1,6 +1,7 @@
 """Which effects a scene calls for."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
 __all__ = ["Plan", "Verdict", "make_plan"]
 
-_INSTANTS = 9  # at which a scene in motion is asked
+_INSTANTS, _MOST_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
 _MOST_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
 _ROUNDS = 6  # two are the rule; effects that wait for each other take more
 
@@ -62,15 +63,13 @@ class Plan:
 def make_plan(scene: Scene) -> Plan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    All sensors are asked, at the beginning, at the end and in between; the greatest change counts. Effects are
-    estimated one after the other, each in the light of those before it: geometry first, then what filters
+    All sensors are asked, at the beginning, at the end, in between and at way points; the greatest change
+    counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then what filters
     echoes, then what adds to them; and again in the light of all others, until nothing changes. Where an
     estimate is not sure enough, the measurement where it is greatest is rendered and processed with the effect
     and without.
     """
-    indices = [0]
-    if scene.moves and scene.count > 1:
-        indices = [int(index) for index in np.unique(np.linspace(0, scene.count - 1, _INSTANTS).round())]
+    indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
@@ -90,6 +89,17 @@ def _kept_on(verdict: Verdict) -> Verdict:
     if verdict.forced:
         return verdict
     return replace(verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, as others wait for it")
+
+
+def _indices(scene: Scene) -> list[int]:
+    """Return the measurements that are asked: of a scene in motion several, those at its way points among them."""
+    if not scene.moves or scene.count == 1:
+        return [0]
+    last = scene.count - 1
+    corners_s = sorted({time_s for thing in scene.things() for time_s, *_ in thing.waypoints})
+    between_s = [(a + b) / 2 for a, b in itertools.pairwise(corners_s)]
+    corners = np.clip(np.rint(np.array([*corners_s, *between_s][:_MOST_CORNERS]) * scene.rate_hz), 0, last)
+    return [int(index) for index in np.unique([*np.linspace(0, last, _INSTANTS).round(), *corners])]
 
 
 def _decided(

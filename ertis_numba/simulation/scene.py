@@ -15,6 +15,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Array
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.placed import Placed
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
 from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
@@ -66,7 +67,7 @@ class Scene(Document, frozen=True, kw_only=True):
     ambient: Ambient | None = None
 
     def __post_init__(self) -> None:
-        checks.whole("seed", self.seed, 0)
+        checks.whole("seed", self.seed, 0, 2**63 - 1)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
         checks.whole("count", self.count, 1, 10**9)
         checks.between("tolerance_db", self.tolerance_db, 1e-6, 60.0)
@@ -87,8 +88,12 @@ class Scene(Document, frozen=True, kw_only=True):
     @property
     def moves(self) -> bool:
         """Whether anything changes its place."""
-        things = (*self.points, *self.spheres, *self.walls, *self.boxes, *self.tones, *self.noises, *self.sonars)
-        return any(thing.moves for thing in (*things, *(sensor.path() for sensor in self.sensors)))
+        return any(thing.moves for thing in self.things())
+
+    def things(self) -> tuple[Placed, ...]:
+        """Return all that has a place, the sensors' own among them."""
+        targets = (*self.points, *self.spheres, *self.walls, *self.boxes)
+        return (*targets, *self.tones, *self.noises, *self.sonars, *(sensor.path() for sensor in self.sensors))
 
     def all_walls(self) -> tuple[tuple[str, Wall], ...]:
         """Return the walls and the sides of the boxes with their names."""

@@ -1,6 +1,7 @@
 """The sensors of a scene: settings, place, emitter and electronics."""
 
 import math
+import re
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from ertis_numba.simulation.placed import Placed, Vector
 __all__ = ["Electronics", "Emitter", "Sensor"]
 
 _LOUDEST_DB = 120.0
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # what can stand in a file
 _LARGEST_M = 0.2  # of an emitter or a microphone
 
 
@@ -135,8 +137,8 @@ class Sensor(Settings, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.name:
-            raise ArgumentError("sensor.name is empty; give it a name")
+        if not _NAME.fullmatch(self.name):
+            raise ArgumentError(f"sensor.name is {self.name!r}; give letters, digits and _ . @ + -")
         checks.between("sensor.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("sensor.pitch_deg", self.pitch_deg, -90.0, 90.0)
         checks.between("sensor.roll_deg", self.roll_deg, -180.0, 180.0)

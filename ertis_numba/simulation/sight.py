@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation.arrivals import echoes, effect, responses
@@ -25,12 +26,14 @@ _NODES = 65
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among side lobes
+_ACROSS = 8192
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by their root mean square
 SAME_RANGE_M = 0.05
 """Echoes so close in range count as at the same range."""
-_MODULATOR_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}  # white noise of the same level in a call's band
+# White noise of the level that modulators of each order leave between 20 and 80 kHz at the clock of eRTIS.
+_MODULATOR_DBFS, _MOST_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +111,11 @@ class Sight:
     @functools.cached_property
     def noise(self) -> float:
         """The highest amplitude that the modulators' noise reaches in the image."""
-        return self.of_white_noise(_MODULATOR_DBFS[self.shot.sensor.electronics.modulator_order])
+        order = self.shot.sensor.electronics.modulator_order
+        # Shaped noise rises with the band's share of the clock, by 6 dB per octave and order.
+        slower = ERTIS_PDM_RATE_HZ / self.settings.recording.pdm_rate_hz
+        dbfs = _MODULATOR_DBFS[order] + 20 * order * math.log10(slower)
+        return self.of_white_noise(min(dbfs, _MOST_NOISE_DBFS))
 
     def echoes(self, active: frozenset[str]) -> Echoes:
         """Return what arrives of calls with other effects."""
@@ -215,11 +222,12 @@ class Sight:
         band_hz : (low, high), optional
         """
         matched, rate_hz, n_fft = _matched(self.settings)
-        frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
+        heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
         low_hz, high_hz = band_hz or (0.0, self.settings.recording.pdm_rate_hz / 2)
-        heard = (frequency_hz >= low_hz) & (frequency_hz <= high_hz)
+        across_hz = np.linspace(low_hz, high_hz, _ACROSS)
+        response = np.interp(across_hz, heard_hz, np.abs(matched.values), left=0.0, right=0.0)
         # A density σ² / B, one-sided, through the filter, and as the modulus of the analytic signal.
-        power = np.sum(np.abs(matched.values[heard]) ** 2) * rate_hz / n_fft / (high_hz - low_hz) / 2
+        power = float(np.mean(response**2)) / 2
         mics = 1 if coherent else len(self.shot.channels)
         return float(_PEAK * 10 ** (dbfs / 20) * math.sqrt(power / mics))
 

@@ -29,11 +29,13 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
     Raises
     ------
     ArgumentError
-        The folder is missing, the path is a folder or a source, or a file is there and may not be
-        replaced.
+        The folder is missing, the path is a folder, a link, a device or a source, or a file is there and
+        may not be replaced.
     """
     if path.is_dir():
         raise ArgumentError(f"output {path} is a folder; give the name of a file")
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise ArgumentError(f"output {path} is a link or a device; give the name of a file")
     if not path.parent.is_dir():
         raise ArgumentError(f"output {path}: there is no folder {path.parent}; make it or give another")
     if path.exists() and any(source.exists() and source.samefile(path) for source in sources):
