@@ -64,9 +64,9 @@ def make_plan(scene: Scene) -> Plan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
     All sensors are asked, at the beginning, at the end, in between and at way points; the greatest change
-    counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then what filters
-    echoes, then what adds to them; and again in the light of all others, until nothing changes. Where an
-    estimate is not sure enough, the measurement where it is greatest is rendered and processed with the effect
+    counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
+    what filters echoes, then what adds to them; and again in the light of all others, until nothing changes. Where
+    an estimate is not sure enough, the measurement where it is greatest is rendered and processed with the effect
     and without.
     """
     indices = _indices(scene)
