@@ -66,7 +66,7 @@ def _occlusion(sight: Sight) -> Estimate | None:
         return Estimate(change_db=0.0, reason="no wall stands on any way")
     level = hidden * sight.levels(sight.heard) * sight.reach(sight.heard.delay_s)
     worst = int(np.argmax(level))
-    open_sight = Sight(sight.shot, sight.active | {"occlusion"})
+    open_sight = Sight.of(sight.shot, sight.active | {"occlusion"})
     beside = open_sight.beside(sight.heard.delay_s)
     return Estimate(
         change_db=change_db(level, beside),

@@ -136,7 +136,7 @@ def _worst(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]])
     """Return the estimate of the greatest change, and the measurement it is about."""
     worst, where = None, 0
     for index, shot in shots:
-        estimate = ESTIMATES[name](Sight(shot, active))
+        estimate = ESTIMATES[name](Sight.of(shot, active))
         if estimate is not None and (worst is None or estimate.change_db > worst.change_db):
             worst, where = estimate, index
     return worst, where

@@ -19,6 +19,9 @@ from ertis_numba.stages.fast import FastChain
 __all__ = ["Rehearsal", "image_change_db"]
 
 
+_KEPT = 24  # images: most verdicts are about the same effects with one more or less
+
+
 class Rehearsal:
     """Renders and processes measurements of a scene with some effects and with others.
 
@@ -31,7 +34,7 @@ class Rehearsal:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._image = functools.lru_cache(maxsize=8)(self._rendered)
+        self._image = functools.lru_cache(maxsize=_KEPT)(self._rendered)
         self._chain = functools.lru_cache(maxsize=8)(_chain)
 
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:

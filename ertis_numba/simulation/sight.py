@@ -91,6 +91,11 @@ class Sight:
         self.settings = shot.sensor.settings()
         self.frequency_hz, self.power = _band(self.settings)
 
+    @classmethod
+    def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
+        """Return the sight with some effects; for one moment it is made once."""
+        return shot.once((cls, active), lambda: cls(shot, active))
+
     @functools.cached_property
     def heard(self) -> Echoes:
         """What arrives of calls: the own one, and those of other sensors where cross-emission is simulated."""

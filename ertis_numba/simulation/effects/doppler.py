@@ -34,19 +34,21 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     target_m = mouth.position_m + paths.first_m[..., None] * paths.leaving
     met_s = start_s + paths.first_m / speed_m_s
     arrival_s = met_s + paths.second_m / speed_m_s
+    mouth_sways, ear_sways = (any(np.any(sway_m_s) for sway_m_s in end.sways_m_s) for end in (mouth, ear))
     for _ in range(_ROUNDS):
-        # A wall is met when the same part of the way is done as if nothing moved.
-        done = (met_s if len(paths.targets) else arrival_s) - start_s
-        whole_m = paths.first_m if len(paths.targets) else paths.second_m
-        from_m = sent_m + _swayed_m(mouth, start_s + paths.mouth_corners_m * _mean(done, whole_m))
+        before_s, from_m = arrival_s, sent_m
+        if mouth_sways:  # a wall is met when the same part of the way is done as if nothing moved
+            done = (met_s if len(paths.targets) else arrival_s) - start_s
+            whole_m = paths.first_m if len(paths.targets) else paths.second_m
+            from_m = sent_m + _swayed_m(mouth, start_s + paths.mouth_corners_m * _mean(done, whole_m))
         met_m = from_m
         if len(paths.targets):
             met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
             met_s = start_s + _length(met_m - from_m) / speed_m_s
-        before_s = arrival_s
         ear_m = ear.positions_m + arrival_s[..., None] * _own_m_s(ear)
-        back = _mean(arrival_s - met_s, paths.second_m)
-        ear_m = ear_m + _swayed_m(ear, np.mean(arrival_s, axis=1) - paths.ear_corners_m * back)
+        if ear_sways:
+            back = _mean(arrival_s - met_s, paths.second_m)
+            ear_m = ear_m + _swayed_m(ear, np.mean(arrival_s, axis=1) - paths.ear_corners_m * back)
         arrival_s = (met_s if len(paths.targets) else start_s) + _length(ear_m - met_m) / speed_m_s
         if np.abs(arrival_s - before_s).max() < _ENOUGH_S:
             break
