@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
+from ertis_numba.simulation import pulse
 from ertis_numba.simulation.arrivals import echoes, effect, responses
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
-from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, matched_filter
 
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
 _GEOMETRY = frozenset({"walls", "occlusion", "target_size"})  # on which ways of the sound depend
-_NODES = 65
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among side lobes
@@ -63,7 +62,7 @@ class Echoes:
         """Return the echoes of all parts."""
         return cls(
             names=tuple(name for part in parts for name in part.names),
-            gain=np.concatenate([np.zeros((0, _NODES)), *(part.gain for part in parts)]),
+            gain=np.concatenate([np.zeros((0, pulse.N_NODES)), *(part.gain for part in parts)]),
             delay_s=np.concatenate([np.zeros(0), *(part.delay_s for part in parts)]),
             direction=np.concatenate([np.zeros((0, 3)), *(part.direction for part in parts)]),
         )
@@ -89,7 +88,7 @@ class Sight:
         self._middle = shot.at_centre()
         self.active = active
         self.settings = shot.sensor.settings()
-        self.frequency_hz, self.power = _band(self.settings)
+        self.frequency_hz, self.power = pulse.band(self.settings)
 
     @classmethod
     def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
@@ -153,7 +152,7 @@ class Sight:
         gain = responses(self._middle, active, paths, emitter, self.frequency_hz, Stopwatch())
         return Echoes(
             names=paths.names,
-            gain=10 ** (emitter.level_db / 20) * np.broadcast_to(gain[:, 0], (len(paths), _NODES)),
+            gain=10 ** (emitter.level_db / 20) * np.broadcast_to(gain[:, 0], (len(paths), pulse.N_NODES)),
             delay_s=paths.length_m[:, 0] / self.shot.speed_m_s,
             direction=-paths.arriving[:, 0] @ paths.ear.axes.T,
         )
@@ -203,7 +202,7 @@ class Sight:
 
     def _lobe(self, lag_s: Floats) -> Floats:
         """Return the highest range side lobe of the call at a lag and beyond, 1 at its peak."""
-        lags_s, envelope = _pulse(self.settings)
+        lags_s, envelope = pulse.envelope(self.settings)
         return np.asarray(np.interp(lag_s, lags_s, np.maximum.accumulate(envelope[::-1])[::-1]))
 
     def coverage(self, direction: Floats) -> Floats:
@@ -226,7 +225,7 @@ class Sight:
             The noise comes from one place, so that a beam takes all of it.
         band_hz : (low, high), optional
         """
-        matched, rate_hz, n_fft = _matched(self.settings)
+        matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
         low_hz, high_hz = band_hz or (0.0, self.settings.recording.pdm_rate_hz / 2)
         across_hz = np.linspace(low_hz, high_hz, _ACROSS)
@@ -238,7 +237,7 @@ class Sight:
 
     def of_tone(self, amplitude: float, frequency_hz: float) -> float:
         """Return the amplitude of a tone in the image."""
-        matched, rate_hz, n_fft = _matched(self.settings)
+        matched, rate_hz, n_fft = pulse.match(self.settings)
         place = round(frequency_hz * n_fft / rate_hz) - matched.first_bin
         response = np.abs(matched.values)
         inside = 0 <= place < len(response)
@@ -249,13 +248,7 @@ class Sight:
         """Return the amplitude of another call, 1 at the microphones, in the image; that of the own call is 1."""
         if call == self.settings.call:
             return 1.0
-        rate_hz = self.settings.signal_rate_hz
-        n_fft = 2 ** math.ceil(math.log2((call.duration_s + self.settings.call.duration_s) * rate_hz + 2))
-        mine = matched_filter(self.settings.call, n_fft=n_fft, rate_hz=rate_hz)
-        spectrum = np.zeros(n_fft, dtype=np.complex128)
-        bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
-        spectrum[bins] = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins] * mine.values
-        return float(np.abs(np.fft.ifft(spectrum)).max())
+        return float(np.abs(pulse.matched(self.settings, call)).max())
 
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
         """Return what beams take at the most, after the image begins, of a sound from within the array.
@@ -272,10 +265,10 @@ class Sight:
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
         every = max(1, len(_directions(self.settings)) // _LAG_DIRECTIONS)
         early_s = _directions(self.settings)[::every] @ self._positions_m.T / self.shot.speed_m_s
-        lag_s, pulse = _complex_pulse(self.settings)
+        lag_s, sound = pulse.baseband(self.settings)
         at_s = time_s[:, None, None] - (delay_s + early_s)
         carrier = np.exp(2j * math.pi * float(self.frequency_hz @ self.power) * at_s)
-        heard = (np.interp(at_s, lag_s, pulse.real) + 1j * np.interp(at_s, lag_s, pulse.imag)) * carrier
+        heard = (np.interp(at_s, lag_s, sound.real) + 1j * np.interp(at_s, lag_s, sound.imag)) * carrier
         return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
     def beam_change(self, directions: Floats, weight: NDArray[np.complex128]) -> float:
@@ -286,7 +279,7 @@ class Sight:
         directions : (path, axis) float64
         weight : (mic, node) complex128
         """
-        nodes = slice(_NODES % 8 // 2, None, 8)
+        nodes = slice(pulse.N_NODES % 8 // 2, None, 8)
         power = self.power[nodes] / self.power[nodes].sum()
         every = max(1, len(_directions(self.settings)) // _BEAM_DIRECTIONS)
         change = 0.0
@@ -353,45 +346,3 @@ def change_db(part: Floats, beside: Floats) -> float:
 def _directions(settings: Settings) -> Floats:
     grid = direction_grid(settings.processing)
     return unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-
-
-@functools.lru_cache(maxsize=16)
-def _matched(settings: Settings) -> tuple[MatchedFilter, float, int]:
-    rate_hz = settings.signal_rate_hz
-    n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * rate_hz))
-    return matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz), rate_hz, n_fft
-
-
-@functools.lru_cache(maxsize=16)
-def _complex_pulse(settings: Settings) -> tuple[Floats, NDArray[np.complex128]]:
-    """Return the matched call without its carrier, by lag: (lag,) float64 seconds, (lag,) complex128."""
-    rate_hz = settings.signal_rate_hz
-    n_fft = 2 ** math.ceil(math.log2(8 * settings.call.duration_s * rate_hz))
-    matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
-    bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
-    spectrum = np.zeros(n_fft, dtype=np.complex128)
-    spectrum[bins] = np.fft.rfft(call_samples(settings.call, rate_hz=rate_hz), n_fft)[bins] * matched.values
-    lag_s = (np.arange(n_fft) - n_fft // 2) / rate_hz
-    frequency_hz, power = _band(settings)
-    carrier = np.exp(-2j * math.pi * float(frequency_hz @ power) * lag_s)
-    return lag_s, np.fft.fftshift(np.fft.ifft(spectrum)) * carrier
-
-
-@functools.lru_cache(maxsize=16)
-def _pulse(settings: Settings) -> tuple[Floats, Floats]:
-    """Return the envelope of the matched call, by lags from 0 on: both (lag,) float64."""
-    lag_s, pulse = _complex_pulse(settings)
-    middle = len(lag_s) // 2
-    return lag_s[middle:], np.abs(pulse[middle:])
-
-
-@functools.lru_cache(maxsize=16)
-def _band(settings: Settings) -> tuple[Floats, Floats]:
-    """Return some frequencies of the call's band, and the share of the matched call's power at each."""
-    rate_hz, n_fft = settings.signal_rate_hz, 32_768  # bins much narrower than a node
-    matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
-    frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
-    edges = np.linspace(*matched_band_hz(settings.call), _NODES + 1)
-    # S H is what the image sums; between the edges of its window H is conj(S).
-    power, _ = np.histogram(frequency_hz, edges, weights=np.abs(matched.values) ** 2)
-    return (edges[:-1] + edges[1:]) / 2, power / power.sum()
