@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ertis_numba.simulation.scene import Scene, load_scene
     from ertis_numba.stages.compare import compare
     from ertis_numba.stages.detect import find_peaks
+    from ertis_numba.stages.health import health
     from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 
     __version__: str
@@ -63,6 +64,7 @@ __all__ = [
     "Stamp",
     "compare",
     "find_peaks",
+    "health",
     "load_layout",
     "load_scene",
     "open_energyscapes",
@@ -86,6 +88,7 @@ _HOMES = {
     "simulation.scene": ("Scene", "load_scene"),
     "stages.compare": ("compare",),
     "stages.detect": ("find_peaks",),
+    "stages.health": ("health",),
     "storage": ("open_energyscapes", "open_recording", "write_energyscapes", "write_recording"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

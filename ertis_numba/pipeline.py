@@ -10,6 +10,7 @@ from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import Array, Settings
+from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
 
@@ -30,26 +31,40 @@ class Pipeline:
         has no compiled kernels.
     threads : int, optional
         Threads of one `process`; all cores by default. The result does not depend on it.
+    max_error_db : float, optional
+        Error that the images may have; that of ``settings.accuracy`` by default.
 
     Attributes
     ----------
     settings : Settings
+        With the plan that was chosen: their accuracy leaves nothing open.
     device : str
         The device that was chosen.
 
     Raises
     ------
     ArgumentError
-        The settings name a layout, grid or range that cannot be used, or the device is unknown.
+        The settings name a layout, grid or range that cannot be used, no plan keeps the error, or the device is
+        unknown.
     DeviceError
         The device cannot be used here.
     """
 
-    def __init__(self, settings: Settings, device: str = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        device: str = "auto",
+        threads: int | None = None,
+        *,
+        max_error_db: float | None = None,
+    ) -> None:
         kernel_set = kernels.load(_device_for(settings, device))
         threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(threads):  # refuses a number that cannot be had
             pass
+        if max_error_db is not None:
+            settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
+        settings = planner.complete(settings, kernel_set, threads=threads)
         self.settings = settings
         self.device = kernel_set.device
         layout = microphones(settings.array)

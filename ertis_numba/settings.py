@@ -22,7 +22,18 @@ from ertis_numba.constants import (
 from ertis_numba.documents import Document, Table
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["PRESETS", "Air", "Array", "Call", "Processing", "Recording", "Settings"]
+__all__ = [
+    "ERROR_PRESETS_DB",
+    "INTERPOLATIONS",
+    "PRESETS",
+    "Accuracy",
+    "Air",
+    "Array",
+    "Call",
+    "Processing",
+    "Recording",
+    "Settings",
+]
 
 _WORDS = {"short": 65_536, "default": 163_840, "long": 294_912}
 _FARTHEST_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
@@ -31,7 +42,14 @@ _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
 _MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
 _WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
+_NARROWEST_HZ = 100.0  # a narrower band pass would ring for seconds
 _LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubic": 4}
+"""Ways of making a delayed sample, and how many samples each takes; None where that is a choice."""
+
+ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
+"""Error budgets by name."""
+
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
 
@@ -127,6 +145,11 @@ class Call(Table, frozen=True, kw_only=True):
                 f"call sweeps from {self.start_frequency_hz:g} Hz to itself; give two different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
+        if self.duration_s * self.low_frequency_hz < 1:
+            raise ArgumentError(
+                f"call.duration_s is {self.duration_s:g}, less than a period of {self.low_frequency_hz:g} Hz; "
+                f"give {1 / self.low_frequency_hz:g} or more"
+            )
         checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
 
     @property
@@ -188,11 +211,19 @@ class Processing(Table, frozen=True, kw_only=True):
     decimation : int, optional
         PDM samples per signal sample, a divisor of ``range_decimation``. By default the largest that
         suits the method and the call's band; see `Settings.decimation`.
-    oversampling : int
-        Delays are kept in steps of ``1 / oversampling`` of the range spacing.
-    precision : {"auto", "float32", "int16"}
-        Of the samples that beams are summed from. ``int16`` needs a processor with a 16-bit dot product
-        and errs by about -75 dB; ``auto`` takes the faster one for the device and the number of directions.
+    wavefront : {"plane", "spherical"}
+        What an echo looks like to the array: ``plane`` as the paper has it, ``spherical`` focuses on each
+        range, which matters nearer than some ten apertures.
+    beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}
+        How microphones are combined; ``docs/beamformers.md`` tells what each is good for. All but the first need
+        the fast method and plane wavefronts.
+    dmas_order : int
+        How many microphones ``dmas`` multiplies at a time, 2 to 8.
+    snapshots : int
+        Ranges from which ``capon`` learns what else is heard, 1 to 32.
+    loading : float
+        White noise that ``capon`` reckons with, by the mean power of a microphone; the more, the more it is
+        like delay-and-sum.
     """
 
     method: Literal["fast", "paper"] = "fast"
@@ -202,8 +233,11 @@ class Processing(Table, frozen=True, kw_only=True):
     range_m: tuple[float, float] = (0.5, 5.0)
     range_decimation: int = 100
     decimation: int | None = None
-    oversampling: int = 10
-    precision: Literal["auto", "float32", "int16"] = "auto"
+    wavefront: Literal["plane", "spherical"] = "plane"
+    beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
+    dmas_order: int = 2
+    snapshots: int = 5
+    loading: float = 1.0
 
     def __post_init__(self) -> None:
         checks.choice("processing.method", self.method, ("fast", "paper"))
@@ -218,8 +252,90 @@ class Processing(Table, frozen=True, kw_only=True):
                     f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
                     f"({self.range_decimation})"
                 )
-        checks.whole("processing.oversampling", self.oversampling, 1, 64)
-        checks.choice("processing.precision", self.precision, ("auto", "float32", "int16"))
+        checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical"))
+        if self.wavefront == "spherical" and self.method == "paper":
+            raise ArgumentError(
+                "processing.wavefront is 'spherical', which the paper's method knows nothing of; give 'plane'"
+            )
+        self._check_beamformer()
+
+    def _check_beamformer(self) -> None:
+        """Refuse what no beamformer can do, and what delay-and-sum alone can."""
+        checks.choice("processing.beamformer", self.beamformer, ("delay_and_sum", "coherence_factor", "dmas", "capon"))
+        checks.whole("processing.dmas_order", self.dmas_order, 2, 8)
+        checks.whole("processing.snapshots", self.snapshots, 1, 32)
+        checks.between("processing.loading", self.loading, 1e-6, 1e6)
+        if self.beamformer == "delay_and_sum":
+            return
+        for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):
+            if getattr(self, name) == value:
+                raise ArgumentError(
+                    f"processing.{name} is {value!r}, which can delay_and_sum only; give {remedy} with "
+                    f"processing.beamformer {self.beamformer!r}"
+                )
+
+
+class Accuracy(Table, frozen=True, kw_only=True):
+    """How exact the image is: an error that it may have, and what shall not be left to the planner.
+
+    Whatever is open (``auto`` or None), the planner chooses, such that the image takes the least time on
+    this machine and its predicted error stays within the budget. An energyscape carries the plan that it
+    was made by, with nothing open. ``docs/accuracy.md`` has the equations.
+
+    Attributes
+    ----------
+    max_error_db : float
+        Budget: the norm of the image less the exact one, by that of the exact one. `ERROR_PRESETS_DB` has
+        names for some.
+    precision : {"auto", "float32", "int16"}
+        Of the samples that beams are summed from. ``int16`` needs a processor with a 16-bit dot product.
+    oversampling : int, optional
+        Samples that are kept per range of the energyscape, 1 to 64.
+    interpolation : {"fitted", "nearest", "carrier", "linear", "cubic"}
+        How a delayed sample is made of those kept. ``fitted``: by weights that err least over the call's band.
+        The others are there to be compared with: the nearest sample; the nearest one, its carrier turned
+        to the right phase; straight or by Lagrange's cubic between carriers turned to the right phase.
+    delay_taps : int, optional
+        Samples that it is made of, 1 to 8; the simpler ways of interpolation imply theirs.
+    beam_taps : int, optional
+        Beams are summed for nodes of a grid and those of all directions are interpolated from so many nodes
+        along each axis of the array, 2, 4 or 6; 0 sums every direction's own beam.
+    beam_density : float, optional
+        Nodes by what the aperture resolves at the call's highest frequency, 1.1 to 8.
+    stop_band_db : float, optional
+        Damping of what the decimation would alias into the call's band, 40 to 140.
+    zones : int, optional
+        Parts of the range axis with delays of their own, 1 to 1000, where wavefronts are spherical.
+    """
+
+    max_error_db: float = -35.0
+    precision: Literal["auto", "float32", "int16"] = "auto"
+    oversampling: int | None = None
+    interpolation: Literal["fitted", "nearest", "carrier", "linear", "cubic"] = "fitted"
+    delay_taps: int | None = None
+    beam_taps: int | None = None
+    beam_density: float | None = None
+    stop_band_db: float | None = None
+    zones: int | None = None
+
+    def __post_init__(self) -> None:
+        checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
+        checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
+        checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, 1000)):
+            if getattr(self, name) is not None:
+                checks.whole(f"accuracy.{name}", getattr(self, name), low, high)
+        if self.beam_taps is not None:
+            checks.choice("accuracy.beam_taps", self.beam_taps, (0, 2, 4, 6))
+        for name, least, most in (("beam_density", 1.1, 8.0), ("stop_band_db", 40.0, 140.0)):
+            if getattr(self, name) is not None:
+                checks.between(f"accuracy.{name}", getattr(self, name), least, most)
+        implied = INTERPOLATIONS[self.interpolation]
+        if implied is not None and self.delay_taps not in {None, implied}:
+            raise ArgumentError(
+                f"accuracy.delay_taps is {self.delay_taps}, but interpolation {self.interpolation!r} takes {implied}; "
+                "leave it out"
+            )
 
 
 class Settings(Document, frozen=True, kw_only=True):
@@ -230,6 +346,7 @@ class Settings(Document, frozen=True, kw_only=True):
     recording: Recording = Recording()
     air: Air = Air()
     processing: Processing = Processing()
+    accuracy: Accuracy = Accuracy()
 
     def __post_init__(self) -> None:
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
@@ -237,6 +354,12 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"processing.decimation {self.decimation} leaves signals at "
                 f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
                 f"{self.call.high_frequency_hz:g} Hz"
+            )
+        swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
+        if self.processing.method == "paper" and swept_hz < _NARROWEST_HZ:
+            raise ArgumentError(
+                f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
+                f"give {_NARROWEST_HZ:g} Hz or more, or method 'fast'"
             )
         step = self.processing.range_decimation
         if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
@@ -267,7 +390,7 @@ class Settings(Document, frozen=True, kw_only=True):
         echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
         processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)))
         if band == "20_80":
-            processing = processing.replace(range_decimation=40, oversampling=6)
+            processing = processing.replace(range_decimation=40)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 
     @property

@@ -18,14 +18,15 @@ __all__ = [
     "matched_band_hz",
     "matched_filter",
     "matched_guard_s",
+    "matched_spectrum",
     "whole_taps",
 ]
 
 _TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
 _LEAST_TRANSITION = 0.02  # of the decimated rate; the filter's length grows with the inverse
-_STOP_BAND_DB = 60.0  # image noise of a 4th order modulator stays below the float32 image's needs
-_ROUNDING_GAIN = 10 ** (-50 / 20)
-_STOP_BAND_GAIN = 10 ** (-59.5 / 20)  # what a filter must reach to be taken
+_STOP_BAND_DB = 60.0
+_SLACK_DB = 0.5  # by which a filter may miss its stop band
+_ROUNDING_DB = -50.0  # what rounded taps may change the response by, where the stop band is no deeper than 60 dB
 
 
 def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
@@ -82,9 +83,12 @@ def matched_band_hz(call: Call) -> tuple[float, float]:
     return call.low_frequency_hz - edge_hz, call.high_frequency_hz + edge_hz
 
 
-def matched_guard_s(call: Call) -> float:
-    """Return how long the matched filter rings before the call and after it."""
-    return 2 / (call.low_frequency_hz - matched_band_hz(call)[0])
+def matched_guard_s(call: Call, *, down_db: float = 60.0) -> float:
+    """Return how long the matched filter rings before the call and after it, until it is ``down_db`` down.
+
+    The edges of its band are raised cosines, whose transform falls with the third power of time.
+    """
+    return 2 / (call.low_frequency_hz - matched_band_hz(call)[0]) * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
 
 
 def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
@@ -106,7 +110,8 @@ def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
     MatchedFilter
     """
     low_hz, high_hz = matched_band_hz(call)
-    bins = np.arange(math.ceil(low_hz * n_fft / rate_hz), math.floor(high_hz * n_fft / rate_hz) + 1)
+    last_bin = min(math.floor(high_hz * n_fft / rate_hz), n_fft // 2)  # the paper's rates may leave the edge no room
+    bins = np.arange(math.ceil(low_hz * n_fft / rate_hz), last_bin + 1)
     frequency_hz = bins * rate_hz / n_fft
     spectrum = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins]
     outside_hz = np.maximum(call.low_frequency_hz - frequency_hz, frequency_hz - call.high_frequency_hz)
@@ -119,11 +124,30 @@ def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
     )
 
 
-def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> NDArray[np.float64]:
+def matched_spectrum(call: Call, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the power of white noise after the matched filter: frequencies in hertz and shares, both (wave,) float64.
+
+    The shares add up to 1. Of an echo, whose own spectrum comes on top, the band is a little narrower.
+    """
+    rate_hz = 4 * call.high_frequency_hz
+    n_fft = max(8 * math.ceil(call.duration_s * rate_hz), 1024)
+    matched = matched_filter(call, n_fft=n_fft, rate_hz=rate_hz)
+    frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
+    power = np.abs(matched.values) ** 2
+    # Parts of the band rather than single bins: the spectrum of a sweep has ripples.
+    edges = np.linspace(0, len(power), min(n_waves, len(power)) + 1).astype(int)
+    shares = np.add.reduceat(power, edges[:-1]) / power.sum()
+    centres_hz = np.add.reduceat(frequency_hz, edges[:-1]) / np.diff(edges)
+    return centres_hz, shares
+
+
+def decimation_taps(
+    *, pdm_rate_hz: float, decimation: int, pass_hz: float, stop_band_db: float = _STOP_BAND_DB
+) -> NDArray[np.float64]:
     """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
 
     A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
-    damped by 60 dB, by 59.5 dB at the worst. The length is ``2 k · decimation + 1``, so that the group delay is k
+    damped by ``stop_band_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so that the group delay is k
     samples of the decimated signal exactly.
 
     Parameters
@@ -132,6 +156,7 @@ def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> N
     decimation : int
     pass_hz : float
         Upper edge of the band that must stay clean.
+    stop_band_db : float
 
     Returns
     -------
@@ -149,12 +174,13 @@ def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> N
             f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
         )
     width_rad = 2 * math.pi * transition_hz / pdm_rate_hz
-    wanted = (_STOP_BAND_DB - 7.95) / (2.285 * width_rad)
+    wanted = (stop_band_db - 7.95) / (2.285 * width_rad)
     half = decimation * math.ceil(wanted / 2 / decimation)
     taps = _windowed_sinc(half, decimation, width_rad)
     # Kaiser's formula is a fit; for some short filters it promises a few decibels too much.
     folding_hz = np.linspace(rate_hz - pass_hz, min(rate_hz + pass_hz, pdm_rate_hz / 2), 256)
-    while decimation > 1 and np.abs(filter_response(taps, folding_hz / pdm_rate_hz)).max() > _STOP_BAND_GAIN:
+    enough = 10 ** ((_SLACK_DB - stop_band_db) / 20)
+    while decimation > 1 and np.abs(filter_response(taps, folding_hz / pdm_rate_hz)).max() > enough:
         half += decimation
         taps = _windowed_sinc(half, decimation, width_rad)
     return taps
@@ -162,41 +188,46 @@ def decimation_taps(*, pdm_rate_hz: float, decimation: int, pass_hz: float) -> N
 
 def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.float64]:
     stop_band_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
-    beta = 0.1102 * (stop_band_db - 8.7)  # Kaiser's formula above 50 dB
+    beta = 0.1102 * (stop_band_db - 8.7) if stop_band_db > 50 else (
+        0.5842 * max(stop_band_db - 21, 0) ** 0.4 + 0.07886 * max(stop_band_db - 21, 0)
+    )  # Kaiser's formulae
     position = np.arange(-half, half + 1)
     taps = np.sinc(position / decimation) * np.kaiser(2 * half + 1, beta)
     return np.asarray(taps / taps.sum())
 
 
-def whole_taps(taps: NDArray[np.float64]) -> NDArray[np.int16]:
-    """Return a filter in whole numbers whose magnitudes add up to 32767 at most: (tap,) int16.
+def whole_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
+    """Return a filter in whole numbers whose magnitudes add up to the largest of them at most: (tap,) int16 or int32.
 
-    It is a filter of its own rather than an approximation at every sum: rounding the taps changes the
-    response by -65 dB or less for some hundred taps, and everything after is exact.
+    It is a filter of its own rather than an approximation at every sum: rounding some hundred taps to 16 bits changes
+    the response by -65 dB or less, and everything after is exact.
 
     Parameters
     ----------
     taps : (tap,) float64
+    bits : {16, 32}
 
     Returns
     -------
-    (tap,) int16
+    (tap,) int16 or int32
 
     Raises
     ------
     ArgumentError
         There are so many taps that rounding them changes the response by more than -50 dB.
     """
-    limit = np.iinfo(np.int16).max
+    dtype = np.int16 if bits == 16 else np.int32
+    limit = np.iinfo(dtype).max
     scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # rounding adds up to a half a tap
     whole = np.rint(taps * scale)
     change = np.abs(np.fft.rfft(whole / (whole.sum() or 1.0) - taps, 4 * len(taps))).max()
-    if change > _ROUNDING_GAIN:
+    change_db = 20 * math.log10(max(change, 1e-20))
+    if change_db > _ROUNDING_DB:
         raise ArgumentError(
-            f"decimation filter of {len(taps)} taps is too long for 16 bits ({20 * math.log10(change):.0f} dB off); "
+            f"decimation filter of {len(taps)} taps is too long for {bits} bits ({change_db:.0f} dB off); "
             "give a smaller processing.decimation"
         )
-    return np.asarray(whole, dtype=np.int16)
+    return np.asarray(whole, dtype=dtype)
 
 
 def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,11 +3,13 @@
 import numpy as np
 
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
 
 LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
 SHORT = Settings(
-    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9), oversampling=32)
+    recording=Recording(n_samples=40_960),
+    processing=Processing(directions="2d:7", range_m=(0.4, 0.9)),
+    accuracy=Accuracy(max_error_db=-45.0),
 )
 CASES = {
     "default": SHORT,
@@ -34,7 +36,7 @@ CASES = {
         )
     ),
     "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15, range_decimation=150)),
-    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30, oversampling=10)),
+    "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30)),
     "every sample": SHORT.replace(processing=SHORT.processing.replace(range_decimation=10, range_m=(0.6, 0.62))),
 }
 """Settings by name. Records are short, so that the float64 referees are quick."""

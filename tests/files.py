@@ -6,7 +6,7 @@ from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.settings import Array, Processing, Recording, Settings
 
 SMALL = Settings(
-    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9), oversampling=32)
+    recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9))
 )
 
 

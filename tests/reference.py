@@ -5,6 +5,8 @@ matched, delayed by exact phase shifts and evaluated at the asked ranges. `paper
 algorithm. The plain functions below them say what each kernel should do.
 """
 
+import itertools
+
 import numpy as np
 import scipy.fft
 import scipy.signal
@@ -160,3 +162,38 @@ def delay_and_sum(signals, offsets, weights, n_ranges):
         for start, factor in zip(starts, factors, strict=True):
             beams[direction] += factor * flat[start : start + n_ranges]
     return beams
+
+
+def delayed(signals, offsets, weights, n_ranges):
+    """The weighted samples that a direction's beams are made of: (direction, mic, range) complex128."""
+    flat = signals.reshape(-1).astype(complex)
+    return flat[offsets[:, :, None] + np.arange(n_ranges)] * weights.astype(complex)[:, :, None]
+
+
+def coherence_factor(signals, offsets, weights, n_ranges):
+    """Delay-and-sum times the coherent by the total power: (direction, range) float64; no silence, please."""
+    y = delayed(signals, offsets, weights, n_ranges)
+    beams = np.abs(y.sum(axis=1))
+    return beams * beams**2 / (y.shape[1] * (np.abs(y) ** 2).sum(axis=1))
+
+
+def dmas(signals, offsets, weights, order, n_ranges):
+    """The products of all choices of microphones, written out: (direction, range) float64; no silence, please."""
+    z = delayed(signals / np.abs(signals).astype(float) ** (1 - 1 / order), offsets, weights, n_ranges)
+    choices = np.array(list(itertools.combinations(range(z.shape[1]), order)))
+    return np.stack([np.abs(np.prod(rows[choices], axis=1).sum(axis=0)) for rows in z])
+
+
+def capon(signals, offsets, weights, n_snapshots, loading, n_ranges):
+    """The weights of least variance from the whole covariance: (direction, range) float64; no silence, please."""
+    image = np.empty((len(offsets), n_ranges))
+    n_mics, n_snapshots = offsets.shape[1], min(n_snapshots, n_ranges)
+    for direction, y in enumerate(delayed(signals, offsets, weights, n_ranges)):
+        for place in range(n_ranges):
+            first = min(max(place - n_snapshots // 2, 0), n_ranges - n_snapshots)
+            window = y[:, first : first + n_snapshots]
+            covariance = window @ window.conj().T / n_snapshots
+            covariance += loading * np.trace(covariance) / n_mics * np.eye(n_mics)
+            w = np.linalg.solve(covariance, np.ones(n_mics))
+            image[direction, place] = np.abs((w / w.sum()).conj() @ y[:, place])
+    return image

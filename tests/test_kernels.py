@@ -23,6 +23,9 @@ CONTRACTS = {
     "delay_and_sum_envelope": _contract.DelayAndSumEnvelope,
     "quantise_tiles": _contract.QuantiseTiles,
     "delay_and_sum_envelope_int16": _contract.DelayAndSumEnvelopeInt16,
+    "combine_coherence": _contract.CombineCoherence,
+    "combine_dmas": _contract.CombineDmas,
+    "combine_capon": _contract.CombineCapon,
     "add_paths": _contract.AddPaths,
     "modulate_pdm": _contract.ModulatePdm,
 }

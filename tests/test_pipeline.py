@@ -62,22 +62,6 @@ def test_error_falls_by_6_db_when_the_phases_double():
     assert np.diff(errors_db) == pytest.approx([-6, -6], abs=1)
 
 
-@pytest.mark.parametrize("method", ["fast", "paper"])
-def test_direct_sound_does_not_wrap_to_far_ranges(method):
-    """Full-scale noise as long as the call at the start, then an idle pattern far out of band."""
-    settings = Settings.from_preset("short_25_50").replace(
-        processing=Processing(directions="2d:5", range_m=(0.0, 2.0), method=method)
-    )
-    words = np.where(np.arange(65_536) % 2, 0xFFFFFFFF, 0).astype(np.uint32)
-    words[: int(2.5e-3 * 4.5e6)] = noise(settings).words[: int(2.5e-3 * 4.5e6)]
-    image = Pipeline(settings).process(Measurement(words, settings))
-    near = image.energy[:, image.range_m < 0.43].max()
-    far_db = 20 * np.log10(image.energy[:, image.range_m > 0.6].max(axis=0) / near)
-    # What is left is the ringing of the band edges, and it dies out instead of coming back.
-    assert far_db.max() < -60
-    assert far_db[-100:].max() < -80
-
-
 def test_window_leaves_out_what_the_image_does_not_need():
     whole = Pipeline(SHORT.replace(processing=SHORT.processing.replace(range_m=(0.0, 1.5))))
     part = Pipeline(SHORT)
@@ -103,15 +87,6 @@ def test_default_image_has_the_range_axis_of_the_paper():
     pipeline = Pipeline(Settings())
     assert pipeline.range_m[0] == 0.5
     assert len(pipeline.range_m) == 1178  # 4.5 m at 3.82 mm: 343.87 m/s at 20 °C and 50 %
-
-
-def test_same_bits_for_any_number_of_threads():
-    settings = Settings.from_preset("short_25_50").replace(
-        processing=Processing(directions="3d:301", range_m=(0.5, 1.5))
-    )
-    measurement = noise(settings)
-    images = [Pipeline(settings, threads=n).process(measurement).energy for n in (1, 2)]
-    assert images[0].tobytes() == images[1].tobytes()
 
 
 def test_one_pipeline_serves_several_threads_at_a_time():

@@ -1,5 +1,7 @@
 """``ertis info``: what a file holds."""
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,20 +11,40 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
+    from ertis_numba.stages.health import Health
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
 
 __all__ = ["info"]
 
+_LOOKED_AT = 8
+_WIDTH = 7  # at least
+_COLUMNS = {  # name: digits, of the report and of the table
+    "offset": (6, 4),
+    "changes": (6, 3),
+    "overload": (6, 4),
+    "level_db": (2, 1),
+    "noise_dbfs": (2, 1),
+    "tone_hz": (1, 0),
+    "tone_db": (2, 1),
+}
+
 
 @click.command()
 @options.input_file("FILE")
+@click.option("--health", "of_health", is_flag=True, help="The state of the microphones of a recording instead.")
 @options.as_json
-def info(*, path: Path, as_json: bool) -> None:
+def info(*, path: Path, of_health: bool, as_json: bool) -> None:
     """Say what a recording or an energyscape file holds.
 
     In JSON, "sensors" lists what each sensor has; if there is one only, the same also stands beside
     what is said of the file.
+
+    With --health, say of each microphone of a recording whether it is ok, dead, stuck, saturated, or has an offset or
+    an idle tone. At most 8 measurements are looked at, evenly spaced. The exit code is 0 whatever is found.
     """
+    if of_health:
+        _tell_health(path, as_json=as_json)
+        return
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     kind = file_kind(path)
@@ -110,3 +132,66 @@ def _iso(time_ns: int) -> str | None:
         return None
     second = datetime.fromtimestamp(time_ns // 10**9, UTC)
     return f"{second:%Y-%m-%dT%H:%M:%S}.{time_ns % 10**9:09d}Z"
+
+
+def _tell_health(path: Path, *, as_json: bool) -> None:
+    """Print the state of the microphones of each sensor."""
+    from ertis_numba.stages.health import health, merge
+    from ertis_numba.storage import open_recording
+
+    sections: list[dict[str, Any]] = []
+    for name in options.sensors_of(path, None):
+        with open_recording(path, sensor=name) as recording:
+            last = len(recording) - 1
+            looked_at = sorted({round(last * step / (_LOOKED_AT - 1)) for step in range(_LOOKED_AT)})
+            report = merge([health(recording[index]) for index in looked_at])
+            sections.append({"sensor": name, "measurements": last + 1, **_health(report)})
+    if as_json:
+        options.print_json({"file": str(path), "sensors": sections})
+        return
+    for index, section in enumerate(sections):
+        if index:
+            click.echo()
+        for line in _health_lines(section):
+            click.echo(line)
+
+
+def _health(report: "Health") -> dict[str, Any]:
+    return {
+        "looked_at": report.measurements,
+        "faults": report.faults,
+        "noise_dbfs": _rounded(report.noise_dbfs, 2),
+        "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
+        "tones_hz": [round(tone_hz, 1) for tone_hz in report.tones_hz],
+        "unknown": report.unknown,
+        "channels": [
+            {**asdict(item), "state": item.state}
+            | {name: _rounded(getattr(item, name), digits) for name, (digits, _) in _COLUMNS.items()}
+            for item in report.channels
+        ],
+    }
+
+
+def _health_lines(section: dict[str, Any]) -> Iterator[str]:
+    """Yield what is known of an array, then a row for each of its microphones."""
+    yield f"sensor         {section['sensor']}"
+    yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
+    yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
+    yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
+    if section["tones_hz"]:
+        yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
+    for text in section["unknown"]:
+        yield f"cannot tell    {text}"
+    width = max(len("state"), *(len(row["state"]) for row in section["channels"]))
+    yield "  ".join(["channel", "state".ljust(width), *(name.rjust(_WIDTH) for name in _COLUMNS)])
+    for row in section["channels"]:
+        cells = (_cell(row[name], digits).rjust(max(_WIDTH, len(name))) for name, (_, digits) in _COLUMNS.items())
+        yield "  ".join([f"{row['channel']:7d}", row["state"].ljust(width), *cells])
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits) + 0.0  # which turns -0.0 into 0.0
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{_rounded(value, digits):.{digits}f}"

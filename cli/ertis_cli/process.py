@@ -29,6 +29,11 @@ __all__ = ["process"]
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="The recording's own choice by default.")
 @click.option(
+    "--beamformer",
+    type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
+    help="How microphones are combined; the recording's own choice by default.",
+)
+@click.option(
     "--settings",
     "settings_file",
     metavar="FILE.toml",
@@ -43,6 +48,7 @@ __all__ = ["process"]
     help="float16 halves the file; it keeps three digits down to -84 dB of full scale, fewer below, and netCDF "
     "programs cannot read it.",
 )
+@click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
 @options.threads
 @options.force
@@ -58,8 +64,10 @@ def process(
     elevation: tuple[float, float] | None,
     range_m: tuple[float, float] | None,
     method: str | None,
+    beamformer: str | None,
     settings_file: Path | None,
     dtype: Literal["float32", "float16"],
+    strict: bool,
     device: str,
     threads: int | None,
     force: bool,
@@ -88,11 +96,15 @@ def process(
                 elevation_limits_deg=elevation,
                 range_m=range_m,
                 method=method,
+                beamformer=beamformer,
             )
             for recording in recordings
         ]
         writer = EnergyscapeWriter(target, recording=recordings, dtype=dtype, overwrite=force)
         runs = [_Run(options.pipeline(given, device=device, threads=threads, quiet=quiet)) for given in settings]
+        for run, recording in zip(runs, recordings, strict=True):
+            first = replace(recording[0], settings=run.pipeline.settings)
+            _tell_faults(f"{path}: sensor {recording.sensor}", first, strict=strict)
         measurements = (
             (run, measurement, recording.settings)
             for run, recording in zip(runs, recordings, strict=True)
@@ -122,6 +134,22 @@ def process(
         )
     if as_json:
         options.print_json(report)
+
+
+def _tell_faults(name: str, measurement: "Measurement", *, strict: bool) -> None:
+    """Warn of faulty microphones, or refuse them."""
+    from ertis_numba.errors import DataError
+    from ertis_numba.stages.health import health
+
+    report = health(measurement)
+    if not report.faults:
+        return
+    every = all(channel.faults for channel in report.channels)
+    remedy = "check its cable and supply" if every else "put them under 'disabled' in a layout file for --settings"
+    text = f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
+    if strict:
+        raise DataError(text)
+    click.echo(f"ertis: warning: {text}", err=True)
 
 
 class _Run:

@@ -1,14 +1,25 @@
-"""Draw the pictures of the README: `make pictures`.
+"""Draw the pictures of the README and of the page on beamformers: `make pictures`.
 
 The real measurement comes with the package rtisdev; its code is not imported.
 """
 
 import importlib.metadata
+import io
 from pathlib import Path
+from typing import Any
+
+from PIL import Image
 
 import ertis_numba as ertis
 
 HERE = Path(__file__).parent
+BEAMFORMERS: dict[str, dict[str, Any]] = {
+    "Delay-and-sum": {},
+    "Coherence factor": {"beamformer": "coherence_factor"},
+    "DMAS of order 2": {"beamformer": "dmas"},
+    "Capon": {"beamformer": "capon"},
+}
+"""Heading of each picture, and what to change in the settings."""
 
 
 def real() -> None:
@@ -21,5 +32,28 @@ def real() -> None:
     ertis.plot(image, peaks=ertis.find_peaks(image, top=5)).savefig(HERE / "real.png")
 
 
+def beamformers() -> None:
+    """Draw the synthetic reflectors once by each beamformer, two by two."""
+    with ertis.open_recording(HERE.parents[1] / "data" / "synthetic" / "reflectors.h5") as recording:
+        measurement = recording[0]
+    parts = []
+    for name, options in BEAMFORMERS.items():
+        settings = measurement.settings
+        processing = settings.processing.replace(directions="2d:361", **options)
+        pipeline = ertis.Pipeline(settings.replace(processing=processing))
+        figure = ertis.plot(pipeline.process(measurement), dynamic_range_db=50)
+        figure.texts[0].set_text(name)
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=70)
+        parts.append(Image.open(file).convert("RGB"))
+    width, height = round(0.76 * parts[0].width), parts[0].height  # without the scale, which all share
+    sheet = Image.new("RGB", (width + parts[0].width, 2 * height))
+    for place, part in enumerate(parts):
+        row, column = divmod(place, 2)
+        sheet.paste(part.crop((0, 0, part.width if column else width, height)), (column * width, row * height))
+    sheet.save(HERE / "beamformers.png", optimize=True)
+
+
 if __name__ == "__main__":
     real()
+    beamformers()

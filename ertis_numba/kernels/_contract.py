@@ -19,6 +19,7 @@ Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Index = NDArray[np.int32]
 Short = NDArray[np.int16]
+Taps = NDArray[np.int16] | NDArray[np.int32]
 
 
 class UnpackBits(Protocol):
@@ -79,8 +80,8 @@ class DemodulateWords(Protocol):
     ----------
     words, channels
         As in `UnpackBits`.
-    taps : (tap,) int16
-        Symmetric, an odd number; their magnitudes add up to 32767 at most.
+    taps : (tap,) int16 or int32
+        Symmetric, an odd number; their magnitudes add up to the largest number of their type at most.
     scale : float32
     factor, first, n_outputs : int
     out : (mic, sample) float32
@@ -90,7 +91,7 @@ class DemodulateWords(Protocol):
         self,
         words: Words,
         channels: Index,
-        taps: Short,
+        taps: Taps,
         scale: np.float32,
         factor: int,
         first: int,
@@ -115,14 +116,15 @@ class MultiplySpectra(Protocol):
 class MultiplyAndFold(Protocol):
     """Multiply spectra by one filter per phase and fold each product to the length of ``out``.
 
-    ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[phase, b]`` over all b with
+    ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[mic, phase, b]`` over all b with
     ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the
     filtered signal at the output rate, once per phase: the polyphase form of one long transform.
 
     Parameters
     ----------
     spectra : (mic, bin) complex64
-    responses : (phase, b) complex64
+    responses : (mic, phase, b) or (1, phase, b) complex64
+        Each microphone's own, or one for all.
     first_bin : int
     out : (mic, phase, k) complex64
     """
@@ -161,23 +163,68 @@ class Envelope(Protocol):
 
 
 class DelayAndSumEnvelope(Protocol):
-    """`DelayAndSum` and `Envelope` in one pass, so that no beam is written to memory.
+    """`DelayAndSum` and `Envelope` in one pass over some ranges, so that no beam is written to memory.
+
+    ``out[direction, range] = |Σ_term weights[direction, term] · signals.flat[offsets[direction, term] + range]|``.
+    A term is one sample of one microphone: where delays are interpolated, each microphone has several.
 
     Parameters
     ----------
-    signals, offsets, weights
-        As in `DelayAndSum`.
+    signals : (mic, phase, sample) complex64
+    offsets : (direction, term) int32
+    weights : (direction, term) complex64
+    first, stop : int
+        Ranges to fill.
     out : (direction, range) float32
     """
 
-    def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Real) -> None: ...
+    def __call__(
+        self, signals: Complex, offsets: Index, weights: Complex, first: int, stop: int, out: Real
+    ) -> None: ...
+
+
+class InterpolatedBeamsEnvelope(Protocol):
+    """Beams of few nodes, from those the beams of all directions, and their envelopes.
+
+    ``nodes[node, range] = Σ_term weights[node, term] · signals.flat[offsets[node, term] + range]`` and
+    ``out[direction, range] = |Σ_pair,k tap_weights[direction, pair, k] · nodes[places[direction, pair] + k, range]|``
+    for k = 0 and 1.
+
+    Parameters
+    ----------
+    signals : (mic, phase, sample) complex64
+    offsets : (node, term) int32
+    weights : (node, term) complex64
+    places : (direction, pair) int32
+        The lower node of each pair.
+    tap_weights : (direction, pair, 2) float32
+    first, stop : int
+        Ranges to fill.
+    n_blocks : int
+        Into how many parts directions are cut, where there are more threads than tiles of ranges.
+    out : (direction, range) float32
+        At least 64 ranges, which is how far signals are read.
+    """
+
+    def __call__(
+        self,
+        signals: Complex,
+        offsets: Index,
+        weights: Complex,
+        places: Index,
+        tap_weights: Real,
+        first: int,
+        stop: int,
+        n_blocks: int,
+        out: Real,
+    ) -> None: ...
 
 
 class QuantiseTiles(Protocol):
     """Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale.
 
     ``tiles[tile, mic, phase, k] ≈ signals[mic, phase, starts[tile] + k] / scales[tile]``, rounded, as pairs of
-    real and imaginary part; the largest part of a tile becomes ``limit``. Past the end of the signals
+    real and imaginary part; the largest magnitude of a tile becomes ``limit``. Past the end of the signals
     tiles are 0. A tile spans decimetres, so an echo keeps its 16 bits however much stronger the
     reflectors at other ranges are.
 
@@ -196,16 +243,18 @@ class QuantiseTiles(Protocol):
 class DelayAndSumEnvelopeInt16(Protocol):
     """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
 
-    ``out[direction, starts[tile] + k] = scales[tile] · weight_scale · |Σ_mic w · x|`` with
-    ``x = tiles[tile].flat[offsets[direction, mic] + k]``, for k below the device's ``tile_ranges``.
+    ``out[direction, starts[tile] + k] = scales[tile] · weight_scale · |Σ_term w · x|`` with
+    ``x = tiles[tile].flat[offsets[direction, term] + k]``, for k below the device's ``tile_ranges``.
 
     Parameters
     ----------
     tiles, scales, starts
-        As in `QuantiseTiles`, ``tile_ranges`` apart; of the last tile only the ranges of the image are written.
-    offsets : (direction, mic) int32
+        As in `QuantiseTiles`, ``tile_ranges`` apart.
+    stop : int
+        Ranges from here on are not written.
+    offsets : (direction, term) int32
         Into one tile, in complex samples.
-    weights : (direction, mic, 2, 2) int16
+    weights : (direction, term, 2, 2) int16
         ``((re w, −im w), (im w, re w))``.
     weight_scale : float32
         Worth of a weight of 1.
@@ -217,10 +266,111 @@ class DelayAndSumEnvelopeInt16(Protocol):
         tiles: Short,
         scales: Real,
         starts: Index,
+        stop: int,
         offsets: Index,
         weights: Short,
         weight_scale: np.float32,
         out: Real,
+    ) -> None: ...
+
+
+class InterpolatedBeamsEnvelopeInt16(Protocol):
+    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
+
+    Of the sums that are beams of nodes the upper 16 bits are kept, rounded: ``(sum + 2¹⁵) >> 16``.
+
+    Parameters
+    ----------
+    tiles, scales, starts, stop
+        As in `DelayAndSumEnvelopeInt16`.
+    offsets : (node, term) int32
+    weights : (node, term, 2, 2) int16
+        As there, of nodes.
+    places : (direction, pair) int32
+    tap_weights : (direction, pair, 2) int16
+    weight_scale : float32
+        Worth of 1 in the sums over nodes, in units of the tile's scale.
+    n_blocks : int
+    out : (direction, range) float32
+    """
+
+    def __call__(
+        self,
+        tiles: Short,
+        scales: Real,
+        starts: Index,
+        stop: int,
+        offsets: Index,
+        weights: Short,
+        places: Index,
+        tap_weights: Short,
+        weight_scale: np.float32,
+        n_blocks: int,
+        out: Real,
+    ) -> None: ...
+
+
+class CombineCoherence(Protocol):
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which tells how well microphones agree.
+
+    With ``y = weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``,
+    ``out[direction, range] = |Σ y| · |Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 where all are silent.
+
+    Parameters
+    ----------
+    signals, offsets, weights
+        As in `DelayAndSum`.
+    out : (direction, range) float32
+    """
+
+    def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Real) -> None: ...
+
+
+class CombineDmas(Protocol):
+    """Delay-multiply-and-sum: sum the products of the roots of all choices of ``order`` microphones.
+
+    ``out[direction, range] = |e_order(z)|``, the elementary symmetric polynomial of all microphones' z =
+    ``weights[direction, mic] · root(signals.flat[offsets[direction, mic] + range])`` with
+    ``root(x) = x / |x|^(1 − 1 / order)`` and ``root(0) = 0``.
+
+    It is built up microphone by microphone, ``e_k += z e_(k−1)``, and errs by rounding of ``e_order(|z|)`` at most.
+    Power sums and Newton's identities, the other way, subtract what nearly cancels where one microphone is much
+    louder than all others.
+
+    Parameters
+    ----------
+    signals, offsets
+        As in `DelayAndSum`.
+    weights : (direction, mic) complex64
+        Of roots.
+    order : int
+        At least 2, and at most the number of microphones.
+    out : (direction, range) float32
+    """
+
+    def __call__(self, signals: Complex, offsets: Index, weights: Complex, order: int, out: Real) -> None: ...
+
+
+class CombineCapon(Protocol):
+    """Combine the microphones with the weights that let a beam's own sound pass and all other sound least.
+
+    With y as in `CombineCoherence`, its covariance R over the ``n_snapshots`` ranges about a range (near the ends
+    of the image, the nearest that are in it) and M microphones, ``w = R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)`` with
+    ``R' = R + loading · trace(R) / M · I`` and ``out[direction, range] = |wᴴ y|``; 0 where all are silent.
+
+    Parameters
+    ----------
+    signals, offsets, weights
+        As in `DelayAndSum`, but weights of magnitude 1 make ``out`` an amplitude: w adds up to 1.
+    n_snapshots : int
+        At least 1; more than there are ranges count as all ranges.
+    loading : float
+        Above 0.
+    out : (direction, range) float32
+    """
+
+    def __call__(
+        self, signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
     ) -> None: ...
 
 
@@ -343,7 +493,12 @@ class KernelSet:
     delay_and_sum: DelayAndSum
     envelope: Envelope
     delay_and_sum_envelope: DelayAndSumEnvelope
+    interpolated_beams_envelope: InterpolatedBeamsEnvelope
     quantise_tiles: QuantiseTiles
     delay_and_sum_envelope_int16: DelayAndSumEnvelopeInt16
+    interpolated_beams_envelope_int16: InterpolatedBeamsEnvelopeInt16
+    combine_coherence: CombineCoherence
+    combine_dmas: CombineDmas
+    combine_capon: CombineCapon
     add_paths: AddPaths
     modulate_pdm: ModulatePdm

@@ -3,15 +3,17 @@
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short, Words
+from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short, Taps, Words
 
 __all__ = ["KERNELS"]
+
+Number = TypeVar("Number", np.float32, np.float64)
 
 _TILE_RANGES = 96  # as many as the compiled kernel has with AVX-512
 _NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / rms of a sum of four numbers from 0 to 4095
@@ -47,7 +49,7 @@ def remove_group_delay(signals: Real, delay: int, out: Real) -> None:
 def demodulate_words(
     words: Words,
     channels: Index,
-    taps: Short,
+    taps: Taps,
     scale: np.float32,
     factor: int,
     first: int,
@@ -60,20 +62,24 @@ def demodulate_words(
     stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
     signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
     unpack_bits(words[start : start + signals.shape[1]], channels, signals)
-    # Sums of whole numbers below 2^24 are exact in float32, in whatever order.
-    out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, first * factor - half - start, n_outputs)
+    # Sums of whole numbers below 2^24 are exact in float32, in whatever order; those of longer taps in float64.
+    exact = np.float32 if taps.dtype == np.int16 else np.float64
+    filtered = _filtered(signals.astype(exact), taps.astype(exact), factor, first * factor - half - start, n_outputs)
+    out[:, :n_outputs] = filtered
     out *= scale
     out[:, n_outputs:] = 0
 
 
-def _filtered(signals: Real, taps: Real, factor: int, start: int, n_outputs: int) -> NDArray[np.float32]:
+def _filtered(
+    signals: NDArray[Number], taps: NDArray[Number], factor: int, start: int, n_outputs: int
+) -> NDArray[Number]:
     """Filter with the first tap of output 0 at sample ``start``; samples outside the signals are 0."""
     needed = (n_outputs - 1) * factor + len(taps)
-    padded = np.zeros((len(signals), needed + factor), dtype=np.float32)
+    padded = np.zeros((len(signals), needed + factor), dtype=signals.dtype)
     source = signals[:, max(start, 0) : max(start + needed, 0)]
     padded[:, max(-start, 0) :][:, : source.shape[1]] = source
     # The taps cut into rows of one output each: n_taps / factor matrix products over views of the signal.
-    total = np.zeros((len(signals), n_outputs), dtype=np.float32)
+    total = np.zeros((len(signals), n_outputs), dtype=signals.dtype)
     for tap in range(0, len(taps), factor):
         part = taps[tap : tap + factor]
         blocks = padded[:, tap : tap + n_outputs * factor]
@@ -90,14 +96,14 @@ def multiply_spectra(spectra: Complex, response: Complex, out: Complex) -> None:
 
 def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None:
     """See `MultiplyAndFold`."""
-    n_bins, n_out = responses.shape[1], out.shape[2]
+    n_bins, n_out = responses.shape[2], out.shape[2]
     out[:] = 0
     done = 0
     while done < n_bins:
         place = (first_bin + done) % n_out
         run = min(n_bins - done, n_out - place)
         part = spectra[:, None, first_bin + done : first_bin + done + run]
-        out[:, :, place : place + run] += part * responses[:, done : done + run]
+        out[:, :, place : place + run] += part * responses[:, :, done : done + run]
         done += run
 
 
@@ -116,11 +122,34 @@ def envelope(beams: Complex, out: Real) -> None:
     np.abs(beams, out=out)
 
 
-def delay_and_sum_envelope(signals: Complex, offsets: Index, weights: Complex, out: Real) -> None:
+def delay_and_sum_envelope(
+    signals: Complex, offsets: Index, weights: Complex, first: int, stop: int, out: Real
+) -> None:
     """See `DelayAndSumEnvelope`."""
-    beams: NDArray[Any] = np.empty(out.shape, dtype=np.complex64)
-    delay_and_sum(signals, offsets, weights, beams)
-    envelope(beams, out)
+    beams: NDArray[Any] = np.empty((len(out), stop - first), dtype=np.complex64)
+    delay_and_sum(signals, offsets + np.int32(first), weights, beams)
+    envelope(beams, out[:, first:stop])
+
+
+def interpolated_beams_envelope(
+    signals: Complex,
+    offsets: Index,
+    weights: Complex,
+    places: Index,
+    tap_weights: Real,
+    first: int,
+    stop: int,
+    n_blocks: int,  # noqa: ARG001
+    out: Real,
+) -> None:
+    """See `InterpolatedBeamsEnvelope`."""
+    nodes: NDArray[Any] = np.empty((len(offsets), stop - first), dtype=np.complex64)
+    delay_and_sum(signals, offsets + np.int32(first), weights, nodes)
+    # Real weights: on floats the matrix product does half the work.
+    for direction, pairs in enumerate(places):
+        near = np.stack([pairs, pairs + 1], axis=1).reshape(-1)
+        beam = tap_weights[direction].reshape(-1) @ nodes[near].view(np.float32)
+        np.abs(beam.view(np.complex64), out=out[direction, first:stop])
 
 
 def quantise_tiles(signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None:
@@ -129,24 +158,112 @@ def quantise_tiles(signals: Complex, starts: Index, limit: np.float32, tiles: Sh
     for tile, start in enumerate(starts):
         part = np.ascontiguousarray(signals[:, :, start : start + tiles.shape[3]])
         parts = part.view(np.float32).reshape(*part.shape, 2)
-        largest = np.max(np.abs(parts), initial=0)
+        largest = np.sqrt(np.max(np.sum(np.square(parts), axis=-1), initial=0))
         scales[tile] = largest / limit
         if largest:
             tiles[tile, :, :, : part.shape[2]] = np.rint(parts * (limit / largest))
 
 
 def delay_and_sum_envelope_int16(
-    tiles: Short, scales: Real, starts: Index, offsets: Index, weights: Short, weight_scale: np.float32, out: Real
+    tiles: Short,
+    scales: Real,
+    starts: Index,
+    stop: int,
+    offsets: Index,
+    weights: Short,
+    weight_scale: np.float32,
+    out: Real,
 ) -> None:
     """See `DelayAndSumEnvelopeInt16`."""
     for tile, start in enumerate(starts):
-        n_ranges = min(_TILE_RANGES, out.shape[1] - start)
-        flat = tiles[tile].reshape(-1, 2).astype(np.int32)
-        for direction, places in enumerate(offsets):
-            samples = flat[places[:, None] + np.arange(n_ranges)]  # (mic, range, 2)
-            real, imag = np.einsum("mrc,mpc->pr", samples, weights[direction].astype(np.int32)).astype(np.float32)
-            level = np.sqrt(real * real + imag * imag)
-            out[direction, start : start + n_ranges] = level * (scales[tile] * weight_scale)
+        n_ranges = min(_TILE_RANGES, stop - start)
+        for direction in range(len(offsets)):
+            parts = _whole_beam(tiles[tile], offsets[direction], weights[direction])[:, :n_ranges]
+            out[direction, start : start + n_ranges] = _level(parts, scales[tile] * weight_scale)
+
+
+def interpolated_beams_envelope_int16(
+    tiles: Short,
+    scales: Real,
+    starts: Index,
+    stop: int,
+    offsets: Index,
+    weights: Short,
+    places: Index,
+    tap_weights: Short,
+    weight_scale: np.float32,
+    n_blocks: int,  # noqa: ARG001
+    out: Real,
+) -> None:
+    """See `InterpolatedBeamsEnvelopeInt16`."""
+    for tile, start in enumerate(starts):
+        n_ranges = min(_TILE_RANGES, stop - start)
+        nodes = np.stack([_whole_beam(tiles[tile], *row) for row in zip(offsets, weights, strict=True)])
+        nodes = (nodes + (1 << 15)) >> 16
+        for direction, pairs in enumerate(places):
+            near = nodes[np.stack([pairs, pairs + 1], axis=1)]  # (pair, 2, part, range)
+            parts = np.einsum("pktr,pk->tr", near, tap_weights[direction].astype(np.int32))[:, :n_ranges]
+            out[direction, start : start + n_ranges] = _level(parts, scales[tile] * weight_scale)
+
+
+def _whole_beam(tile: Short, offsets: Index, weights: Short) -> NDArray[np.int32]:
+    """Return the beam of one direction, in whole numbers: (part, range) int32."""
+    flat = tile.reshape(-1, 2).astype(np.int32)
+    samples = flat[offsets[:, None] + np.arange(_TILE_RANGES)]  # (term, range, 2)
+    return np.asarray(np.einsum("trc,tpc->pr", samples, weights.astype(np.int32)))
+
+
+def _level(parts: NDArray[np.int32], scale: np.float32) -> NDArray[np.float32]:
+    real, imag = parts.astype(np.float32)
+    return np.asarray(np.sqrt(real * real + imag * imag) * scale)
+
+
+def _delayed(
+    signals: Complex, offsets: Index, weights: Complex, n_ranges: int
+) -> Iterator[tuple[int, NDArray[np.complex128]]]:
+    """Yield each direction with what its beams are made of, (mic, range) complex128."""
+    windows = np.lib.stride_tricks.sliding_window_view(signals.reshape(-1), n_ranges)
+    for direction, places in enumerate(offsets):
+        yield direction, windows[places] * weights[direction].astype(np.complex128)[:, None]
+
+
+def combine_coherence(signals: Complex, offsets: Index, weights: Complex, out: Real) -> None:
+    """See `CombineCoherence`."""
+    for direction, y in _delayed(signals, offsets, weights, out.shape[1]):
+        beams = np.abs(y.sum(axis=0))
+        total = len(y) * (y.real**2 + y.imag**2).sum(axis=0)
+        out[direction] = np.divide(beams**3, total, out=np.zeros_like(beams), where=total != 0)
+
+
+def combine_dmas(signals: Complex, offsets: Index, weights: Complex, order: int, out: Real) -> None:
+    """See `CombineDmas`."""
+    level = np.abs(signals.astype(np.complex128))
+    roots = signals * np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
+    for direction, z in _delayed(roots, offsets, weights, out.shape[1]):
+        sums = np.zeros((order + 1, out.shape[1]), dtype=np.complex128)
+        sums[0] = 1
+        for mic in range(len(z)):
+            sums[1:] += z[mic] * sums[:-1]  # the right side is made first, of sums without this microphone
+        out[direction] = np.abs(sums[order])
+
+
+def combine_capon(
+    signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
+) -> None:
+    """See `CombineCapon`; a system of the size of the snapshots, as in the compiled one."""
+    n_mics, n_ranges = offsets.shape[1], out.shape[1]
+    n_snapshots = min(n_snapshots, n_ranges)
+    ranges = np.arange(n_ranges)
+    first = np.clip(ranges - n_snapshots // 2, 0, n_ranges - n_snapshots)
+    for direction, y in _delayed(signals, offsets, weights, n_ranges):
+        samples = y[:, first[:, None] + np.arange(n_snapshots)].transpose(1, 0, 2)  # (range, mic, snapshot)
+        gram = samples.conj().transpose(0, 2, 1) @ samples
+        trace = np.trace(gram, axis1=1, axis2=2).real
+        added = np.where(trace == 0, 1.0, loading * trace / n_mics)
+        beams = samples.conj().sum(axis=1)
+        solved = np.linalg.solve(gram + added[:, None, None] * np.eye(n_snapshots), beams[:, :, None])[:, :, 0]
+        fit = (beams.conj() * solved).sum(axis=1).real
+        out[direction] = np.abs(solved[ranges, ranges - first]) * added / (n_mics - fit)
 
 
 def add_paths(
@@ -227,8 +344,13 @@ KERNELS = KernelSet(
     delay_and_sum=delay_and_sum,
     envelope=envelope,
     delay_and_sum_envelope=delay_and_sum_envelope,
+    interpolated_beams_envelope=interpolated_beams_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    interpolated_beams_envelope_int16=interpolated_beams_envelope_int16,
+    combine_coherence=combine_coherence,
+    combine_dmas=combine_dmas,
+    combine_capon=combine_capon,
     add_paths=add_paths,
     modulate_pdm=modulate_pdm,
 )

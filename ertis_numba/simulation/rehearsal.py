@@ -14,6 +14,7 @@ from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
 
 __all__ = ["Rehearsal", "image_change_db"]
@@ -100,6 +101,10 @@ def image_change_db(
 
 
 def _chain(settings: Settings) -> FastChain:
-    exact = settings.processing.replace(method="fast", precision="float32")
     kernel_set = kernels.load("cpu")
-    return FastChain(settings.replace(processing=exact), kernel_set, threads=kernel_set.max_threads)
+    threads = kernel_set.max_threads
+    single = settings.replace(
+        processing=settings.processing.replace(method="fast"),
+        accuracy=settings.accuracy.replace(precision="float32"),
+    )
+    return FastChain(planner.complete(single, kernel_set, threads=threads), kernel_set, threads=threads)

@@ -1,77 +1,27 @@
 """From analytic signals to the envelopes of beams, by delay-and-sum."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DeviceError
+from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet
-from ertis_numba.settings import Settings
+from ertis_numba.stages.beam_nodes import BeamNodes
+from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "DelayTable", "beamform"]
+__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "beamform", "require_int16", "whole_limits"]
 
-_DIRECTIONS_PER_PHASE = 30  # from here on 16 bits save more time than it takes to make them
 _WEIGHT_BITS = 12  # leave the samples 13 bits with 32 microphones: both err by about -85 dB then
+_TAP_BITS = 15  # of the weights of nodes, less what their sum needs
+_SAFE = 0.98  # of the largest whole number: rounding must not go beyond it
 
 Buffers = tuple[NDArray[np.int16], NDArray[np.float32]]
 """What a call writes to on its way: tiles and their scales, empty where samples stay in float32."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DelayTable:
-    """Which sample of which phase each microphone adds to a direction's first range, and its weight.
-
-    A delay is rounded to the nearest phase; the carrier's phase over the remainder goes into the weight, so
-    that only the envelope is off by it.
-
-    Attributes
-    ----------
-    phases, samples : (direction, mic) int64
-    weights : (direction, mic) complex128
-    """
-
-    phases: NDArray[np.int64]
-    samples: NDArray[np.int64]
-    weights: NDArray[np.complex128]
-
-    @classmethod
-    def of(
-        cls,
-        delays_s: NDArray[np.float64],
-        amplitudes: NDArray[np.float64],
-        settings: Settings,
-        window: TimeWindow,
-        *,
-        centre_hz: float,
-    ) -> Self:
-        """Return the table of ``delays_s``, (direction, mic), with the weight of each microphone."""
-        n_phases = settings.processing.oversampling
-        fine_rate_hz = settings.output_rate_hz * n_phases
-        steps = np.rint(delays_s * fine_rate_hz)
-        carrier = np.exp(2j * math.pi * centre_hz * (delays_s - steps / fine_rate_hz))
-        samples, phases = np.divmod(steps.astype(np.int64), n_phases)
-        return cls(phases, samples + window.lead, carrier * amplitudes)
-
-    def offsets(self, n_phases: int, width: int) -> NDArray[np.int32]:
-        """Return where the first sample lies in a flat array of (mic, phase, ``width``).
-
-        Raises
-        ------
-        ArgumentError
-            The array has too many samples to index.
-        """
-        n_mics = self.phases.shape[1]
-        if n_mics * n_phases * width > np.iinfo(np.int32).max:
-            raise ArgumentError(
-                f"{n_mics} microphones, {n_phases} phases and {width} samples are too many to index; "
-                "give a shorter range or less oversampling"
-            )
-        rows = np.arange(n_mics) * n_phases + self.phases
-        return (rows * width + self.samples).astype(np.int32)
 
 
 class Beamform(Protocol):
@@ -81,47 +31,78 @@ class Beamform(Protocol):
         """Return what one call needs to write to."""
         ...
 
-    def __call__(
-        self,
-        analytic: NDArray[np.complex64],
-        buffers: Buffers,
-        out: NDArray[np.float32],
-    ) -> None:
+    def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         ...
 
 
+def require_int16(kernels: KernelSet) -> None:
+    """Refuse a device without 16-bit dot products.
+
+    Raises
+    ------
+    DeviceError
+    """
+    if not kernels.tile_ranges:
+        raise DeviceError(
+            "accuracy.precision is 'int16', but this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI); "
+            "give 'float32' or 'auto'"
+        )
+
+
 def beamform(
-    settings: Settings, window: TimeWindow, kernels: KernelSet, table: DelayTable
+    precision: str,
+    kernels: KernelSet,
+    window: TimeWindow,
+    zones: Sequence[Zone],
+    nodes: BeamNodes | None,
+    *,
+    n_phases: int,
+    threads: int,
 ) -> "BeamformFloat32 | BeamformInt16":
-    """Return the beamformer of ``settings.processing.precision``.
+    """Return the beamformer of a plan; parameters as for `BeamformFloat32`.
 
     Raises
     ------
     DeviceError
         The device has no 16-bit dot product.
     """
-    precision = settings.processing.precision
-    if precision == "auto":
-        worth_it = len(table.weights) > _DIRECTIONS_PER_PHASE * settings.processing.oversampling
-        precision = "int16" if worth_it and kernels.fastest_precision == "int16" else "float32"
     if precision == "float32":
-        return BeamformFloat32(settings, window, kernels, table)
-    if not kernels.tile_ranges:
-        raise DeviceError(
-            "processing.precision is 'int16', but this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI); "
-            "give 'float32'"
-        )
-    return BeamformInt16(settings, window, kernels, table)
+        return BeamformFloat32(kernels, window, zones, nodes, threads=threads)
+    require_int16(kernels)
+    return BeamformInt16(kernels, window, zones, nodes, n_phases=n_phases, threads=threads)
 
 
 class BeamformFloat32:
-    """See `Beamform`; samples stay in single precision."""
+    """See `Beamform`; samples stay in single precision.
 
-    def __init__(self, settings: Settings, window: TimeWindow, kernels: KernelSet, table: DelayTable) -> None:
-        self._offsets = table.offsets(settings.processing.oversampling, window.n_outputs)
-        self._weights = table.weights.astype(np.complex64)
-        self._kernel = kernels.delay_and_sum_envelope
+    Parameters
+    ----------
+    kernels, window
+    zones : sequence of Zone
+        Together the whole range axis; of the beams of all directions, or of the nodes.
+    nodes : BeamNodes, optional
+        The zones' beams are those of nodes, and others are interpolated from them.
+    threads : int
+    """
+
+    def __init__(
+        self,
+        kernels: KernelSet,
+        window: TimeWindow,
+        zones: Sequence[Zone],
+        nodes: BeamNodes | None,
+        *,
+        threads: int,
+    ) -> None:
+        self._kernels, self._nodes = kernels, nodes
+        self._zones = [
+            (zone.first, zone.stop, zone.table.offsets(window.n_outputs), np.ascontiguousarray(zone.table.weights, np.complex64))
+            for zone in zones
+        ]
+        if nodes is not None:
+            self._tap_weights = nodes.weights.astype(np.float32)
+            self._n_blocks = _blocks(threads, len(window.range_m) // 64)
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
@@ -134,48 +115,129 @@ class BeamformFloat32:
         out: NDArray[np.float32],
     ) -> None:
         """See `Beamform`."""
-        self._kernel(analytic, self._offsets, self._weights, out)
+        for first, stop, offsets, weights in self._zones:
+            if self._nodes is None:
+                self._kernels.delay_and_sum_envelope(analytic, offsets, weights, first, stop, out)
+            else:
+                self._kernels.interpolated_beams_envelope(
+                    analytic,
+                    offsets,
+                    weights,
+                    self._nodes.places,
+                    self._tap_weights,
+                    first,
+                    stop,
+                    self._n_blocks,
+                    out,
+                )
+
+
+def whole_limits(sum_of_weights: float) -> tuple[int, int]:
+    """Return the largest whole numbers of weights and of samples, for a sum of weights by the largest of them."""
+    bits = math.log2(_SAFE) + 31 - math.log2(sum_of_weights)
+    weight_bits = min(_WEIGHT_BITS, math.floor(bits / 2))
+    # One off for rounding, and a sample has 15 bits at most.
+    return 2**weight_bits - 1, math.floor(min(2.0 ** (bits - weight_bits), 2.0**15)) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _WholeZone:
+    """A zone in whole numbers; its tiles are those from ``begin`` to ``end``."""
+
+    begin: int
+    end: int
+    stop: int
+    offsets: NDArray[np.int32]
+    weights: NDArray[np.int16]
 
 
 class BeamformInt16:
     """See `Beamform`; samples go through 16 bits, scaled tile by tile of ranges.
 
-    The 32-bit sums must hold all microphones at full scale: with weights up to ``w`` and parts of samples up
-    to ``x``, that is ``√2 · n_mics · w · x ≤ 2³¹``. Weights get 12 bits of it, or half where there is less.
+    The 32-bit sums must hold all terms at full scale: for weights w and samples of magnitudes up to x, that is
+    ``x · Σ|w| ≤ 2³¹``. Weights get 12 bits of it, or half where there is less. Of the beams of nodes the upper
+    16 bits are kept, so that they fill them where the sums fill their 32.
     """
 
-    def __init__(self, settings: Settings, window: TimeWindow, kernels: KernelSet, table: DelayTable) -> None:
-        n_mics = table.weights.shape[1]
-        n_phases = settings.processing.oversampling
-        n_ranges = len(window.range_m)
-        bits = 31 - 0.5 - math.log2(n_mics)
-        weight_bits = min(_WEIGHT_BITS, math.floor(bits / 2))
-        # One off for rounding, and a sample has 15 bits at most.
-        self._limit = np.float32(min(2.0 ** (bits - weight_bits), 2.0**15) - 1)
-        largest = float(np.max(np.abs(table.weights)))
-        scaled = table.weights * ((2**weight_bits - 1) / largest)
-        pairs = [[scaled.real, -scaled.imag], [scaled.imag, scaled.real]]
-        self._weights = np.ascontiguousarray(np.rint(np.moveaxis(np.array(pairs), (0, 1), (2, 3)))).astype(np.int16)
-        self._weight_scale = np.float32(largest / (2**weight_bits - 1))
-        width = kernels.tile_ranges + int(table.samples.max()) + 1
-        self._offsets = table.offsets(n_phases, width)
-        n_tiles = -(-n_ranges // kernels.tile_ranges)
-        self._starts = np.arange(n_tiles, dtype=np.int32) * np.int32(kernels.tile_ranges)
-        self._shape = (n_tiles, n_mics, n_phases, width, 2)
-        self._quantise = kernels.quantise_tiles
-        self._kernel = kernels.delay_and_sum_envelope_int16
+    def __init__(
+        self,
+        kernels: KernelSet,
+        window: TimeWindow,
+        zones: Sequence[Zone],
+        nodes: BeamNodes | None,
+        *,
+        n_phases: int,
+        threads: int,
+    ) -> None:
+        tables = [zone.table for zone in zones]
+        largest = max(float(np.max(np.abs(table.weights))) for table in tables)
+        weight_limit, limit = whole_limits(
+            max(float(np.max(np.abs(table.weights).sum(axis=1))) for table in tables) / largest
+        )
+        self._limit = np.float32(limit)
+        self._weight_scale = np.float32(largest / weight_limit)
+        self._kernels, self._nodes = kernels, nodes
+        width = kernels.tile_ranges + max(int(table.samples.max()) for table in tables) + 1
+        starts: list[int] = []
+        self._zones: list[_WholeZone] = []
+        for zone in zones:
+            mine = range(zone.first, zone.stop, kernels.tile_ranges)
+            offsets, weights = zone.table.offsets(width), _pairs(zone.table.weights / self._weight_scale)
+            self._zones.append(_WholeZone(len(starts), len(starts) + len(mine), zone.stop, offsets, weights))
+            starts += mine
+        self._starts = np.array(starts, dtype=np.int32)
+        n_mics = 1 + int(tables[0].rows.max()) // n_phases
+        self._shape = (len(starts), n_mics, n_phases, width, 2)
+        if nodes is not None:
+            sums = float(np.max(np.abs(nodes.weights).sum(axis=(1, 2))))
+            scale = min(_SAFE * 2**_TAP_BITS / float(np.max(np.abs(nodes.weights))), _SAFE * 2**16 / sums)
+            self._tap_weights = np.rint(nodes.weights * scale).astype(np.int16)
+            self._weight_scale = np.float32(self._weight_scale * 2**16 / scale)
+            self._n_blocks = _blocks(threads, len(starts))
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
         return np.zeros(self._shape, dtype=np.int16), np.zeros(self._shape[0], dtype=np.float32)
 
-    def __call__(
-        self,
-        analytic: NDArray[np.complex64],
-        buffers: Buffers,
-        out: NDArray[np.float32],
-    ) -> None:
+    def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
         """See `Beamform`."""
         tiles, scales = buffers
-        self._quantise(analytic, self._starts, self._limit, tiles, scales)
-        self._kernel(tiles, scales, self._starts, self._offsets, self._weights, self._weight_scale, out)
+        self._kernels.quantise_tiles(analytic, self._starts, self._limit, tiles, scales)
+        for zone in self._zones:
+            mine = slice(zone.begin, zone.end)
+            if self._nodes is None:
+                self._kernels.delay_and_sum_envelope_int16(
+                    tiles[mine],
+                    scales[mine],
+                    self._starts[mine],
+                    zone.stop,
+                    zone.offsets,
+                    zone.weights,
+                    self._weight_scale,
+                    out,
+                )
+            else:
+                self._kernels.interpolated_beams_envelope_int16(
+                    tiles[mine],
+                    scales[mine],
+                    self._starts[mine],
+                    zone.stop,
+                    zone.offsets,
+                    zone.weights,
+                    self._nodes.places,
+                    self._tap_weights,
+                    self._weight_scale,
+                    self._n_blocks,
+                    out,
+                )
+
+
+def _pairs(weights: NDArray[np.complex128]) -> NDArray[np.int16]:
+    """Return ``((re w, −im w), (im w, re w))`` of each weight, rounded: (beam, term, 2, 2) int16."""
+    pairs = np.array([[weights.real, -weights.imag], [weights.imag, weights.real]])
+    return np.ascontiguousarray(np.rint(np.moveaxis(pairs, (0, 1), (2, 3)))).astype(np.int16)
+
+
+def _blocks(threads: int, n_tiles: int) -> int:
+    """Return into how many parts to cut directions: every thread should have two tiles of a part."""
+    return max(1, round(2 * threads / max(1, n_tiles)))

@@ -12,6 +12,10 @@ from ertis_numba.stages.window import TimeWindow
 
 __all__ = ["Demodulate"]
 
+# Of full scale, -260 dB. Signals that decay further become denormal numbers in this stage or the next, and an image of
+# them would take 13 times as long.
+_SILENCE = 1e-13
+
 
 class Demodulate:
     """Words to signals.
@@ -29,7 +33,7 @@ class Demodulate:
         window: TimeWindow,
         kernels: KernelSet,
         *,
-        taps: NDArray[np.int16],
+        taps: NDArray[np.int16] | NDArray[np.int32],
     ) -> None:
         self._kernel, self._decimate = kernels.demodulate_words, kernels.decimate
         self._taps = taps
@@ -55,7 +59,8 @@ class Demodulate:
         inside = (here >= 0) & (here < signals.shape[1])
         heard = np.zeros((len(signals), len(here)), dtype=np.float32)
         heard[:, inside] = signals[:, here[inside]]
+        heard[np.abs(heard) < _SILENCE] = 0.0
         decimated = np.empty((len(signals), count + ahead), dtype=np.float32)
-        self._decimate(heard, self._taps * self._scale, self._factor, decimated)
+        self._decimate(heard, (self._taps * np.float64(self._scale)).astype(np.float32), self._factor, decimated)
         out[:, :count] = decimated[:, ahead:]
         out[:, count:] = 0.0

@@ -1,5 +1,6 @@
 """The fast chain: only the window of the record, and only the beams, that the image needs."""
 
+import math
 from queue import Empty, LifoQueue
 from typing import Any, NamedTuple
 
@@ -8,16 +9,46 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beamform import Beamform, Buffers, DelayTable, beamform
+from ertis_numba.stages.adaptive import AdaptiveBeamform
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beamform import Buffers, beamform
+from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.window import time_window
-from ertis_numba.waveform import decimation_taps, matched_band_hz, whole_taps
+from ertis_numba.stages.window import TimeWindow, time_window
+from ertis_numba.stages.zones import zone_edges
+from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
 
-__all__ = ["FastChain"]
+__all__ = ["FastChain", "chain_taps", "ringing_db", "spectrum_of"]
+
+_SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
+_WAVES = 40
+
+
+def spectrum_of(settings: Settings) -> Spectrum:
+    """Return where the matched filter has its power, as if its input were white."""
+    return Spectrum(*matched_spectrum(settings.call, n_waves=_WAVES))
+
+
+def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
+    """Return the decimation filter of a complete plan."""
+    stop_band_db = settings.accuracy.stop_band_db or 60.0
+    taps = decimation_taps(
+        pdm_rate_hz=settings.recording.pdm_rate_hz,
+        decimation=settings.decimation,
+        pass_hz=matched_band_hz(settings.call)[1],
+        stop_band_db=stop_band_db,
+    )
+    return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)
+
+
+def ringing_db(stop_band_db: float) -> float:
+    """Return how far down the matched filter's ringing may be cut off, to be heard less than the stop band."""
+    return max(60.0, 1.2 * stop_band_db - 12.0)
 
 
 class _Buffers(NamedTuple):
@@ -29,6 +60,13 @@ class _Buffers(NamedTuple):
 class FastChain:
     """Demodulate, matched filter, beamform and envelope with tables made once.
 
+    Parameters
+    ----------
+    settings : Settings
+        Their plan leaves nothing open: see `planner`.
+    kernels : KernelSet
+    threads : int
+
     Attributes
     ----------
     grid : Grid
@@ -36,36 +74,87 @@ class FastChain:
     """
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int) -> None:
+        with one_thread():
+            self._make(settings, kernels, threads)
+
+    def _make(self, settings: Settings, kernels: KernelSet, threads: int) -> None:
+        plan = settings.accuracy
         layout = microphones(settings.array)
         self.grid: Grid = direction_grid(settings.processing)
-        delays_s = layout.delay_s[layout.enabled] + far_field_delays(
-            layout.enabled_positions_m,
-            unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
-            sound_speed_m_s=sound_speed_m_s(settings.air),
+        speed_m_s = sound_speed_m_s(settings.air)
+        aperture = Aperture.of(
+            layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
         )
-        taps = whole_taps(
-            decimation_taps(
-                pdm_rate_hz=settings.recording.pdm_rate_hz,
-                decimation=settings.decimation,
-                pass_hz=matched_band_hz(settings.call)[1],
+        spectrum = spectrum_of(settings)
+        n_phases = plan.oversampling or 1
+        step_s = 1 / (settings.output_rate_hz * n_phases)
+        fit = DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum)
+        nodes = None
+        if plan.beam_taps:
+            nodes = BeamNodes(
+                aperture,
+                spectrum,
+                n_taps=plan.beam_taps,
+                density=plan.beam_density or 2.0,
+                high_hz=settings.call.high_frequency_hz,
+                sound_speed_m_s=speed_m_s,
             )
+        points = aperture.directions if nodes is None else nodes.points
+        own_s = layout.delay_s[layout.enabled]
+        ahead_s = _dither(len(own_s)) * step_s if plan.interpolation == "fitted" else np.zeros(1)
+        first_m = settings.processing.range_m[0]
+        spherical = settings.processing.wavefront == "spherical"
+        largest_s = max(
+            float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
+            for range_m in ((max(first_m, 1e-3), math.inf) if spherical else (math.inf,))
         )
-        window = time_window(settings, largest_delay_s=float(np.max(np.abs(delays_s))), n_taps=len(taps))
+        taps = chain_taps(settings)
+        window = time_window(
+            settings,
+            largest_delay_s=largest_s + (fit.n_taps // 2 + 2) * step_s,
+            n_taps=len(taps),
+            ringing_db=ringing_db(plan.stop_band_db or 60.0),
+        )
         self.range_m = window.range_m
+        self._lead = window.lead
         self._kernels = kernels
         self._threads = threads
         self._demodulate = Demodulate(settings, layout, window, kernels, taps=taps)
         self._matched_filter = MatchedFilter(
-            settings, window, kernels, fft.load(kernels.device), taps=taps, n_mics=delays_s.shape[1]
-        )
-        table = DelayTable.of(
-            delays_s,
-            1 / (layout.gain[layout.enabled] * delays_s.shape[1]),
             settings,
             window,
-            centre_hz=self._matched_filter.centre_hz,
+            kernels,
+            fft.load(kernels.device),
+            taps=taps,
+            n_mics=len(own_s),
+            gain=lambda frequency_hz: (
+                fit.gain(frequency_hz)
+                * (1 if nodes is None else nodes.gain(frequency_hz))
+                * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
+            ),
         )
-        self._beamform: Beamform = beamform(settings, window, kernels, table)
+        amplitudes = 1 / (layout.gain[layout.enabled] * len(own_s))
+        zones = [
+            Zone(
+                first,
+                stop,
+                DelayTable.of(
+                    own_s - ahead_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m),
+                    amplitudes,
+                    fit,
+                    n_phases=n_phases,
+                    lead=window.lead,
+                ),
+            )
+            for first, stop, range_m in _zones(window, plan.zones if spherical else None)
+        ]
+        self._adaptive = None
+        self._beamform = beamform(plan.precision, kernels, window, zones, nodes, n_phases=n_phases, threads=threads)
+        if settings.processing.beamformer != "delay_and_sum":
+            table = zones[0].table
+            self._adaptive = AdaptiveBeamform(
+                settings.processing, kernels, table.offsets(window.n_outputs), table.weights.astype(np.complex64)
+            )
         self._spare: LifoQueue[_Buffers] = LifoQueue()
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
@@ -74,6 +163,14 @@ class FastChain:
         with self._kernels.threads(self._threads):
             self._demodulate(words, buffers.signals)
             self._finish(buffers, out)
+
+    def analytic(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> NDArray[np.complex64]:
+        """Do as `process` and return the analytic signals from the first range on: (mic, phase, sample) complex64."""
+        buffers = self._take_buffers()
+        with self._kernels.threads(self._threads):
+            self._demodulate(words, buffers.signals)
+            self._finish(buffers, out)
+        return buffers.analytic[:, :, self._lead :].copy()
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
@@ -84,7 +181,10 @@ class FastChain:
 
     def _finish(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
         self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
-        self._beamform(buffers.analytic, buffers.beamform, out)
+        if self._adaptive is None:
+            self._beamform(buffers.analytic, buffers.beamform, out)
+        else:
+            self._adaptive(buffers.analytic, out)
         self._spare.put(buffers)
 
     def _take_buffers(self) -> _Buffers:
@@ -97,3 +197,19 @@ class FastChain:
                 np.zeros(self._matched_filter.shape, dtype=np.complex64),
                 self._beamform.new_buffers(),
             )
+
+
+def _dither(n_mics: int) -> NDArray[np.float64]:
+    """Return by what part of a step each microphone's samples are taken earlier: (mic,) float64 in 0 to 1.
+
+    Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
+    golden ratio's multiples any few of them are spread evenly.
+    """
+    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0
+
+
+def _zones(window: TimeWindow, count: int | None) -> list[tuple[int, int, float]]:
+    """Return first range, the one after the last, and the distance whose delays hold, of each zone."""
+    if count is None:
+        return [(0, len(window.range_m), math.inf)]
+    return zone_edges(window.range_m, count)

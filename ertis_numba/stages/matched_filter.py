@@ -1,6 +1,7 @@
 """From signals to analytic signals, compressed by the call's matched filter."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,10 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 from ertis_numba.waveform import filter_response, matched_filter
 
-__all__ = ["MatchedFilter"]
+__all__ = ["Gain", "MatchedFilter"]
+
+Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
+"""Frequencies, (bin,), to gains, (mic, bin) or (1, bin)."""
 
 
 class MatchedFilter:
@@ -20,14 +24,22 @@ class MatchedFilter:
     A beam is wanted at the output ranges only, but with delays much finer than their spacing. So the
     filtered spectrum is turned back once per phase: phase p holds the samples that lie ``p /
     n_phases`` of a step after those of phase 0. The one-sided spectrum makes them analytic. The gain
-    of the decimation filter is divided out, since within the band it is known exactly.
+    of the decimation filter is divided out, since within the band it is known exactly. The gains that go with
+    the interpolation of delays and beams are taken along.
+
+    Parameters
+    ----------
+    settings, window, kernels, transforms
+    taps : (tap,) int16 or int32
+        Of the decimation filter.
+    n_mics : int
+    gain : callable
+        Frequencies, (bin,) float64, to gains, (mic, bin) or (1, bin) complex128.
 
     Attributes
     ----------
     shape : (mic, phase, sample)
         Of the analytic signals.
-    centre_hz : float
-        Carrier of the filtered call.
     """
 
     def __init__(
@@ -37,12 +49,13 @@ class MatchedFilter:
         kernels: KernelSet,
         transforms: Transforms,
         *,
-        taps: NDArray[np.int16],
+        taps: NDArray[np.int16] | NDArray[np.int32],
         n_mics: int,
+        gain: Gain,
     ) -> None:
         rate_hz = settings.signal_rate_hz
         matched = matched_filter(settings.call, n_fft=window.n_fft, rate_hz=rate_hz)
-        n_phases = settings.processing.oversampling
+        n_phases = settings.accuracy.oversampling or 1
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
         flat = matched.values / filter_response(
             taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.pdm_rate_hz
@@ -51,11 +64,11 @@ class MatchedFilter:
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
         # The inverse transform divides by its own length instead of the forward one's.
         scale = window.n_outputs / window.n_fft
-        self._responses = (scale * flat * np.exp(2j * math.pi * frequency_hz * lag_s)).astype(np.complex64)
+        shifted = scale * flat * np.exp(2j * math.pi * frequency_hz * lag_s)
+        self._responses = (gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64)
         self._first_bin = matched.first_bin
         self._kernel = kernels.multiply_and_fold
         self._transforms = transforms
-        self.centre_hz = matched.centre_hz
         self.shape = (n_mics, n_phases, window.n_outputs)
 
     def __call__(self, signals: NDArray[np.float32], out: NDArray[np.complex64], *, threads: int) -> None:

@@ -43,13 +43,15 @@ class TimeWindow:
     start_s: float
 
 
-def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int) -> TimeWindow:
+def time_window(
+    settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0
+) -> TimeWindow:
     """Return the window for beams whose delays stay within ``± largest_delay_s``.
 
     ``n_taps`` is the length of the decimation filter, which lets the record reach over its ends.
 
     An echo at time t needs the samples from t on for as long as the call lasts, and the matched
-    filter's ringing on both sides, until it is 60 dB down. The transform is a little longer than that, so
+    filter's ringing on both sides, until it is ``ringing_db`` down. The transform is a little longer than that, so
     what wraps around in it falls outside of the samples that are read: the convolution is linear.
 
     Raises
@@ -69,7 +71,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int) -> T
     step_m = speed_m_s / (2 * output_rate_hz)
     n_ranges = math.floor((last_m - first_m) / step_m * (1 + 1e-12)) + 1
     lead = math.ceil(largest_delay_s * output_rate_hz) + 1
-    guard_s = matched_guard_s(settings.call)
+    guard_s = matched_guard_s(settings.call, down_db=ringing_db)
     start_s = 2 * first_m / speed_m_s - lead / output_rate_hz
     stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
     spanned_s = stop_s - start_s + settings.call.duration_s + 2 * guard_s

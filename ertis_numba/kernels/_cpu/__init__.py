@@ -17,16 +17,18 @@ from ertis_numba import checks
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract import KernelSet
 from ertis_numba.kernels._cpu.add_paths import add_paths
+from ertis_numba.kernels._cpu.combine_capon import combine_capon
+from ertis_numba.kernels._cpu.combine_coherence import combine_coherence
+from ertis_numba.kernels._cpu.combine_dmas import combine_dmas
 from ertis_numba.kernels._cpu.decimate import decimate
 from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
 from ertis_numba.kernels._cpu.delay_and_sum_envelope import delay_and_sum_envelope
-from ertis_numba.kernels._cpu.delay_and_sum_envelope_int16 import (
-    HAS_INT16_DOT,
-    RANGES,
-    delay_and_sum_envelope_int16,
-)
+from ertis_numba.kernels._cpu.delay_and_sum_envelope_int16 import delay_and_sum_envelope_int16
 from ertis_numba.kernels._cpu.demodulate_words import demodulate_words
+from ertis_numba.kernels._cpu.dot16 import HAS_INT16_DOT, RANGES
 from ertis_numba.kernels._cpu.envelope import envelope
+from ertis_numba.kernels._cpu.interpolated_beams_envelope import interpolated_beams_envelope
+from ertis_numba.kernels._cpu.interpolated_beams_envelope_int16 import interpolated_beams_envelope_int16
 from ertis_numba.kernels._cpu.modulate_pdm import modulate_pdm
 from ertis_numba.kernels._cpu.multiply_and_fold import multiply_and_fold
 from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
@@ -85,8 +87,13 @@ KERNELS = KernelSet(
     delay_and_sum=delay_and_sum,
     envelope=envelope,
     delay_and_sum_envelope=delay_and_sum_envelope,
+    interpolated_beams_envelope=interpolated_beams_envelope,
     quantise_tiles=quantise_tiles,
     delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
+    interpolated_beams_envelope_int16=interpolated_beams_envelope_int16,
+    combine_coherence=combine_coherence,
+    combine_dmas=combine_dmas,
+    combine_capon=combine_capon,
     add_paths=add_paths,
     modulate_pdm=modulate_pdm,
 )

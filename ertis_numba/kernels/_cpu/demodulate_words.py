@@ -37,7 +37,8 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
         tile_array = context.make_array(signature.args[4])(context, builder, tile_value)
         n_words = cgutils.unpack_tuple(builder, words_array.shape)[1]
         n_taps = cgutils.unpack_tuple(builder, taps_array.shape)[0]
-        vector = ir.VectorType(ir.IntType(16), lanes)
+        number = signature.args[3].dtype.bitwidth
+        vector = ir.VectorType(ir.IntType(number), lanes)
         mask = ir.VectorType(ir.IntType(1), lanes)
         lane_0 = ir.Constant(ir.IntType(32), 0)
         all_lanes_0 = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
@@ -59,7 +60,7 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
         for g, total in enumerate(sums):
             place = builder.mul(builder.add(row, ir.Constant(row.type, g)), ir.Constant(row.type, lanes))
             target = builder.bitcast(builder.gep(tile_array.data, [place]), vector.as_pointer())
-            builder.store(builder.load(total), target).align = 2
+            builder.store(builder.load(total), target).align = number // 8
         return context.get_dummy_value()
 
     return signature, codegen
@@ -107,7 +108,7 @@ def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out
         elif start < 0 or start + (_TILE - 1) * factor + taps.size > n_samples:
             _filter_at_edge(words, channels, taps, scale, factor, first, begin, end, out)
         else:
-            tile = np.empty((_TILE, words.itemsize * 8), np.int16)
+            tile = np.empty((_TILE, words.itemsize * 8), taps.dtype)
             for word in range(n_words):
                 for row in range(0, _TILE, _GROUP):
                     at = (start + row * factor) * n_words + word

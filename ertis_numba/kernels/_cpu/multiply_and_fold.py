@@ -10,8 +10,9 @@ __all__ = ["multiply_and_fold"]
 def multiply_and_fold(spectra, responses, first_bin, out):
     """See `MultiplyAndFold`."""
     n_mics, n_phases, n_out = out.shape
-    n_bins = responses.shape[1]
+    n_bins = responses.shape[2]
     for mic in prange(n_mics):
+        row = min(np.int64(mic), np.int64(responses.shape[0] - 1))  # one row may serve all
         for phase in range(n_phases):
             out[mic, phase, :] = np.complex64(0)
             done = 0
@@ -20,7 +21,7 @@ def multiply_and_fold(spectra, responses, first_bin, out):
                 place = (first_bin + done) % n_out
                 run = min(n_bins - done, n_out - place)
                 x = spectra[mic, first_bin + done : first_bin + done + run]
-                h = responses[phase, done : done + run]
+                h = responses[row, phase, done : done + run]
                 y = out[mic, phase, place : place + run]
                 for b in range(run):
                     real = x[b].real * h[b].real - x[b].imag * h[b].imag

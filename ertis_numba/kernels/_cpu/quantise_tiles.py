@@ -5,24 +5,26 @@ from numba import njit, prange
 
 __all__ = ["quantise_tiles"]
 
-_MAGNITUDE = np.int32(0x7FFFFFFF)
-
 
 @njit(nogil=True, cache=True)
 def _largest(signals, begin, end):
-    """Largest part of any sample in ``begin … end``, as the bits of a float.
+    """Largest squared magnitude of any sample in ``begin … end``, as the bits of a float.
 
     Non-negative floats are ordered like their bits, and a maximum of integers is one vector
     instruction where a maximum of floats, for the sake of NaN, is a loop.
     """
     n_mics, n_phases, _ = signals.shape
-    bits = signals.view(np.int32)
+    parts = signals.view(np.float32)
+    powers = np.empty(end - begin, np.float32)
+    bits = powers.view(np.int32)
     largest = np.int32(0)
     for mic in range(n_mics):
         for phase in range(n_phases):
-            part = bits[mic, phase, 2 * begin : 2 * end]
-            for k in range(part.size):
-                largest = max(largest, part[k] & _MAGNITUDE)
+            part = parts[mic, phase, 2 * begin : 2 * end]
+            for k in range(powers.size):
+                powers[k] = part[2 * k] * part[2 * k] + part[2 * k + 1] * part[2 * k + 1]
+            for k in range(bits.size):
+                largest = max(largest, bits[k])
     return largest
 
 
@@ -34,7 +36,7 @@ def quantise_tiles(signals, starts, limit, tiles, scales):
     bits = np.zeros(n_tiles, np.int32)
     for tile in prange(n_tiles):
         bits[tile] = _largest(signals, starts[tile], min(starts[tile] + width, n_samples))
-    largest = bits.view(np.float32)
+    largest = np.sqrt(bits.view(np.float32))
     for tile in range(n_tiles):
         scales[tile] = largest[tile] / limit
     parts = signals.view(np.float32)

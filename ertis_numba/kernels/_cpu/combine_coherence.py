@@ -1,0 +1,40 @@
+"""Sum the microphones and weigh the sum by how well they agree."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["combine_coherence"]
+
+_TILE = 256  # ranges whose sums stay in the first cache level while the microphones pass by
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def combine_coherence(signals, offsets, weights, out):
+    """See `CombineCoherence`."""
+    flat = signals.reshape(-1)
+    n_directions, n_mics = offsets.shape
+    n_ranges = out.shape[1]
+    for direction in prange(n_directions):
+        real, imag, power = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+        for first in range(0, n_ranges, _TILE):
+            count = min(_TILE, n_ranges - first)
+            real[:count], imag[:count], power[:count] = 0, 0, 0
+            for mic in range(n_mics):
+                begin = offsets[direction, mic] + first
+                delayed = flat[begin : begin + count]
+                weight = weights[direction, mic]
+                for r in range(count):
+                    x = delayed[r]
+                    y_real = x.real * weight.real - x.imag * weight.imag
+                    y_imag = x.real * weight.imag + x.imag * weight.real
+                    real[r] += y_real
+                    imag[r] += y_imag
+                    power[r] += y_real * y_real + y_imag * y_imag
+            for r in range(count):
+                coherent = real[r] * real[r] + imag[r] * imag[r]
+                total = np.float32(n_mics) * power[r]
+                # Rounding must not raise a beam; where there is nothing, nothing agrees. NaN passes both.
+                factor = min(coherent / total, np.float32(1)) if total != 0 else np.float32(0)
+                out[direction, first + r] = factor * np.float32(math.sqrt(coherent))

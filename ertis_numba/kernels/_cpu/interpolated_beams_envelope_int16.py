@@ -1,0 +1,133 @@
+"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; on 16-bit samples.
+
+Both steps go through the processor's 16-bit dot product. In the second a pair is that of two neighbouring nodes at
+one range, so an instruction adds two nodes at once, and loads never cross a cache line. A tile's nodes stay in
+the second cache level between the steps.
+"""
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, VECTORS, Dot16
+
+__all__ = ["interpolated_beams_envelope_int16"]
+
+_LINE = 64  # bytes of a cache line
+
+
+@intrinsic
+def _address(typing_context, array):
+    """Address of an array's first number. (``array.ctypes.data`` would keep callers out of Numba's cache.)"""
+    signature = types.intp(array)
+
+    def codegen(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.ptrtoint(data, context.get_value_type(types.intp))
+
+    return signature, codegen
+
+
+@intrinsic
+def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
+    """Fill ``rows[row]``, (part, range) int16, with the beam of a node, its lower 16 bits rounded off."""
+    signature = types.void(tiles, types.intp, offsets, weights, types.intp, rows, types.intp)
+
+    def codegen(context, builder, signature, arguments):
+        def array(k):
+            return context.make_array(signature.args[k])(context, builder, arguments[k])
+
+        dot = Dot16(builder)
+        dot.complex_terms(array(0), arguments[1], array(2), array(3), arguments[4])
+        size = ir.Constant(arguments[6].type, 2 * RANGES)
+        dot.store_upper_halves(builder.gep(array(5).data, [builder.mul(arguments[6], size)]))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction, scale, out, place):
+    """Fill ``out.flat[place : place + RANGES]`` from the pairs of nodes around ``direction``.
+
+    ``pairs`` is (node, part, range) int32 from node ``skipped`` on, each number the 16 bits of a node
+    and above them those of the next one.
+    """
+    signature = types.void(pairs, types.intp, places, weights, types.intp, types.float32, out, types.intp)
+
+    def codegen(context, builder, signature, arguments):
+        def array(k):
+            return context.make_array(signature.args[k])(context, builder, arguments[k])
+
+        direction = arguments[4]
+        size = direction.type
+        n_pairs = cgutils.unpack_tuple(builder, array(2).shape)[1]
+        values = builder.bitcast(array(3).data, INT32.as_pointer())
+        first_pair = builder.mul(direction, n_pairs)
+        dot = Dot16(builder)
+        with cgutils.for_range(builder, n_pairs) as loop:
+            entry = builder.add(first_pair, loop.index)
+            node = builder.sext(builder.load(builder.gep(array(2).data, [entry])), size)
+            begin = builder.mul(builder.sub(node, arguments[1]), ir.Constant(size, 2 * RANGES))
+            weight = dot.pair(values, entry)
+            for vector in range(VECTORS):
+                for part in (0, 1):
+                    at = builder.add(begin, ir.Constant(size, part * RANGES))
+                    dot.add(part, vector, dot.load(array(0).data, at, vector, align=_LINE), weight)
+        dot.store_levels(arguments[5], builder.gep(array(6).data, [arguments[7]]))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@njit(nogil=True, cache=True)
+def _pair_rows(rows, lower, pairs, node):
+    """Put the row ``lower`` and the other one side by side."""
+    low, high = rows[lower], rows[1 - lower]
+    target = pairs[node].reshape(-1)
+    for k in range(target.size):
+        target[k] = np.int32(np.int32(high[k]) << np.int32(16)) | (np.int32(low[k]) & np.int32(0xFFFF))
+
+
+@njit(nogil=True, cache=True)
+def _node_pairs(tiles, tile, offsets, weights, first, last):
+    """Beams of the nodes ``first … last``, each beside the next one: (node, part, range) int32 on whole cache lines."""
+    raw = np.empty((last - first + 1) * 2 * RANGES + _LINE // 4, np.int32)
+    ahead = (-_address(raw) % _LINE) // 4
+    pairs = raw[ahead : ahead + (last - first + 1) * 2 * RANGES].reshape(last - first + 1, 2, RANGES)
+    rows = np.empty((2, 2 * RANGES), np.int16)
+    for node in range(first, last + 1):
+        _node_tile(tiles, tile, offsets, weights, node, rows, node % 2)
+        if node > first:
+            _pair_rows(rows, 1 - node % 2, pairs, node - 1 - first)
+    return pairs
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def interpolated_beams_envelope_int16(
+    tiles, scales, starts, stop, offsets, weights, places, tap_weights, weight_scale, n_blocks, out
+):
+    """See `InterpolatedBeamsEnvelopeInt16`."""
+    n_directions, n_ranges = out.shape
+    n_tiles = tiles.shape[0]
+    block = (n_directions + n_blocks - 1) // n_blocks
+    for part in prange(n_tiles * n_blocks):
+        tile = part // n_blocks
+        begin = min(part % n_blocks * block, n_directions)
+        end = min(begin + block, n_directions)
+        if begin == end:
+            continue
+        first = places[begin:end].min()
+        last = places[begin:end].max() + 1
+        pairs = _node_pairs(tiles, tile, offsets, weights, first, last)
+        scale = scales[tile] * weight_scale
+        short = np.empty((1, RANGES), np.float32)
+        for direction in range(begin, end):
+            if starts[tile] + RANGES > stop:
+                _interpolate_tile(pairs, first, places, tap_weights, direction, scale, short, 0)
+                out[direction, starts[tile] : stop] = short[0, : stop - starts[tile]]
+            else:
+                place = direction * n_ranges + starts[tile]
+                _interpolate_tile(pairs, first, places, tap_weights, direction, scale, out, place)

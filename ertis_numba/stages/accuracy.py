@@ -1,0 +1,203 @@
+"""By how much an image differs from the exact one: what each choice of a plan adds, before it is made.
+
+The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ranges, in decibels. The exact image is that of
+`tests/reference.py`: float64, nothing decimated, delays as exact phase shifts.
+
+All parts are errors of complex beams that add up like noise: between microphones, because `fitting` leaves no error
+that they share, and between parts. A part whose power is ε of that of a microphone's signal after the matched
+filter therefore adds, to an image whose mean power is ``gain`` times that of uncorrelated microphones,
+
+    s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.
+
+s is the share of a complex error that changes a magnitude: half of it in noise, where the other half turns the phase,
+which the envelope does not see; more where few coherent echoes make most of the image, since beam and error are then
+sums of the same waves and tend to have one phase. How much brighter coherent echoes make the image is what settings
+cannot tell; a `Texture` measures it, and where there is none the model assumes what errs on the safe side.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.settings import Settings
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.fitting import DelayFit
+from ertis_numba.waveform import matched_band_hz, matched_spectrum
+
+__all__ = ["PARTS", "ErrorModel", "Texture", "decibels"]
+
+PARTS: Final = {
+    "delays": "interpolation of delayed samples",
+    "beams": "interpolation of beams between nodes",
+    "zones": "one set of delays for all ranges of a zone",
+    "samples": "16-bit samples and weights",
+    "filter": "modulator noise that the decimation lets through",
+    "arithmetic": "single precision",
+}
+"""Name of each part of the error, and what it is due to."""
+
+_WAVES = 40
+_ARITHMETIC = 10 ** (-112 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
+_SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
+_SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
+_SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
+_SAFE_LEVEL = 10 ** (-24 / 10)  # as quiet as a room that eRTIS was tried in
+_NOISE_CORNER_HZ = 500e3  # of the shaped noise of eRTIS at 4.5 MHz
+_NOISE_RATE_HZ = 4.5e6
+
+
+def decibels(power: float) -> float:
+    """Return ``10 log10``, -300 for nothing at all."""
+    return 10 * math.log10(max(power, 1e-30))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """What the error depends on besides the settings: a few numbers of what is heard.
+
+    Attributes
+    ----------
+    shares : (wave,) float64
+        Of the power after the matched filter, at the frequencies of the model; they add up to 1.
+    gain : float
+        Mean power of the image by what it would be of microphones that have nothing in common.
+    crest : float
+        Largest power of any sample of a tile of ranges, the mean over tiles, by the mean power of samples.
+    noise : (bin,) float64
+        Power density of the bits from 0 to half the PDM rate, by that of white bits.
+    level : float
+        Power after the matched filter, in the ranges of the image, by that of white bits.
+    colour : float
+        By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
+    """
+
+    shares: NDArray[np.float64]
+    gain: float
+    crest: float
+    noise: NDArray[np.float64]
+    level: float
+    colour: float = 1.0
+
+    @classmethod
+    def unknown(cls, settings: Settings) -> "Texture":
+        """Return the texture that is assumed where none was measured: on the safe side."""
+        _, shares = matched_spectrum(settings.call, n_waves=_WAVES)
+        frequency_hz = np.linspace(0, settings.recording.pdm_rate_hz / 2, 1025)
+        corner_hz = _NOISE_CORNER_HZ * settings.recording.pdm_rate_hz / _NOISE_RATE_HZ
+        noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
+        return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, _SAFE_COLOUR)
+
+
+class ErrorModel:
+    """The parts of an image's error, each as power by that of the exact image.
+
+    Parameters
+    ----------
+    settings : Settings
+    texture : Texture, optional
+        Measured; what errs on the safe side by default.
+    """
+
+    def __init__(self, settings: Settings, texture: Texture | None = None) -> None:
+        self._settings = settings
+        self.texture = texture or Texture.unknown(settings)
+        self.frequency_hz, _ = matched_spectrum(settings.call, n_waves=_WAVES)
+
+    def delays(self, fit: DelayFit) -> float:
+        """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
+
+        What samples are wrong by on average is a filter of the image itself, however coherent echoes are; the
+        simple ways of interpolation weaken it, which changes magnitudes by all of it. Of the rest no two
+        microphones err alike, so that it has no phase in common with the beam.
+        """
+        texture = self.texture
+        varying, shared = (float(errors @ texture.shares) for errors in (fit.errors, fit.biases))
+        return texture.colour * (0.5 * varying / texture.gain + (0.5 if fit.is_fitted else 1.0) * shared)
+
+    def beams(self, nodes: BeamNodes) -> float:
+        """Return the part of interpolated beams, in the same way, and a fifth more for what differs between images."""
+        errors = np.exp(np.interp(self.frequency_hz, nodes.frequency_hz, np.log(np.maximum(nodes.errors, 1e-30))))
+        return self._of(1.2 * self.texture.colour * float(errors @ self.texture.shares))
+
+    def zones(self, aperture: Aperture, range_m: NDArray[np.float64], count: int, *, sound_speed_m_s: float) -> float:
+        """Return the part of zones in which delays are those of their middle.
+
+        A microphone at p is late by ``b (p² − (u·p)²) / 2c`` where wavefronts have the curvature b = 1/r. Zones
+        are steps of b, over which its variance is that of a uniform number; what all microphones are late by turns the
+        phase of the beam only.
+        """
+        along_m = aperture.directions @ aperture.positions_m.T
+        across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
+        spread_m2 = float(np.mean(np.var(across_m2, axis=1)))
+        nearest, farthest = 1 / max(range_m[0], 1e-3), 1 / max(range_m[-1], 1e-3)
+        turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m2
+        return self._of(float(turn_2 @ self.texture.shares) * ((nearest - farthest) / count) ** 2 / 12)
+
+    def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
+        """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
+        half = np.array([2 * range_m, range_m])  # one zone from here to infinity, whose middle is a plane wave
+        return min(1.0, 12 * self.zones(aperture, half, 1, sound_speed_m_s=sound_speed_m_s) * 4)
+
+    def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
+        """Return the part of 16-bit numbers.
+
+        Parts of samples are off by a number within ± half a step, and so are parts of weights; a step is the tile's
+        largest magnitude by ``limit``, or the largest weight by ``weight_limit``.
+
+        Parameters
+        ----------
+        n_terms : int
+            Of one microphone.
+        terms : float
+            Sum of their squared weights, 1 where there is one.
+        limit, weight_limit : float
+            Largest whole number of samples and of weights.
+        taps : float
+            Sum of the squared weights of the nodes that make a beam, 1 without nodes.
+        """
+        of_samples = terms * self.texture.crest / limit**2 / 6
+        of_weights = n_terms / weight_limit**2 / 6
+        return self._of(taps * (of_samples + of_weights))
+
+    def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float) -> float:
+        """Return the part of beams of nodes of which 16 bits are kept: 2⁻¹⁵ of what all terms at full scale add up to.
+
+        Parameters
+        ----------
+        n_mics : int
+        sum_of_terms : float
+            Sum of the magnitudes of one microphone's weights, 1 where it has one.
+        taps : float
+            As for `samples`.
+        """
+        step_2 = self.texture.crest * n_mics * sum_of_terms**2 / 2.0**30
+        return self._of(taps * step_2 / 6)
+
+    def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
+        """Return the part of what the decimation folds into the band: noise beyond it, through the filter's stop band.
+
+        The filter is the one in whole numbers, so that what rounding leaves of its stop band counts.
+        """
+        settings, noise = self._settings, self.texture.noise
+        low_hz, high_hz = matched_band_hz(settings.call)
+        n_fft = 2 * (len(noise) - 1)
+        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # fine enough for the filter's side lobes
+        gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
+        frequency_hz = np.arange(len(gain_2)) * settings.recording.pdm_rate_hz / n_fft
+        folded = gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
+        rate_hz = settings.signal_rate_hz
+        distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
+        outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
+        passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
+        return self._of(passed / self.texture.level)
+
+    def arithmetic(self) -> float:
+        """Return the part of single precision."""
+        return _ARITHMETIC / self.texture.gain
+
+    def _of(self, power: float) -> float:
+        gain = self.texture.gain
+        return (0.5 if gain <= 1 else 1 - 0.5 / gain) * power / gain

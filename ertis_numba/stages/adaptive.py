@@ -1,0 +1,84 @@
+"""From analytic signals to the envelopes of beams, by ways that look at how the microphones agree."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Processing
+
+__all__ = ["AdaptiveBeamform"]
+
+_Combine = Callable[[NDArray[np.complex64], NDArray[np.float32]], None]
+
+
+class AdaptiveBeamform:
+    """Analytic signals to the energy of every direction and range, by coherence factor, DMAS or Capon.
+
+    All of them give an echo that reaches all microphones alike the level that delay-and-sum gives it. What
+    each computes is written in `kernels`; they hold no buffers, so several threads may call one at a time.
+
+    Parameters
+    ----------
+    processing : Processing
+        Its ``beamformer`` is not ``delay_and_sum``.
+    kernels : KernelSet
+    offsets : (direction, mic) int32
+        Where a microphone's first sample lies in a flat array of (mic, phase, sample).
+    weights : (direction, mic) complex64
+        The carrier's phase and the calibration; the magnitudes of a direction add up to about 1.
+
+    Raises
+    ------
+    ArgumentError
+        There are fewer microphones than ``dmas_order``.
+    """
+
+    def __init__(
+        self,
+        processing: Processing,
+        kernels: KernelSet,
+        offsets: NDArray[np.int32],
+        weights: NDArray[np.complex64],
+    ) -> None:
+        n_mics = offsets.shape[1]
+        combine: dict[str, Callable[[], _Combine]] = {
+            "coherence_factor": lambda: _coherence_factor(kernels, offsets, weights),
+            "dmas": lambda: _dmas(kernels, offsets, n_mics * weights, processing.dmas_order),
+            "capon": lambda: _capon(kernels, offsets, n_mics * weights, processing),
+        }
+        self._combine = combine[processing.beamformer]()
+
+    def __call__(self, analytic: NDArray[np.complex64], out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
+        self._combine(analytic, out)
+
+
+def _coherence_factor(kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64]) -> _Combine:
+    return lambda analytic, out: kernels.combine_coherence(analytic, offsets, weights, out)
+
+
+def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64], order: int) -> _Combine:
+    """Return DMAS whose weights are roots, too, and divide by the number of products in the sum."""
+    n_mics = offsets.shape[1]
+    if n_mics < order:
+        raise ArgumentError(
+            f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
+            "give an order of at most as many, or another processing.beamformer"
+        )
+    exact = weights.astype(np.complex128)
+    level = np.abs(exact)
+    shrunk = np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
+    # Every product has ``order`` of them, so each takes that root of the whole: no sum leaves single precision.
+    roots = (exact * shrunk * math.comb(n_mics, order) ** (-1 / order)).astype(np.complex64)
+    return lambda analytic, out: kernels.combine_dmas(analytic, offsets, roots, order, out)
+
+
+def _capon(
+    kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64], processing: Processing
+) -> _Combine:
+    snapshots, loading = processing.snapshots, processing.loading
+    return lambda analytic, out: kernels.combine_capon(analytic, offsets, weights, snapshots, loading, out)

@@ -1,0 +1,189 @@
+"""Beams of all directions from those of few: a grid of nodes as fine as the aperture can tell directions apart.
+
+A beam changes with its direction no faster than the array's outermost microphones turn their phase. So beams at
+the nodes of a grid say all there is, once the grid has a few nodes more than the aperture resolves, and any
+other beam is a sum of the nodes around it, by the weights of `fitting`. With 32 microphones and 3000 directions that
+sum has 16 real terms instead of 32 or more complex ones, and there are ten times fewer nodes than directions.
+
+The grid lies in the array's own axes: a line array needs one, a plane array two. A node is a point of that plane, not
+of the sphere; those outside of the unit circle belong to no direction, and are as good as any to interpolate from.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.stages.fitting import Spectrum, fit, weights_of
+
+__all__ = ["Aperture", "BeamNodes"]
+
+_FLAT_M = 1e-6  # an axis along which microphones differ by less is none
+_LEAST_POWER = 1e-8  # large weights that cancel each other would let 16 bits be heard
+_MOST_FITTED = 96  # directions and microphones from which gain and error are found
+_WAVES = 17  # frequencies, over which the gain of a microphone is smooth
+_MOST_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # for an error within a quarter of a decibel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aperture:
+    """Microphones and directions in the axes of the array itself.
+
+    Attributes
+    ----------
+    positions_m : (mic, axis) float64
+        Along the axes in which the array extends, the longest first: one for a line, two for a plane.
+    directions : (direction, axis) float64
+        Components of the unit vectors along them.
+    square_m2 : (mic,) float64
+        Squared distance from the centre.
+    """
+
+    positions_m: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    square_m2: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, positions_m: NDArray[np.float64], directions: NDArray[np.float64]) -> Self:
+        """Return the aperture of microphones, (mic, 3), and unit vectors, (direction, 3)."""
+        _, extent_m, axes = np.linalg.svd(positions_m, full_matrices=False)
+        axes = axes[extent_m > _FLAT_M * math.sqrt(len(positions_m))]
+        return cls(positions_m @ axes.T, directions @ axes.T, np.sum(positions_m**2, axis=1))
+
+    @property
+    def n_axes(self) -> int:
+        """In how many axes the array extends, 0 to 3."""
+        return self.positions_m.shape[1]
+
+    def delays_s(
+        self, points: NDArray[np.float64], *, sound_speed_m_s: float, range_m: float = math.inf
+    ) -> NDArray[np.float64]:
+        """Return the delays of points of the array's plane: (point, mic) float64.
+
+        As `geometry.far_field_delays` and, for a finite range, `geometry.spherical_delays`, of which the distance
+        to a microphone, ``√(r² − 2 r u·p + p²)``, holds for points outside of the unit circle as well.
+        """
+        along_m = points @ self.positions_m.T
+        if math.isinf(range_m):
+            return np.asarray(-along_m / sound_speed_m_s)
+        # As a quotient, since the difference of square root and range would lose digits far away.
+        bent_m = self.square_m2 - 2 * range_m * along_m
+        root_m = np.sqrt(np.maximum(range_m**2 + bent_m, 0.0))
+        return np.asarray(bent_m / (root_m + range_m) / sound_speed_m_s)
+
+    def spacing(self, density: float, *, high_hz: float, sound_speed_m_s: float) -> NDArray[np.float64]:
+        """Return the distance of nodes along each axis: (axis,) float64."""
+        extent_m = np.ptp(self.positions_m, axis=0)
+        return np.asarray(sound_speed_m_s / (high_hz * density * extent_m))
+
+    def lowest_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> NDArray[np.int64]:
+        """Return the lowest of the nodes around each direction, as its numbers along the axes."""
+        return np.asarray(np.floor(self.directions / spacing).astype(np.int64) - (n_taps // 2 - 1))
+
+    def count_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> int:
+        """Return how many nodes lie around any direction."""
+        return len(np.unique(_numbers(_around(self.lowest_nodes(spacing, n_taps), n_taps))))
+
+
+def _around(lowest: NDArray[np.int64], n_taps: int) -> NDArray[np.int64]:
+    """Return the nodes around directions, neighbours along the first axis side by side: (direction, tap, axis)."""
+    steps = np.indices((n_taps,) * lowest.shape[1]).reshape(lowest.shape[1], -1)[::-1].T
+    return lowest[:, None, :] + steps
+
+
+def _numbers(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return one number per node, ascending along the first axis of the array first."""
+    low = nodes.min(axis=tuple(range(nodes.ndim - 1)))
+    extent = nodes.max(axis=tuple(range(nodes.ndim - 1))) - low + 1
+    return np.asarray((nodes - low) @ np.concatenate([[1], np.cumprod(extent)[:-1]]))
+
+
+class BeamNodes:
+    """Nodes, and how the beams of all directions are made of theirs.
+
+    Attributes
+    ----------
+    squares : float
+        Sum of a beam's squared weights, the mean over directions.
+    points : (node, axis) float64
+        In the array's plane.
+    places : (direction, pair) int32
+        Lower node of each pair; the other one is the next.
+    weights : (direction, pair, 2) float64
+    frequency_hz, errors : (wave,) float64
+        Power of the error by that of the beam at some frequencies, the mean over uncorrelated microphones and over
+        directions.
+    """
+
+    def __init__(
+        self,
+        aperture: Aperture,
+        spectrum: Spectrum,
+        *,
+        n_taps: int,
+        density: float,
+        high_hz: float,
+        sound_speed_m_s: float,
+        estimate: bool = False,
+    ) -> None:
+        self._aperture = aperture
+        self._sound_speed_m_s = sound_speed_m_s
+        spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=sound_speed_m_s)
+        lowest = aperture.lowest_nodes(spacing, n_taps)
+        # A patch looks the same wherever it lies: only where the direction is in it matters.
+        self._inside = aperture.directions - lowest * spacing
+        patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
+        most, n_waves = (_MOST_ESTIMATED, _WAVES_ESTIMATED) if estimate else (_MOST_FITTED, _WAVES)
+        mics, directions = (_some(count, most) for count in (len(aperture.positions_m), len(lowest)))
+        n_waves = min(n_waves, len(spectrum.power))
+        chosen = np.unique(np.linspace(0, len(spectrum.power) - 1, n_waves).astype(int))
+        self.frequency_hz = spectrum.frequency_hz[chosen]
+        power = np.tile(spectrum.power[chosen] / spectrum.power[chosen].sum() / len(mics), len(mics))
+        taps, wanted = (self._waves(points, mics) for points in (patch, self._inside[directions]))
+        gain, weights = fit(taps, wanted, power, real=True, least_power=_LEAST_POWER)
+        errors = np.mean(np.abs(gain[:, None] * (taps @ weights) - wanted) ** 2, axis=1)
+        self.squares = float(np.mean(np.sum(np.abs(weights) ** 2, axis=0)))
+        self.errors = errors.reshape(len(mics), n_waves).mean(axis=0)
+        if estimate:
+            return
+        self._patch, self._fitted_weights = patch, weights
+        self._fitted_directions = directions
+        found = np.concatenate(
+            [
+                weights_of(gain, taps, self._waves(part, mics), power, real=True, least_power=_LEAST_POWER).real.T
+                for part in np.array_split(self._inside, -(-len(self._inside) // _MOST_FITTED))
+            ]
+        )
+        nodes = _around(lowest, n_taps)
+        _, one, index = np.unique(_numbers(nodes).reshape(-1), return_index=True, return_inverse=True)
+        self.points = nodes.reshape(-1, aperture.n_axes)[one] * spacing
+        self.places = np.ascontiguousarray(index.reshape(len(lowest), -1, 2)[:, :, 0]).astype(np.int32)
+        self.weights = np.ascontiguousarray(found).reshape(len(lowest), -1, 2)
+
+    def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the gain of each microphone that goes with the weights: (mic, frequency) complex128."""
+        mics = np.arange(len(self._aperture.positions_m))
+        made = self._waves(self._patch, mics) @ self._fitted_weights
+        wanted = self._waves(self._inside[self._fitted_directions], mics)
+        gain = np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+        rows = gain.reshape(len(mics), len(self.frequency_hz))
+        return np.stack(
+            [
+                np.interp(frequency_hz, self.frequency_hz, row.real)
+                + 1j * np.interp(frequency_hz, self.frequency_hz, row.imag)
+                for row in rows
+            ]
+        )
+
+    def _waves(self, points: NDArray[np.float64], mics: NDArray[np.intp]) -> NDArray[np.complex128]:
+        """Return plane waves: (mic · frequency, point) complex128."""
+        delay_s = -self._aperture.positions_m[mics] @ points.T / self._sound_speed_m_s
+        turns = delay_s[:, None, :] * self.frequency_hz[:, None]
+        return np.asarray(np.exp(2j * math.pi * turns).reshape(-1, len(points)))
+
+
+def _some(count: int, most: int) -> NDArray[np.intp]:
+    """Return ``most`` indices at the most, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))

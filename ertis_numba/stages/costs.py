@@ -1,0 +1,282 @@
+"""What each stage takes on this machine: measured once by running its kernels, and kept."""
+
+import hashlib
+import json
+import logging
+import math
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from ertis_numba import fft
+from ertis_numba.kernels import KernelSet
+
+__all__ = ["Costs", "Work", "cache_file", "costs_of", "measure"]
+
+_LOG = logging.getLogger("ertis_numba")
+_RUNS = 5  # the best of which counts
+_FLOOR_S = 2e-4  # runs shorter than this are repeated
+_MICS, _RANGES = 32, 960
+_FEW_PHASES, _MANY_PHASES = 1, 12
+_UNITS = (
+    "call",
+    "demodulate_16",
+    "demodulate_32",
+    "forward",
+    "fold",
+    "inverse",
+    "quantise",
+    "sum_float32_few",
+    "sum_float32_many",
+    "sum_int16_few",
+    "sum_int16_many",
+    "pair_float32",
+    "pair_int16",
+    "image",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """How much a plan has to do for one image.
+
+    Attributes
+    ----------
+    n_mics, n_words, n_samples, n_taps, tap_bits : int
+        Of the demodulation; samples are those of the signals.
+    n_fft, n_bins, n_phases, n_outputs : int
+        Of the matched filter.
+    n_directions, n_ranges : int
+    n_beams, n_terms, n_pairs : int
+        Beams that are summed, terms of each, and pairs of nodes that make a direction's beam, 0 without nodes.
+    precision : {"float32", "int16"}
+    """
+
+    n_mics: int
+    n_words: int
+    n_samples: int
+    n_taps: int
+    tap_bits: int
+    n_fft: int
+    n_bins: int
+    n_phases: int
+    n_outputs: int
+    n_directions: int
+    n_ranges: int
+    n_beams: int
+    n_terms: int
+    n_pairs: int
+    precision: str
+
+
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """Seconds per unit of work of each kernel; `stages_ms` tells what the units are."""
+
+    seconds: dict[str, float]
+
+    def stages_ms(self, work: Work) -> dict[str, float]:
+        """Return what each stage is expected to take, in milliseconds."""
+        unit = self.seconds
+        rows = work.n_mics * work.n_phases
+        # Samples of a tile, which fit into the first cache level with few phases and not with many.
+        many = math.log2(max(rows / (_MICS * _FEW_PHASES), 1.0)) / math.log2(_MANY_PHASES / _FEW_PHASES)
+        few, lots = (unit[f"sum_{work.precision}_{name}"] for name in ("few", "many"))
+        term = few + min(many, 1.5) * max(lots - few, 0.0)
+        points = work.n_directions * work.n_ranges
+        quantised = rows * (work.n_ranges + 20 * work.n_ranges / 96) if work.precision == "int16" else 0.0
+        seconds = {
+            "demodulate": unit[f"demodulate_{work.tap_bits}"] * work.n_samples * work.n_taps * work.n_words,
+            "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
+            + unit["fold"] * rows * work.n_bins
+            + unit["inverse"] * rows * _transform(work.n_outputs),
+            "16 bits": unit["quantise"] * quantised,
+            "sums": term * work.n_beams * work.n_terms * work.n_ranges,
+            "interpolation": unit[f"pair_{work.precision}"] * points * work.n_pairs,
+            "image": unit["image"] * points,
+            "calls": 6 * unit["call"],
+        }
+        return {name: 1000 * value for name, value in seconds.items()}
+
+
+def _transform(n: int) -> float:
+    return n * math.log2(max(n, 2))
+
+
+def costs_of(kernels: KernelSet, threads: int) -> Costs:
+    """Return the costs of a device on this machine; measured at the first time and kept in `cache_file`."""
+    key = (kernels.device, threads)
+    if key not in _KNOWN:
+        path = cache_file(*key)
+        _KNOWN[key] = _kept(path) or _measured(kernels, threads, path)
+    return _KNOWN[key]
+
+
+_KNOWN: dict[tuple[str, int], Costs] = {}
+
+
+def cache_file(device: str, threads: int) -> Path:
+    """Return where the costs of a device are kept; take the file away to have them measured again."""
+    machine = [platform.machine(), platform.processor(), platform.node(), os.environ.get("NUMBA_CPU_NAME", "")]
+    with suppress(OSError):
+        machine.append(Path("/proc/cpuinfo").read_text("utf-8").partition("\n\n")[0].partition("model name")[2][:80])
+    versions = [version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")]
+    digest = hashlib.sha256("\n".join([*machine, *versions, *_UNITS]).encode()).hexdigest()[:12]
+    folder = os.environ.get("ERTIS_CACHE_DIR") or platformdirs.user_cache_dir("ertis-numba", appauthor=False)
+    return Path(folder) / f"costs-{device}-{threads}-{digest}.json"
+
+
+def _kept(path: Path) -> Costs | None:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        seconds = {name: float(found[name]) for name in _UNITS}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Costs(seconds) if all(value > 0 and math.isfinite(value) for value in seconds.values()) else None
+
+
+def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
+    _LOG.info("measuring what the kernels of device %r take here; kept in %s", kernels.device, path)
+    costs = measure(kernels, threads)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:
+            json.dump(costs.seconds, file, indent=1)
+        Path(file.name).replace(path)
+    except OSError as error:
+        _LOG.info("costs cannot be kept (%s)", error)
+    return costs
+
+
+def measure(kernels: KernelSet, threads: int) -> Costs:
+    """Return the costs, measured now: some tenths of a second."""
+    random = np.random.default_rng(1)
+    small = 8 if kernels.device == "numpy" else 1
+    with kernels.threads(threads):
+        seconds = {
+            **_front(kernels, random, threads),
+            **_sums(kernels, random, 256 // small),
+            **_pairs(kernels, random, 1024 // small),
+        }
+    return Costs({name: seconds.get(name, 1.0) for name in _UNITS})  # a second each where a device cannot
+
+
+def _best(run: Callable[[], object]) -> float:
+    """Return the least time of some runs."""
+    run()
+    start_s = time.perf_counter()
+    run()
+    count = max(1, math.ceil(_FLOOR_S / max(time.perf_counter() - start_s, 1e-7)))
+    times_s = []
+    for _ in range(_RUNS):
+        start_s = time.perf_counter()
+        for _ in range(count):
+            run()
+        times_s.append((time.perf_counter() - start_s) / count)
+    return min(times_s)
+
+
+def _front(kernels: KernelSet, random: np.random.Generator, threads: int) -> dict[str, float]:
+    n_samples, n_taps, factor, n_fft, n_out, n_bins = 4000, 101, 20, 6000, 1200, 1000
+    words = random.integers(0, 2**32, (n_samples * factor + n_taps, 1), dtype=np.uint32)
+    channels = np.arange(_MICS, dtype=np.int32)
+    signals = np.zeros((_MICS, n_fft), dtype=np.float32)
+    tiny, tiny_out = np.zeros((2, 4), dtype=np.complex64), np.zeros((2, 4), dtype=np.float32)
+    found = {"call": _best(lambda: kernels.envelope(tiny, tiny_out))}
+    for bits, dtype in ((16, np.int16), (32, np.int32)):
+        taps = np.arange(n_taps).astype(dtype)
+        took_s = _best(
+            lambda taps=taps: kernels.demodulate_words(
+                words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals
+            )
+        )
+        found[f"demodulate_{bits}"] = took_s / (n_samples * n_taps)
+    transforms = fft.load(kernels.device)
+    found["forward"] = _best(lambda: transforms.forward(signals, threads=threads)) / _MICS / _transform(n_fft)
+    spectra = transforms.forward(signals, threads=threads)
+    out = np.zeros((_MICS, 4, n_out), dtype=np.complex64)
+    responses = np.ones((_MICS, 4, n_bins), dtype=np.complex64)
+    found["fold"] = _best(lambda: kernels.multiply_and_fold(spectra, responses, 300, out)) / (_MICS * 4 * n_bins)
+    found["inverse"] = _best(lambda: transforms.inverse(out, threads=threads)) / (_MICS * 4) / _transform(n_out)
+    return found
+
+
+def _sums(kernels: KernelSet, random: np.random.Generator, n_beams: int) -> dict[str, float]:
+    """Return the cost of a term at one range, with few phases and with many."""
+    found: dict[str, float] = {}
+    energy = np.empty((n_beams, _RANGES), dtype=np.float32)
+    points = n_beams * _MICS * _RANGES
+    for name, n_phases in (("few", _FEW_PHASES), ("many", _MANY_PHASES)):
+        signals = random.standard_normal((_MICS, n_phases, 2 * (_RANGES + 40)), dtype=np.float32).view(np.complex64)
+        rows = np.arange(_MICS) * n_phases + random.integers(0, n_phases, (n_beams, _MICS))
+        samples = random.integers(0, 16, (n_beams, _MICS))
+        weights = np.full((n_beams, _MICS), 0.01 + 0.02j, dtype=np.complex64)
+        offsets = (rows * signals.shape[2] + samples).astype(np.int32)
+        found[f"sum_float32_{name}"] = (
+            _best(lambda: kernels.delay_and_sum_envelope(signals, offsets, weights, 0, _RANGES, energy)) / points
+        )
+        if not kernels.tile_ranges:
+            continue
+        width = kernels.tile_ranges + 20
+        starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
+        tiles = np.zeros((len(starts), _MICS, n_phases, width, 2), dtype=np.int16)
+        scales = np.zeros(len(starts), dtype=np.float32)
+        took_s = _best(lambda: kernels.quantise_tiles(signals, starts, np.float32(8000), tiles, scales))
+        found["quantise"] = took_s / (len(starts) * _MICS * n_phases * width)
+        places, pairs = (rows * width + samples).astype(np.int32), np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
+        took_s = _best(
+            lambda: kernels.delay_and_sum_envelope_int16(
+                tiles, scales, starts, _RANGES, places, pairs, np.float32(1), energy
+            )
+        )
+        found[f"sum_int16_{name}"] = took_s / points
+    return found
+
+
+def _pairs(kernels: KernelSet, random: np.random.Generator, n_directions: int) -> dict[str, float]:
+    """Return the cost of a pair of nodes at one range, and of one place in the image."""
+    n_nodes = 400
+    energy = np.empty((n_directions, _RANGES), dtype=np.float32)
+    signals = random.standard_normal((1, 1, 2 * (_RANGES + 40)), dtype=np.float32).view(np.complex64)
+    offsets, weights = np.zeros((n_nodes, 1), dtype=np.int32), np.ones((n_nodes, 1), dtype=np.complex64)
+    points = n_directions * _RANGES
+    found: dict[str, float] = {}
+    for precision in ("float32", "int16") if kernels.tile_ranges else ("float32",):
+        took_s = []
+        for n_pairs in (2, 10):
+            first = np.sort(random.integers(0, n_nodes - 80, n_directions))
+            places = (first[:, None] + 8 * np.arange(n_pairs)).astype(np.int32)
+            if precision == "float32":
+                taps = np.full((n_directions, n_pairs, 2), 0.1, dtype=np.float32)
+                took_s.append(
+                    _best(
+                        lambda places=places, taps=taps: kernels.interpolated_beams_envelope(
+                            signals, offsets, weights, places, taps, 0, _RANGES, 1, energy
+                        )
+                    )
+                )
+            else:
+                width = kernels.tile_ranges + 20
+                starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
+                tiles = np.ones((len(starts), 1, 1, width, 2), dtype=np.int16)
+                scales, pairs = np.ones(len(starts), dtype=np.float32), np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
+                whole = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
+                took_s.append(
+                    _best(
+                        lambda places=places, whole=whole: kernels.interpolated_beams_envelope_int16(
+                            tiles, scales, starts, _RANGES, offsets, pairs, places, whole, np.float32(1), 1, energy
+                        )
+                    )
+                )
+        found[f"pair_{precision}"] = max((took_s[1] - took_s[0]) / 8, 1e-3 * took_s[1]) / points
+        found["image"] = max(took_s[0] / points - 2 * found[f"pair_{precision}"], 1e-12)
+    return found

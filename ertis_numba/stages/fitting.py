@@ -1,0 +1,192 @@
+"""Waves made of others, by weights that err least: what delays and beams are interpolated by.
+
+A sample at a delay between those that are kept, and a beam between those that are computed, are both sums of
+neighbours. For a plane wave of unit amplitude the neighbours are ``E[wave, tap]``, what is wanted is
+``T[wave, target]``, and all that the chain can choose are the weights ``c[tap, target]`` and one gain
+``g[wave]`` that all targets share, which the matched filter takes along for nothing. Both are the ones that
+make
+
+    Σ_wave power[wave] · Σ_target |T − g (E c)|²
+
+least: a linear least-squares problem in either, solved in turns. The gain takes away what all targets would be
+wrong by in the same way, so what is left has no mean over the targets and adds up between microphones like
+noise. That is why its power is a tight estimate of the image's error, not only a bound. (The gain is what
+deapodization is to gridding: J. I. Jackson et al., Selection of a convolution function for Fourier inversion
+using gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutton, Nonuniform fast Fourier
+transforms using min-max interpolation, IEEE Trans. Signal Process. 51, 2003.)
+"""
+
+import math
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import numpy as np
+import threadpoolctl
+from numpy.typing import NDArray
+
+from ertis_numba.settings import INTERPOLATIONS
+
+__all__ = ["DelayFit", "Spectrum", "fit", "one_thread", "weights_of"]
+
+_TURNS = 12  # the error falls by less than 0.1 dB after that
+_LEAST_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
+_TARGETS = 65  # over one step of the samples that are kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spectrum:
+    """Where the matched filter's output has its power.
+
+    Attributes
+    ----------
+    frequency_hz : (wave,) float64
+    power : (wave,) float64
+        Adds up to 1.
+    """
+
+    frequency_hz: NDArray[np.float64]
+    power: NDArray[np.float64]
+
+    @property
+    def centre_hz(self) -> float:
+        """Mean frequency."""
+        return float(self.frequency_hz @ self.power)
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Keep BLAS to one thread inside: its matrices here are small, and on busy cores its threads wait for each other."""
+    return threadpoolctl.threadpool_limits(1, user_api="blas")
+
+
+def fit(
+    taps: NDArray[np.complex128],
+    targets: NDArray[np.complex128],
+    power: NDArray[np.float64],
+    *,
+    real: bool = False,
+    least_power: float = _LEAST_POWER,
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the gain and the weights that make ``targets`` of ``taps`` with the least error.
+
+    Parameters
+    ----------
+    taps : (wave, tap) complex128
+    targets : (wave, target) complex128
+    power : (wave,) float64
+    real : bool
+        Give real weights only.
+    least_power : float
+        Added to the taps' Gram matrix, by its mean diagonal.
+
+    Returns
+    -------
+    gain : (wave,) complex128
+    weights : (tap, target) complex128
+    """
+    gain = np.ones(len(taps), dtype=np.complex128)
+    for _ in range(_TURNS):
+        weights = weights_of(gain, taps, targets, power, real=real, least_power=least_power)
+        made = taps @ weights
+        gain = np.sum(np.conj(made) * targets, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+    return gain, weights_of(gain, taps, targets, power, real=real, least_power=least_power)
+
+
+def weights_of(
+    gain: NDArray[np.complex128],
+    taps: NDArray[np.complex128],
+    targets: NDArray[np.complex128],
+    power: NDArray[np.float64],
+    *,
+    real: bool = False,
+    least_power: float = _LEAST_POWER,
+) -> NDArray[np.complex128]:
+    """Return the weights, (tap, target), that are best with a given gain; parameters as for `fit`."""
+    gained = gain[:, None] * taps
+    left = np.conj(gained.T) * power
+    gram, right = left @ gained, left @ targets
+    if real:
+        gram, right = gram.real + 0j, right.real + 0j
+    gram += least_power * np.trace(gram).real / len(gram) * np.eye(len(gram))
+    return np.asarray(np.linalg.solve(gram, right))
+
+
+class DelayFit:
+    """How a sample at any time is made of samples that are kept at a fixed step.
+
+    Attributes
+    ----------
+    n_taps : int
+    fractions : (target,) float64
+        Delays spread evenly over one step, as `split` returns them.
+    errors : (wave,) float64
+        Power of the error by that of the sample at each frequency of the spectrum, the variance over delays spread
+        evenly over one step.
+    biases : (wave,) float64
+        Power of its mean, which all microphones share; fitted weights leave less of it than others.
+    """
+
+    def __init__(self, interpolation: str, n_taps: int | None, step_s: float, spectrum: Spectrum) -> None:
+        self.n_taps = INTERPOLATIONS[interpolation] or n_taps or 1
+        self._interpolation = interpolation
+        self._step_s = step_s
+        self._spectrum = spectrum
+        self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + (self.n_taps - 1) // 2 - 0.5 * (self.n_taps % 2)
+        self._gain = np.ones(len(spectrum.power), dtype=np.complex128)
+        if interpolation == "fitted":
+            self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
+        made = self.gain(spectrum.frequency_hz)[:, None] * (
+            self._taps(spectrum.frequency_hz) @ self.weights(self.fractions).T
+        )
+        wrong = made - self._wanted(self.fractions)
+        self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the weights are those that err least."""
+        return self._interpolation == "fitted"
+
+    def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the first kept sample that makes each delayed one, and how far after it that lies, in steps."""
+        steps = delays_s / self._step_s
+        nearest = np.rint(steps) if self.n_taps % 2 else np.floor(steps)
+        first = nearest - (self.n_taps - 1) // 2
+        return first.astype(np.int64), steps - first
+
+    def weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them."""
+        flat = np.ravel(fractions)
+        if self._interpolation == "fitted":
+            frequency_hz = self._spectrum.frequency_hz
+            found = weights_of(self._gain, self._taps(frequency_hz), self._wanted(flat), self._spectrum.power)
+        else:
+            found = self._simple_weights(flat)
+        return np.ascontiguousarray(found.T).reshape(*np.shape(fractions), self.n_taps)
+
+    def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the gain that goes with the weights: (frequency,) complex128."""
+        if self._interpolation != "fitted":
+            return np.ones(len(frequency_hz), dtype=np.complex128)
+        made = self._taps(frequency_hz) @ self.weights(self.fractions).T
+        wanted = self._wave(frequency_hz, self.fractions)
+        return np.asarray(np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1))
+
+    def _simple_weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the weights, (tap, target), of the ways of interpolation that know no band."""
+        if self._interpolation == "nearest":
+            return np.ones((1, len(fractions)), dtype=np.complex128)
+        nodes = np.arange(self.n_taps)
+        shape = np.ones((self.n_taps, len(fractions)))
+        for tap in nodes:  # Lagrange's polynomials; 1 for a single tap, straight lines for two
+            for other in nodes[nodes != tap]:
+                shape[tap] *= (fractions - other) / (tap - other)
+        carrier = 2j * math.pi * self._spectrum.centre_hz * self._step_s
+        return np.asarray(shape * np.exp(carrier * (fractions - nodes[:, None])))
+
+    def _taps(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return self._wave(frequency_hz, np.arange(self.n_taps, dtype=np.float64))
+
+    def _wanted(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return self._wave(self._spectrum.frequency_hz, fractions)
+
+    def _wave(self, frequency_hz: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return np.asarray(np.exp(2j * math.pi * self._step_s * np.outer(frequency_hz, steps)))

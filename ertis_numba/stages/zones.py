@@ -1,0 +1,41 @@
+"""Range zones: spherical wavefronts by delays that hold for a stretch of ranges."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["bend", "zone_edges"]
+
+_NEAREST_M = 1e-3  # what stands for range 0, where a wavefront has no curvature to speak of
+
+
+def bend(range_m: float) -> float:
+    """Return the curvature of a wavefront from ``range_m``: 1/m."""
+    return 1 / max(range_m, _NEAREST_M)
+
+
+def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
+    """Return zones over which the curvature changes by the same amount.
+
+    The delay of a microphone at p differs from that of a plane wave by ``p²/2rc`` in the main, so it is steps of
+    1/r, not of r, that make every zone err alike. The delays of a zone are those of its middle curvature.
+
+    Parameters
+    ----------
+    range_m : (range,) float64
+        Ascending.
+    count : int
+        Zones; there are fewer where some would hold no range.
+
+    Returns
+    -------
+    list of (first, stop, distance)
+        Ranges ``first … stop - 1`` of each zone and the distance in metres whose delays it has.
+    """
+    bends = 1 / np.maximum(range_m, _NEAREST_M)
+    span = bends[0] - bends[-1]
+    zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)
+    edges = [0, *(np.flatnonzero(np.diff(np.minimum(zone, count - 1))) + 1).tolist(), len(bends)]
+    return [
+        (first, stop, float(2 / (bends[first] + bends[stop - 1])))
+        for first, stop in zip(edges[:-1], edges[1:], strict=True)
+    ]

@@ -1,0 +1,95 @@
+"""Records of 16,777,216 words: nothing drifts over 640 m, and memory holds the words and nothing else of their size."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.storage import write_recording
+from ertis_numba.waveform import call_at
+from tests import reference
+from tests.hard_cases.tuned import tuned
+
+N_SAMPLES = 2**24
+N_NOISE = 40_960
+PAIR = Array(layout="pair", positions_m=((0.0, -0.02, 0.0), (0.0, 0.02, 0.0)), word_bits=8)
+LONG = Settings(
+    array=PAIR, recording=Recording(n_samples=N_SAMPLES), processing=Processing(directions="2d:5", range_m=(0.4, 0.9))
+)
+RATE_HZ = LONG.recording.pdm_rate_hz
+LATER = (N_SAMPLES - N_NOISE - 2000) // 100 * 100  # a multiple of range_decimation: ranges shift by whole steps
+
+
+def shifted_image(first, precision, shift=0):
+    """The image of noise that begins at sample ``first + shift``, its range window shifted with it.
+
+    What surrounds the noise is an idle pattern with a period of two samples, the same before and after.
+    """
+    farther_m = shift * sound_speed_m_s(LONG.air) / (2 * RATE_HZ)
+    near_m, far_m = LONG.processing.range_m
+    processing = LONG.processing.replace(range_m=(near_m + farther_m, far_m + farther_m))
+    words = np.zeros(N_SAMPLES, dtype=np.uint8)
+    words[1::2] = 0xFF
+    words[first + shift :][:N_NOISE] = np.random.default_rng(1).integers(0, 256, N_NOISE, dtype=np.uint8)
+    settings = tuned(LONG.replace(processing=processing), precision=precision)
+    image = Pipeline(settings).process(Measurement(words, settings))
+    assert image.range_m[0] == pytest.approx(near_m + farther_m, abs=1e-9)
+    return image.energy
+
+
+@pytest.mark.parametrize("precision", ["float32", "auto"])
+def test_the_end_of_the_record_is_imaged_as_its_beginning(precision):
+    """At 640 m the image differs by -148 dB from that of the same bits at 0.4 m (by -113 dB through 16 bits)."""
+    near, far = shifted_image(1000, precision), shifted_image(1000, precision, LATER)
+    n_ranges = min(near.shape[1], far.shape[1])  # the last range may fall on either side of the window's edge
+    assert n_ranges >= 130
+    change = np.linalg.norm(far[:, :n_ranges] - near[:, :n_ranges])
+    assert change < 1e-5 * np.linalg.norm(near)  # it may well be 0
+
+
+def test_times_in_float32_drift():
+    """The naive form: past 2²⁴ an index has no neighbour, and after 3.7 s the call is off by -36 dB."""
+    assert np.float32(N_SAMPLES + 1) == np.float32(N_SAMPLES)
+    index = LATER + np.arange(12_000)
+    wanted = call_at(LONG.call, (index - LATER) / RATE_HZ)
+    drifted = index.astype(np.float32) / np.float32(RATE_HZ) - np.float32(LATER / RATE_HZ)
+    assert -40 < reference.error_db(call_at(LONG.call, drifted.astype(float)), wanted) < -30
+    assert reference.error_db(call_at(LONG.call, index / RATE_HZ - LATER / RATE_HZ), wanted) < -100
+
+
+STREAM = """
+import sys
+import ertis_numba as ertis
+with ertis.open_recording(sys.argv[1]) as recording:
+    pipeline = ertis.Pipeline(recording.settings)
+    for measurement in recording:
+        pipeline.process(measurement)
+print(open("/proc/self/status").read())
+"""
+
+
+def peak_bytes(path, n_samples):
+    """How large a process ever was that streamed four records of so many words from a file."""
+    settings = LONG.replace(recording=Recording(n_samples=n_samples))
+    words = np.zeros(n_samples, dtype=np.uint8)
+    words[1::2] = 0xFF
+    write_recording(path, (Measurement(words, settings, Stamp(sequence=number)) for number in range(4)))
+    done = subprocess.run([sys.executable, "-c", STREAM, path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # Not getrusage: what it says begins with the size of the process that started this one.
+    (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", done.stdout)
+    return 1024 * int(peak_kb)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
+def test_memory_grows_by_the_words_and_no_more(tmp_path):
+    """Two records of 16 MiB at a time, the last and the next, of a file of 64 MiB; signals would take 128 MiB."""
+    grown = peak_bytes(tmp_path / "long.h5", N_SAMPLES) - peak_bytes(tmp_path / "short.h5", 2**17)
+    assert grown < 2.5 * N_SAMPLES

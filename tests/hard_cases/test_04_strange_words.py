@@ -1,0 +1,100 @@
+"""Words without sound, faulty bits, offsets, idle tones: finite, and no worse than the missing share of the array."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.frames import Measurement
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.stages.detect import find_peaks
+from ertis_numba.waveform import matched_filter
+from tests.cases import SHORT, words_of
+from tests.hard_cases.echoes import echo_signals, echo_words
+
+SETTINGS = SHORT.replace(processing=SHORT.processing.replace(directions="2d:91"))
+N_SAMPLES = SETTINGS.recording.n_samples
+ECHO = {"azimuth_deg": 20.0, "range_m": 0.7, "level": 0.5}
+ODD = np.arange(N_SAMPLES) % 2 == 1
+ALL = np.uint32(0xFFFF_FFFF)
+SILENT = {
+    "all zero": np.zeros(N_SAMPLES, dtype=np.uint32),
+    "all one": np.full(N_SAMPLES, ALL),
+    "alternating": np.where(ODD, ALL, np.uint32(0)),
+}
+CHANNEL = np.uint32(1 << 7)
+FAULTS = {
+    "stuck at 0": lambda words: words & ~CHANNEL,
+    "stuck at 1": lambda words: words | CHANNEL,
+    "dead, its modulator idles": lambda words: np.where(ODD, words | CHANNEL, words & ~CHANNEL),
+}
+
+
+def pulses(rate_hz):
+    """What a modulator makes of an offset near its limit, a pulse per period: (sample,) uint32 of 0 and 1."""
+    phase = np.arange(N_SAMPLES + 1) * (rate_hz / SETTINGS.recording.pdm_rate_hz)
+    return np.diff(np.floor(phase)).astype(np.uint32)
+
+
+def image_of(words, settings=SETTINGS):
+    image = Pipeline(settings).process(Measurement(words, settings))
+    assert np.isfinite(image.energy).all()
+    assert image.energy.min() >= 0
+    return image
+
+
+def level_db(image):
+    return 20 * np.log10(float(image.energy.max()))
+
+
+def require_echo(image, changed_db, abs_db):
+    """The echo is at its place, and its level is off by what is expected."""
+    [peak] = find_peaks(image, top=1)
+    assert peak.azimuth_deg == pytest.approx(20, abs=0.1)
+    assert peak.range_m == pytest.approx(0.7, abs=3e-4)
+    assert level_db(image) - level_db(image_of(echo_words(SETTINGS, **ECHO))) == pytest.approx(changed_db, abs=abs_db)
+
+
+@pytest.mark.parametrize(("method", "largest_db"), [("fast", -110), ("paper", -180)])
+@pytest.mark.parametrize("name", SILENT)
+def test_words_without_sound_give_nothing(name, method, largest_db):
+    """-114 dB of full scale at the most where the record is whole: offset and clock lie far out of the band."""
+    settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
+    assert level_db(image_of(SILENT[name], settings)) < largest_db
+
+
+@pytest.mark.parametrize(("name", "largest_db"), [("all zero", -44), ("all one", -44), ("alternating", -78)])
+def test_the_step_at_the_beginning_of_the_record_is_all_there_is(name, largest_db):
+    """A constant begins at sample 0, a step of full scale: -45 dB there, and nothing of it beyond."""
+    image = image_of(SILENT[name], SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.0, 1.0))))
+    assert level_db(image) < largest_db
+    assert 20 * np.log10(image.energy[:, image.range_m > 0.5].max()) < -110
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_one_channel_less_costs_its_share(fault):
+    """One of 32: -0.28 dB."""
+    require_echo(image_of(fault(echo_words(SETTINGS, **ECHO))), 20 * np.log10(31 / 32), 0.02)
+
+
+@pytest.mark.parametrize(("offset", "abs_db"), [(-0.01, 0.02), (0.1, 0.05), (0.3, 0.1)])
+def test_offset_changes_nothing(offset, abs_db):
+    """An offset of 0.3 of full scale changes the level by 0.05 dB, which is the bits' own noise."""
+    require_echo(image_of(words_of(echo_signals(SETTINGS, **ECHO) + offset)), 0, abs_db)
+
+
+@pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
+def test_idle_tone_of_one_channel_leaves_the_echo(rate_hz):
+    """A tone of -29 dB in the middle of the band, in place of the microphone's signal."""
+    words = (echo_words(SETTINGS, **ECHO) & ~CHANNEL) | (pulses(rate_hz) * CHANNEL)
+    require_echo(image_of(words), 20 * np.log10(31 / 32), 0.05)
+
+
+@pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
+def test_idle_tone_of_all_channels_is_as_strong_as_the_filter_lets_it_be(rate_hz):
+    """Compression spreads a tone over the length of the call: within 0.3 dB of the filter's gain there."""
+    image = image_of(pulses(rate_hz) * ALL)
+    n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz
+    matched = matched_filter(SETTINGS.call, n_fft=n_fft, rate_hz=signal_rate_hz)
+    gain = np.abs(matched.values[round(rate_hz * n_fft / signal_rate_hz) - matched.first_bin]) / 2
+    amplitude = 4 * rate_hz / SETTINGS.recording.pdm_rate_hz  # of the first harmonic of short pulses from -1 to 1
+    ahead = image.energy[np.argmin(np.abs(image.azimuth_rad))]
+    assert 20 * np.log10(ahead.max()) == pytest.approx(20 * np.log10(gain * amplitude), abs=0.3)

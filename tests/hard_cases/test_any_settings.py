@@ -1,0 +1,227 @@
+"""Any valid settings with any data: finite energies of 0 or more, or one line that says what cannot be had.
+
+As many examples as take some ten seconds; more with the number in ``ERTIS_EXAMPLES``.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.stages.detect import find_peaks
+from tests.hard_cases.tuned import tuned
+
+EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "600"))
+MOST_SAMPLES = 500_000
+LOUDEST = 100.0  # of an image whose full scale is 1, before calibrated gains
+DATA = ("noise", "zeros", "ones", "alternating", "sparse", "stuck")
+
+
+def count_of(array):
+    """Channels of an array; the shipped layouts have 32."""
+    return 32 if array.positions_m is None else len(array.positions_m)
+
+
+def limits(low, high):
+    """Intervals, those of no width among them."""
+    edges = st.floats(low, high, allow_subnormal=False)
+    return st.tuples(edges, edges).map(lambda pair: (min(pair), max(pair))) | edges.map(lambda edge: (edge, edge))
+
+
+@st.composite
+def arrays(draw):
+    """1 to 8 microphones, at times 9 to 70, or a shipped layout; some in one place, some without a microphone."""
+    if draw(st.integers(0, 9)) == 0:
+        return Array(layout=draw(st.sampled_from(["eRTIS_v3D1", "uRTIS_v1"])))
+    n_mics = draw(st.integers(1, 8) | st.sampled_from([9, 31, 33, 70]))
+    reach_m = draw(st.sampled_from([0.0, 0.01, 0.1, 1.0]))
+    places_m = reach_m * np.random.default_rng(draw(st.integers(0, 99))).uniform(-1, 1, (n_mics, 3))
+    enabled = draw(st.none() | _mixed(st.booleans(), n_mics).map(lambda flags: flags if any(flags) else None))
+
+    def each(values):
+        return draw(st.none() | values.map(lambda value: (value,) * n_mics) | _mixed(values, n_mics))
+
+    return Array(
+        layout="any",
+        positions_m=tuple(map(tuple, places_m.tolist())),
+        enabled=enabled,
+        gain=each(st.sampled_from([1e-3, 0.5, 1.0, 2.0, 1e3])),
+        delay_s=each(st.sampled_from([-1e-3, -1e-6, 0.0, 3e-6, 1e-3])),
+        word_bits=draw(st.sampled_from([8, 16, 32, 64])),
+    )
+
+
+def _mixed(values, n_mics):
+    return st.lists(values, min_size=n_mics, max_size=n_mics).map(tuple)
+
+
+@st.composite
+def calls(draw):
+    """Fields of sweeps of any direction, width and ramp, from one that hardly sweeps on."""
+    sample_rate_hz = draw(st.floats(2e5, 1e6))
+    low_hz = draw(st.floats(2e3, 4e4))
+    high_hz = draw(st.floats(low_hz * 1.0001, min(9e4, sample_rate_hz * 0.499)))
+    edges_hz = (low_hz, high_hz) if draw(st.booleans()) else (high_hz, low_hz)
+    return {
+        "start_frequency_hz": edges_hz[0],
+        "stop_frequency_hz": edges_hz[1],
+        "duration_s": draw(st.floats(16 / sample_rate_hz, 3e-3)),
+        "sample_rate_hz": sample_rate_hz,
+        "ramp_fraction": draw(st.floats(0, 0.5)),
+    }
+
+
+def some_of(fields):
+    """Values of some fields; the others keep their defaults."""
+    return st.fixed_dictionaries({}, optional=fields)
+
+
+TUNING = {
+    "precision": st.sampled_from(["auto", "float32", "int16"]),
+    "oversampling": st.integers(1, 64),
+    "max_error_db": st.sampled_from([-20.0, -35.0, -60.0, -100.0]) | st.floats(-120, 0),
+    "interpolation": st.sampled_from(["fitted", "fitted", "nearest", "carrier", "linear", "cubic"]),
+    "delay_taps": st.sampled_from([None, None, 1, 2, 4, 8]),
+    "beam_taps": st.sampled_from([None, 0, 2, 4, 6]),
+    "beam_density": st.floats(1.1, 8),
+    "stop_band_db": st.floats(40, 140),
+    "zones": st.integers(1, 4),
+}
+COMBINING = {
+    "wavefront": st.sampled_from(["plane", "spherical"]),
+    "beamformer": st.sampled_from(["delay_and_sum", "delay_and_sum", "coherence_factor", "dmas", "capon"]),
+    "dmas_order": st.integers(2, 8),
+    "snapshots": st.integers(1, 32),
+    "loading": st.floats(1e-6, 1e6),
+}
+
+
+@st.composite
+def any_settings(draw):
+    """Settings that their constructors take, or None where they refuse; records of 4 ms at the most."""
+    rate_hz = draw(st.sampled_from([450e3, 9e5, 1.125e6, 4.5e6]) | st.floats(2.5e5, 5e6))
+    recording = Recording(
+        pdm_rate_hz=rate_hz, n_samples=draw(st.integers(1, 300) | st.integers(1, max(1, int(4e-3 * rate_hz))))
+    )
+    step, divisor = draw(st.integers(1, 30)), draw(st.integers(1, 30))
+    head, count = draw(st.sampled_from(["2d", "3d"])), draw(st.integers(1, 40))
+    reach_m = 340.0 * recording.duration_s / 2
+    array = draw(arrays())
+    tuning = draw(some_of(TUNING))
+    # All phases and microphones of the 10 ms that an image needs at the most: few, so that examples are quick.
+    finest = max(1, min(64, int(MOST_SAMPLES * step * divisor / (10e-3 * rate_hz * count_of(array)))))
+    tuning["oversampling"] = min(finest, tuning.get("oversampling", finest))
+    air = Air(
+        temperature_c=draw(st.floats(-40, 60)),
+        humidity_percent=draw(st.floats(0, 100)),
+        pressure_pa=draw(st.floats(1e4, 2e5)),
+    )
+    processing = {
+        "method": draw(st.sampled_from(["fast", "fast", "fast", "paper"])),
+        "directions": f"{head}:{count}",
+        "azimuth_limits_deg": draw(limits(-180, 180)),
+        "elevation_limits_deg": draw(limits(-90, 90)),
+        "range_m": draw(limits(0, reach_m) | limits(0, 1.2 * reach_m)),
+        "range_decimation": step * divisor,
+        "decimation": draw(st.sampled_from([None, divisor])),
+        **draw(some_of(COMBINING)),
+    }
+    call = draw(calls())
+    try:
+        call = Call(**call)
+        made = Settings(array=array, call=call, recording=recording, air=air, processing=Processing(**processing))
+        return tuned(made, **tuning)
+    except ArgumentError as error:
+        require_one_line(error)
+        return None
+
+
+def require_one_line(error):
+    """What is refused is named, with the remedy, in one line."""
+    message = str(error)
+    assert message
+    assert "\n" not in message
+    assert ";" in message
+
+
+def words_for(pipeline, kind, seed):
+    """Data of a kind in the shape that the settings ask for."""
+    random = np.random.default_rng(seed)
+    array = pipeline.settings.array
+    n_words = -(-count_of(array) // array.word_bits)
+    dtype = np.dtype(f"u{array.word_bits // 8}")
+    shape = (pipeline.settings.recording.n_samples, n_words)
+    words = random.integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
+    if kind in {"zeros", "ones"}:
+        words[:] = 0 if kind == "zeros" else np.iinfo(dtype).max
+    elif kind == "alternating":
+        words[0::2], words[1::2] = 0, np.iinfo(dtype).max
+    elif kind == "sparse":
+        words[random.random(shape) < 0.99] = 0
+    elif kind == "stuck":
+        words |= dtype.type(1)
+    return words if n_words > 1 else words[:, 0]
+
+
+@pytest.mark.filterwarnings("error")
+@settings(max_examples=EXAMPLES, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    made=any_settings(), kind=st.sampled_from(DATA), seed=st.integers(0, 99), device=st.sampled_from(["cpu", "numpy"])
+)
+def test_any_settings_and_any_data_give_an_image_or_one_line(made, kind, seed, device):
+    if made is None:
+        event("refused when made")
+        return
+    try:
+        pipeline = Pipeline(made, device="auto" if made.processing.method == "paper" else device, threads=1)
+    except (ArgumentError, DataError) as error:
+        event("refused by the pipeline")
+        require_one_line(error)
+        return
+    event(f"an image of {kind}")
+    image = pipeline.process(Measurement(words_for(pipeline, kind, seed), made))
+    assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
+    assert np.isfinite(image.energy).all()
+    if made.processing.method == "fast":  # the paper's envelope is low-passed by a recursive filter, which undershoots
+        assert image.energy.min() >= 0
+    if made.processing.beamformer == "delay_and_sum":
+        assert image.energy.max() < LOUDEST / min(made.array.gain or (1.0,))
+    for peak in find_peaks(image, top=3):
+        assert np.isfinite([peak.azimuth_deg, peak.elevation_deg, peak.range_m, peak.level_db]).all()
+        assert peak.level_db <= 0
+
+
+# ---- what the search has found ---------------------------------------------------------------------
+
+
+def test_a_call_shorter_than_a_period_is_refused():
+    """Sampled at the signals' rate it was all zeros, and the matched filter divided by its power."""
+    with pytest.raises(
+        ArgumentError, match=r"call\.duration_s is 8e-05, less than a period of 2000 Hz; give 0\.0005 or"
+    ):
+        Call(start_frequency_hz=2001.0, stop_frequency_hz=2000.0, duration_s=8e-5)
+
+
+def test_a_sweep_too_narrow_for_the_paper_is_refused():
+    """Its band pass rang for a minute, and 3 GB of it were computed."""
+    call = Call(start_frequency_hz=40_000.5, stop_frequency_hz=40_000.0)
+    Settings(call=call)
+    with pytest.raises(ArgumentError, match=r"call sweeps over 0\.5 Hz, too little for the band pass .*; give 100 Hz"):
+        Settings(call=call, processing=Processing(method="paper"))
+
+
+def test_peaks_are_found_where_the_rate_cuts_the_edge_of_the_band():
+    """The paper's method may have a rate at which the matched filter's band reaches past half of it."""
+    processing = Processing(method="paper", directions="2d:31", range_decimation=160, decimation=80, range_m=(0.2, 0.5))
+    call = Call(start_frequency_hz=25_000.0, stop_frequency_hz=10_000.0)
+    made = Settings(call=call, recording=Recording(n_samples=20_000), processing=processing)
+    assert made.signal_rate_hz < 2 * (call.high_frequency_hz + 5_000)
+    pipeline = Pipeline(made)
+    [peak] = find_peaks(pipeline.process(Measurement(words_for(pipeline, "noise", 1), made)), top=1)
+    assert 0.2 < peak.range_m < 0.5

@@ -1,0 +1,15 @@
+"""Settings of other accuracy, and the chain that takes signals."""
+
+from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.stages.fast import FastChain
+
+
+def tuned(settings, **changes):
+    """Settings with some of their accuracy changed."""
+    return settings.replace(accuracy=settings.accuracy.replace(**changes))
+
+
+def chain_of(settings):
+    """A chain on one thread, which also takes what would be modulated."""
+    return FastChain(Pipeline(settings, threads=1).settings, kernels.load("cpu"), threads=1)

@@ -1,0 +1,163 @@
+"""What coherence factor, DMAS and Capon make of recordings, and how they are chosen."""
+
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba import kernels
+from ertis_numba.errors import ArgumentError
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Processing, Recording
+from ertis_numba.simulation import Point
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.stages.adaptive import AdaptiveBeamform
+from ertis_numba.stages.fast import FastChain
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests import cases
+from tests.files import noise
+from tests.scenes import SENSOR, line_array, only, scene_of
+
+KERNELS = {name: kernels.load(name) for name in kernels.DEVICES}
+OTHERS = ("coherence_factor", "dmas", "capon")
+LINE_16 = SENSOR.replace(
+    array=line_array(16, 0.004),
+    recording=Recording(n_samples=45_000),
+    processing=Processing(directions="2d:361", range_m=(0.9, 1.4)),
+)
+
+
+@pytest.mark.parametrize("beamformer", OTHERS)
+def test_pipeline_gives_the_same_bits_on_any_number_of_threads(beamformer):
+    settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer))
+    measurement = cases.noise(settings)
+    counts = range(1, KERNELS["cpu"].max_threads + 1)
+    images = [Pipeline(settings, threads=count).process(measurement).energy for count in counts]
+    assert len({image.tobytes() for image in images}) == 1
+    plain = Pipeline(settings, device="numpy").process(measurement).energy
+    assert np.abs(images[0] - plain).max() < 1e-5 * plain.max()
+
+
+@pytest.mark.parametrize("device", KERNELS)
+@pytest.mark.parametrize("beamformer", OTHERS)
+def test_the_chain_makes_zeros_of_zeros(device, beamformer):
+    settings = cases.CASES["line of 8"]
+    settings = settings.replace(processing=settings.processing.replace(beamformer=beamformer))
+    chain = FastChain(settings, KERNELS[device], threads=1)
+    out = np.full((len(chain.grid), len(chain.range_m)), 12_345, dtype=np.float32)
+    chain.process_signals(np.zeros((8, settings.recording.n_samples)), out)
+    assert not out.any()
+
+
+def cut(points, **options):
+    """Levels of a ring about 1.2 m over azimuth: (direction,) in degrees and in dB of the strongest."""
+    scene = scene_of(*points, sensor=LINE_16)
+    measurement = Simulator(scene, plan=only("spreading", "modulation")).render()
+    settings = scene.sensor(None).settings()
+    image = Pipeline(settings.replace(processing=settings.processing.replace(**options))).process(measurement)
+    ring = image.energy[:, np.abs(image.range_m - 1.2) < 0.015].max(axis=1)
+    return np.degrees(image.azimuth_rad), 20 * np.log10(ring)
+
+
+@pytest.mark.parametrize(
+    ("options", "lower_db", "lost_db", "narrower"),
+    [
+        ({"beamformer": "coherence_factor"}, 25, 0.2, 0.7),
+        ({"beamformer": "dmas"}, 11, 0.1, 0.8),
+        ({"beamformer": "dmas", "dmas_order": 5}, 40, 0.2, 0.6),
+        ({"beamformer": "capon"}, 11, 1.5, 0.3),
+    ],
+)
+def test_side_lobes_are_lower_and_the_beam_is_narrower(options, lower_db, lost_db, narrower):
+    point = Point(azimuth_deg=10.0, range_m=1.2, strength_db=-20)
+    azimuth_deg, plain_db = cut([point])
+    _, found_db = cut([point], **options)
+    side = np.abs(azimuth_deg - 10) > 12
+    peak_db, plain_peak_db = found_db.max(), plain_db.max()
+    assert plain_peak_db - lost_db < peak_db < plain_peak_db + 0.01
+    assert found_db[side].max() - peak_db < plain_db[side].max() - plain_peak_db - lower_db
+    assert np.sum(found_db > peak_db - 3) < narrower * np.sum(plain_db > plain_peak_db - 3)
+
+
+def dip_db(azimuth_deg, level_db, first_deg, second_deg):
+    """How far the level falls between two directions, below the lower of both; each is sought within a degree."""
+    tops = [level_db[np.abs(azimuth_deg - place) <= 1].max() for place in (first_deg, second_deg)]
+    return min(tops) - level_db[(azimuth_deg > first_deg) & (azimuth_deg < second_deg)].min()
+
+
+def test_capon_parts_what_delay_and_sum_does_not():
+    """Two points 8° apart, of which beams of 7.5° make one; 5 mm in range let them differ between snapshots."""
+    points = [
+        Point(azimuth_deg=side * 4.0, range_m=1.2 + place, strength_db=-20) for side, place in ((-1, 0), (1, 0.005))
+    ]
+    plain = dip_db(*cut(points), -4.0, 4.0)
+    assert dip_db(*cut(points, beamformer="capon", loading=0.3), -4.0, 4.0) > plain + 6
+    assert dip_db(*cut(points, beamformer="capon"), -4.0, 4.0) > plain + 2
+
+
+@pytest.mark.parametrize("device", KERNELS)
+def test_capon_parts_independent_sources_within_a_beam(device):
+    """Narrow band, 16 microphones at half a wavelength: sources at 0.6 of the half-power width, 30 dB over noise."""
+    random, sines = np.random.default_rng(6), np.linspace(-0.2, 0.2, 81)
+    mics, apart = np.arange(16), 0.6 * 0.886 / 8
+    steer = np.exp(1j * np.pi * np.multiply.outer(mics, [-apart / 2, apart / 2]))
+    noise_of = [random.standard_normal((2, n, 32)) for n in (2, 16)]
+    sources, rest = (part[0] + 1j * part[1] for part in noise_of)
+    signals = (steer @ sources + 0.03 * rest).astype(np.complex64)
+    weights = (np.exp(-1j * np.pi * np.multiply.outer(sines, mics)) / 16).astype(np.complex64)
+    offsets = np.tile(mics.astype(np.int32) * 32, (len(sines), 1))
+    power = {}
+    for name, options in {"plain": {"loading": 1e6}, "capon": {"loading": 1e-3}}.items():
+        processing = Processing(beamformer="capon", snapshots=32, **options)
+        out = np.empty((len(sines), 32), dtype=np.float32)
+        AdaptiveBeamform(processing, KERNELS[device], offsets, weights)(signals[:, None], out)
+        power[name] = 10 * np.log10((out.astype(float) ** 2).mean(axis=1))
+    middle = len(sines) // 2
+    assert power["plain"][middle] > power["plain"][np.abs(sines) > apart / 2].max()
+    tops = [power["capon"][half].max() for half in (slice(0, middle), slice(middle + 1, None))]
+    assert min(tops) > power["capon"][middle] + 6
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"beamformer": "mvdr"}, r"processing\.beamformer 'mvdr' is unknown; known are delay_and_sum, .*capon"),
+        ({"dmas_order": 1}, r"processing\.dmas_order is 1; give a whole number from 2 to 8"),
+        ({"dmas_order": 9}, r"processing\.dmas_order is 9; give a whole number from 2 to 8"),
+        ({"snapshots": 0}, r"processing\.snapshots is 0; give a whole number from 1 to 32"),
+        ({"snapshots": 33}, r"processing\.snapshots is 33; give a whole number from 1 to 32"),
+        ({"loading": 0.0}, r"processing\.loading is 0; give a number from 1e-06 to 1e\+06"),
+        ({"loading": math.nan}, r"processing\.loading is nan; give a finite number"),
+        (
+            {"beamformer": "dmas", "method": "paper"},
+            r"processing\.method is 'paper', which can delay_and_sum only; give 'fast' with .*'dmas'",
+        ),
+        (
+            {"beamformer": "capon", "wavefront": "spherical"},
+            r"processing\.wavefront is 'spherical', which can delay_and_sum only; give 'plane' with .*'capon'",
+        ),
+    ],
+)
+def test_settings_that_cannot_be(options, told):
+    with pytest.raises(ArgumentError, match=told):
+        Processing(**options)
+
+
+@pytest.mark.parametrize(
+    ("case", "order", "many"), [("one microphone", 2, "1 microphone"), ("16 bits, disabled", 5, "4 microphones")]
+)
+def test_dmas_of_too_few_microphones(case, order, many):
+    settings = cases.CASES[case]
+    settings = settings.replace(processing=settings.processing.replace(beamformer="dmas", dmas_order=order))
+    with pytest.raises(ArgumentError, match=rf"dmas_order is {order}, but the array has {many}; give an order of"):
+        Pipeline(settings)
+
+
+def test_command_line(tmp_path):
+    recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--beamformer", "capon"])
+    assert done.exit_code == 0, done.stderr
+    with open_energyscapes(target) as images:
+        assert images[0].settings.processing.beamformer == "capon"

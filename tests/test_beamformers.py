@@ -1,0 +1,244 @@
+"""Coherence factor, DMAS and Capon: against their referees, where they break, and what each is good for."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from ertis_numba import kernels
+from ertis_numba.settings import Processing
+from ertis_numba.stages.adaptive import AdaptiveBeamform
+from tests import reference
+
+KERNELS = {name: kernels.load(name) for name in kernels.DEVICES}
+OTHERS = ("coherence_factor", "dmas", "capon")
+FLOAT32 = 2e-6  # relative to the largest number of an image
+SHAPES = {
+    # microphones, phases, samples, ranges, directions
+    "two microphones": (2, 1, 40, 30, 3),
+    "one range": (4, 2, 10, 1, 2),
+    "prime": (7, 5, 211, 151, 13),
+    "over a tile": (5, 2, 300, 257, 3),
+    "eRTIS": (32, 10, 120, 70, 5),
+    "many microphones": (129, 2, 40, 33, 2),
+}
+
+
+@pytest.fixture(params=KERNELS)
+def kernel_set(request):
+    return KERNELS[request.param]
+
+
+def complex_noise(*shape, seed=1):
+    random = np.random.default_rng(seed)
+    return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
+
+
+def beam_input(name):
+    n_mics, n_phases, n_samples, n_ranges, n_directions = SHAPES[name]
+    random = np.random.default_rng(2)
+    row = np.arange(n_mics) * n_phases + random.integers(0, n_phases, (n_directions, n_mics))
+    offsets = row * n_samples + random.integers(0, n_samples - n_ranges + 1, (n_directions, n_mics))
+    weights = complex_noise(n_directions, n_mics, seed=3)
+    return complex_noise(n_mics, n_phases, n_samples), offsets.astype(np.int32), weights, (n_directions, n_ranges)
+
+
+def combined(kernel_set, beamformer, signals, **options):
+    """What a beamformer makes of signals that reach the microphones at once: (range,) float32."""
+    n_mics, n_ranges = signals.shape
+    weights = np.full((1, n_mics), 1 / n_mics, dtype=np.complex64)
+    offsets = np.arange(n_mics, dtype=np.int32)[None] * n_ranges
+    out = np.full((1, n_ranges), 12_345, dtype=np.float32)
+    beamform = AdaptiveBeamform(Processing(beamformer=beamformer, **options), kernel_set, offsets, weights)
+    beamform(np.ascontiguousarray(signals, dtype=np.complex64)[:, None], out)
+    return out[0]
+
+
+def all_of(kernel_set, name):
+    """The images of all three kernels, one after the other."""
+    signals, offsets, weights, shape = beam_input(name)
+    out = np.full((3, *shape), 12_345, dtype=np.float32)
+    kernel_set.combine_coherence(signals, offsets, weights, out[0])
+    kernel_set.combine_dmas(signals, offsets, weights, 2, out[1])
+    kernel_set.combine_capon(signals, offsets, weights, 5, 0.1, out[2])
+    return out
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_coherence_factor_is_the_referees(kernel_set, name):
+    signals, offsets, weights, shape = beam_input(name)
+    out = np.full(shape, 12_345, dtype=np.float32)
+    kernel_set.combine_coherence(signals, offsets, weights, out)
+    expected = reference.coherence_factor(signals, offsets, weights, shape[1])
+    assert np.abs(out - expected).max() < FLOAT32 * expected.max()
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [
+        ("two microphones", 2),
+        ("one range", 3),
+        ("prime", 5),
+        ("prime", 7),
+        ("over a tile", 4),
+        ("eRTIS", 2),
+        ("eRTIS", 3),
+        ("many microphones", 2),
+    ],
+)
+def test_dmas_is_all_products_written_out(kernel_set, name, order):
+    signals, offsets, weights, shape = beam_input(name)
+    out = np.full(shape, 12_345, dtype=np.float32)
+    kernel_set.combine_dmas(signals, offsets, weights, order, out)
+    expected = reference.dmas(signals, offsets, weights, order, shape[1])
+    assert np.abs(out - expected).max() < FLOAT32 * expected.max()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize(("n_snapshots", "loading"), [(5, 0.1), (1, 1e-3), (8, 1e-6), (4, 10.0), (32, 0.1)])
+def test_capon_is_the_referees(kernel_set, name, n_snapshots, loading):
+    signals, offsets, weights, shape = beam_input(name)
+    out = np.full(shape, 12_345, dtype=np.float32)
+    kernel_set.combine_capon(signals, offsets, weights, n_snapshots, loading, out)
+    expected = reference.capon(signals, offsets, weights, n_snapshots, loading, shape[1])
+    assert np.abs(out - expected).max() < FLOAT32 * expected.max()
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    cpu, found = KERNELS["cpu"], set()
+    for count in range(1, cpu.max_threads + 1):
+        with cpu.threads(count):
+            found.add(all_of(cpu, "prime").tobytes())
+    assert cpu.max_threads > 1
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("n_mics", [2, 8, 31])
+@pytest.mark.parametrize(
+    ("beamformer", "options"),
+    [("coherence_factor", {}), ("capon", {}), ("capon", {"loading": 1e-6, "snapshots": 32})]
+    + [("dmas", {"dmas_order": order}) for order in (2, 5, 8)],
+)
+def test_what_all_microphones_hear_alike_keeps_its_level(kernel_set, beamformer, options, n_mics):
+    if options.get("dmas_order", 2) > n_mics:
+        options = {"dmas_order": n_mics}
+    signal = complex_noise(50)
+    found = combined(kernel_set, beamformer, np.tile(signal, (n_mics, 1)), **options)
+    np.testing.assert_allclose(found, np.abs(signal), rtol=3e-6)
+
+
+@pytest.mark.parametrize(("beamformer", "order"), [("coherence_factor", 2), ("dmas", 2), ("dmas", 5), ("capon", 2)])
+def test_twice_as_loud_is_twice_as_high(kernel_set, beamformer, order):
+    signals = complex_noise(8, 40)
+    found = [combined(kernel_set, beamformer, scale * signals, dmas_order=order) for scale in (1, 2, 1e-12)]
+    np.testing.assert_allclose(found[1], 2 * found[0], rtol=2e-5)
+    np.testing.assert_allclose(found[2], 1e-12 * found[0], rtol=2e-5)
+
+
+@pytest.mark.parametrize("beamformer", ["coherence_factor", "capon"])
+def test_one_microphone_is_its_envelope(kernel_set, beamformer):
+    signals = complex_noise(1, 40)
+    np.testing.assert_allclose(combined(kernel_set, beamformer, signals), np.abs(signals[0]), rtol=1e-6)
+
+
+def test_capon_of_much_loading_is_delay_and_sum(kernel_set):
+    signals = complex_noise(8, 40)
+    expected = np.abs(signals.mean(axis=0))
+    np.testing.assert_allclose(combined(kernel_set, "capon", signals, loading=1e6), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("loading", [1e-3, 0.1, 10.0])
+def test_capon_of_one_snapshot_knows_the_coherence_factor_only(kernel_set, loading):
+    signals = complex_noise(8, 40)
+    beams = np.abs(signals.mean(axis=0))
+    factor = combined(kernel_set, "coherence_factor", signals) / beams
+    expected = beams * loading / (loading + 8 * (1 - factor))
+    np.testing.assert_allclose(
+        combined(kernel_set, "capon", signals, snapshots=1, loading=loading), expected, rtol=1e-5
+    )
+
+
+# Hard cases, and how the plain form fails.
+
+
+@pytest.mark.parametrize("beamformer", OTHERS)
+def test_silence_is_zero(kernel_set, beamformer):
+    """And what comes after it is what it would have been: here, the second half."""
+    signals = complex_noise(4, 40)
+    signals[:, :20] = 0
+    found = combined(kernel_set, beamformer, signals, snapshots=3)
+    assert not found[:19].any()
+    alone = combined(kernel_set, beamformer, signals[:, 20:], snapshots=3)
+    np.testing.assert_allclose(found[21:], alone[1:], rtol=1e-6)
+    assert alone.all()
+
+
+def test_plain_forms_do_not_survive_silence():
+    y = np.zeros((4, 3), dtype=np.complex64)
+    with np.errstate(all="ignore"):
+        assert np.isnan(np.abs(y.sum(axis=0)) ** 2 / (4 * (np.abs(y) ** 2).sum(axis=0))).all()
+        assert np.isnan(y / np.abs(y) ** 0.5).all()
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.solve(y @ y.conj().T, np.ones(4))
+
+
+@pytest.mark.parametrize("beamformer", OTHERS)
+def test_what_is_next_to_nothing_stays_finite(kernel_set, beamformer):
+    """Squares of these are no numbers of single precision any more: the plain root is infinite."""
+    signals = np.full((4, 40), 1e-25 + 1e-25j, dtype=np.complex64)
+    with np.errstate(all="ignore"):
+        power = signals.real**2 + signals.imag**2
+        assert not np.isfinite(signals * power ** np.float32(-0.25)).any()
+    found = combined(kernel_set, beamformer, signals)
+    assert np.all(np.isfinite(found))
+    assert found.max() <= 1.5e-25
+
+
+def test_one_loud_microphone_does_not_drown_the_products_of_the_others(kernel_set):
+    """Power sums and Newton's identities lose everything but the loud one, which is in a part of all products only."""
+    signals = complex_noise(8, 200)
+    signals[3] *= 1e10
+    order = 4
+    weights, offsets = np.ones((1, 8), dtype=np.complex64), np.arange(8, dtype=np.int32)[None] * 200
+    expected = reference.dmas(signals[:, None], offsets, weights, order, 200)[0]
+    out = np.empty((1, 200), dtype=np.float32)
+    kernel_set.combine_dmas(signals[:, None], offsets, weights, order, out)
+    z = (signals / np.abs(signals) ** np.float32(1 - 1 / order)).astype(np.complex64)
+    sums = [(z**k).sum(axis=0) for k in range(order + 1)]
+    newton = [np.ones(200, dtype=np.complex64)]
+    for k in range(1, order + 1):
+        newton.append(sum((-1) ** (i - 1) * newton[k - i] * sums[i] for i in range(1, k + 1)) / np.float32(k))
+    assert newton[-1].dtype == np.complex64
+    assert np.median(np.abs(np.abs(newton[-1]) / expected - 1)) > 0.1
+    assert np.abs(out[0] / expected - 1).max() < 1e-4
+
+
+def test_capon_of_snapshots_that_are_nearly_equal(kernel_set):
+    """The covariance of few snapshots is singular, and single precision loses what is left under the fraction."""
+    loading, random, signals = 1e-6, np.random.default_rng(5), np.ones((16, 5), dtype=np.complex64)
+    signals += (3e-4 * random.standard_normal((16, 5))).astype(np.float32)
+    covariance = signals.astype(complex) @ signals.astype(complex).conj().T
+    assert np.linalg.cond(covariance) > 1e15
+    weights, offsets = np.ones((1, 16), dtype=np.complex64), np.arange(16, dtype=np.int32)[None] * 5
+    expected = reference.capon(signals[:, None], offsets, weights, 5, loading, 5)
+    out = np.empty((1, 5), dtype=np.float32)
+    kernel_set.combine_capon(signals[:, None], offsets, weights, 5, loading, out)
+    np.testing.assert_allclose(out, expected, rtol=1e-5)
+    gram, beams = signals.conj().T @ signals, signals.conj().sum(axis=0)
+    added = np.float32(loading) * np.trace(gram).real / np.float32(16)
+    solved = np.linalg.solve(gram + added * np.eye(5, dtype=np.float32), beams)
+    with np.errstate(divide="ignore"):
+        single = added * np.abs(solved) / np.abs(16 - np.vdot(beams, solved))
+    assert solved.dtype == np.complex64
+    assert np.abs(single / expected[0] - 1).max() > 0.01
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("beamformer", "reach"), [("coherence_factor", 0), ("dmas", 0), ("capon", 2)])
+def test_bad_numbers_stay_where_they_are(kernel_set, beamformer, reach, value):
+    signals = complex_noise(4, 300)
+    signals[2, 100] = value
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy also says so
+        found = combined(kernel_set, beamformer, signals)
+    assert np.flatnonzero(~np.isfinite(found)).tolist() == list(range(100 - reach, 101 + reach))
