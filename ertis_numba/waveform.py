@@ -147,8 +147,8 @@ def decimation_taps(
     """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
 
     A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
-    damped by ``stop_band_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so that the group delay is k
-    samples of the decimated signal exactly.
+    damped by ``stop_band_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so
+    that the group delay is k samples of the decimated signal exactly.
 
     Parameters
     ----------
@@ -188,8 +188,10 @@ def decimation_taps(
 
 def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.float64]:
     stop_band_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
-    beta = 0.1102 * (stop_band_db - 8.7) if stop_band_db > 50 else (
-        0.5842 * max(stop_band_db - 21, 0) ** 0.4 + 0.07886 * max(stop_band_db - 21, 0)
+    beta = (
+        0.1102 * (stop_band_db - 8.7)
+        if stop_band_db > 50
+        else (0.5842 * max(stop_band_db - 21, 0) ** 0.4 + 0.07886 * max(stop_band_db - 21, 0))
     )  # Kaiser's formulae
     position = np.arange(-half, half + 1)
     taps = np.sinc(position / decimation) * np.kaiser(2 * half + 1, beta)
@@ -216,8 +218,7 @@ def whole_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16
     ArgumentError
         There are so many taps that rounding them changes the response by more than -50 dB.
     """
-    dtype = np.int16 if bits == 16 else np.int32
-    limit = np.iinfo(dtype).max
+    limit = np.iinfo(np.int16 if bits == 16 else np.int32).max
     scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # rounding adds up to a half a tap
     whole = np.rint(taps * scale)
     change = np.abs(np.fft.rfft(whole / (whole.sum() or 1.0) - taps, 4 * len(taps))).max()
@@ -227,7 +228,7 @@ def whole_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16
             f"decimation filter of {len(taps)} taps is too long for {bits} bits ({change_db:.0f} dB off); "
             "give a smaller processing.decimation"
         )
-    return np.asarray(whole, dtype=dtype)
+    return np.asarray(whole, np.int16) if bits == 16 else np.asarray(whole, np.int32)
 
 
 def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:

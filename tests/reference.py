@@ -197,3 +197,34 @@ def capon(signals, offsets, weights, n_snapshots, loading, n_ranges):
             w = np.linalg.solve(covariance, np.ones(n_mics))
             image[direction, place] = np.abs((w / w.sum()).conj() @ y[:, place])
     return image
+
+
+def interpolated_beams(signals, offsets, weights, places, tap_weights, rows, n_ranges):
+    """Beams of nodes, and of pairs of them those of all directions: (direction, range) complex128."""
+    nodes = delay_and_sum(signals, offsets, weights, n_ranges)
+    return _of_pairs(nodes, places, tap_weights, rows)
+
+
+def interpolated_whole_beams(tile, offsets, weights, places, tap_weights, rows, n_ranges):
+    """The same from one tile of whole numbers, whose nodes keep their upper 16 bits: (direction, range) complex128.
+
+    Parameters
+    ----------
+    tile : (mic, phase, k, 2) int16
+    weights : (node, term, 2, 2) int16
+    """
+    flat = tile.reshape(-1, 2).astype(np.int64)
+    nodes = np.zeros((len(offsets), n_ranges), dtype=complex)
+    for node, (starts, factors) in enumerate(zip(offsets, weights.astype(np.int64), strict=True)):
+        parts = sum(factor @ flat[start : start + n_ranges].T for start, factor in zip(starts, factors, strict=True))
+        upper = (parts + 2**15) // 2**16
+        nodes[node] = upper[0] + 1j * upper[1]
+    return _of_pairs(nodes, places, tap_weights, rows)
+
+
+def _of_pairs(nodes, places, tap_weights, rows):
+    """Sums of pairs of neighbours, each put into its row: (direction, range) complex128."""
+    beams = np.zeros((len(rows), nodes.shape[1]), dtype=complex)
+    for pair, k in np.ndindex(tap_weights.shape[1:]):
+        beams[rows] += tap_weights[:, pair, k, None].astype(float) * nodes[places[:, pair] + k]
+    return beams

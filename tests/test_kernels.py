@@ -21,8 +21,10 @@ CONTRACTS = {
     "delay_and_sum": _contract.DelayAndSum,
     "envelope": _contract.Envelope,
     "delay_and_sum_envelope": _contract.DelayAndSumEnvelope,
+    "interpolated_beams_envelope": _contract.InterpolatedBeamsEnvelope,
     "quantise_tiles": _contract.QuantiseTiles,
     "delay_and_sum_envelope_int16": _contract.DelayAndSumEnvelopeInt16,
+    "interpolated_beams_envelope_int16": _contract.InterpolatedBeamsEnvelopeInt16,
     "combine_coherence": _contract.CombineCoherence,
     "combine_dmas": _contract.CombineDmas,
     "combine_capon": _contract.CombineCapon,
@@ -141,14 +143,17 @@ def test_remove_group_delay(kernel_set, n_samples, delay, n_out):
     assert (out == expected).all()
 
 
+@pytest.mark.parametrize("taps_type", [np.int16, np.int32])
 @pytest.mark.parametrize("name", WORDS)
 @pytest.mark.parametrize(
     ("factor", "first", "n_outputs", "n_out"),
     [(10, 0, 100, 130), (10, -3, 40, 40), (10, 7, 33, 32 + 33), (1, 3, 1, 1), (7, 90, 60, 64), (10, 5, 0, 9)],
 )
-def test_demodulate_words_is_unpack_decimate_and_group_delay(kernel_set, name, factor, first, n_outputs, n_out):
+def test_demodulate_words_is_unpack_decimate_and_group_delay(
+    kernel_set, name, factor, first, n_outputs, n_out, taps_type
+):
     words, channels = words_of(name)
-    taps = np.rint(32_000 * taps_of(61)).astype(np.int16)
+    taps = np.rint(0.98 * np.iinfo(taps_type).max * taps_of(61).astype(float)).astype(taps_type)
     out = filled(len(channels), n_out)
     kernel_set.demodulate_words(words, channels, taps, np.float32(0.25), factor, first, n_outputs, out)
     signals = reference.unpack_bits(words, channels)
@@ -156,17 +161,19 @@ def test_demodulate_words_is_unpack_decimate_and_group_delay(kernel_set, name, f
     places = (first + np.arange(n_outputs)) * factor + len(taps) // 2
     inside = (places >= 0) & (places < filtered.shape[1])
     expected = np.zeros((len(channels), n_out))
-    expected[:, :n_outputs][:, inside] = 0.25 * filtered[:, places[inside]]
-    assert (out == expected).all()  # sums of integers: not a bit less
+    expected[:, :n_outputs][:, inside] = 0.25 * np.rint(filtered[:, places[inside]])
+    assert (out == expected.astype(np.float32)).all()  # sums of integers: not a bit less
 
 
 @pytest.mark.parametrize("word", [0, 0xFFFF_FFFF])
-def test_demodulate_words_bears_taps_at_the_limit(kernel_set, word):
-    taps = np.array([-1_000, 3_000, 24_767, 3_000, -1_000], dtype=np.int16)
+@pytest.mark.parametrize("taps_type", [np.int16, np.int32])
+def test_demodulate_words_bears_taps_at_the_limit(kernel_set, word, taps_type):
+    limit = np.iinfo(taps_type).max
+    taps = np.array([-1_000, 3_000, limit - 8_000, 3_000, -1_000], dtype=taps_type)
     out = filled(32, 64)
     words = np.full((128, 1), word, dtype=np.uint32)
     kernel_set.demodulate_words(words, np.arange(32, dtype=np.int32), taps, np.float32(1), 1, 10, 64, out)
-    assert (out == (28_767 if word else -28_767)).all()
+    assert (out == np.float32((limit - 4_000) * (1 if word else -1))).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 17), (32, 1009)])
@@ -176,17 +183,18 @@ def test_multiply_spectra(kernel_set, shape):
     assert np.abs(out - spectra.astype(complex) * response).max() < 10 * FLOAT32
 
 
+@pytest.mark.parametrize("own_responses", [False, True])
 @pytest.mark.parametrize(
     ("n_bins", "first_bin", "n_band", "n_phases", "n_out"),
     [(1, 0, 1, 1, 1), (100, 10, 30, 3, 64), (100, 50, 50, 2, 64), (100, 5, 90, 4, 16), (700, 600, 97, 10, 134)],
 )
-def test_multiply_and_fold(kernel_set, n_bins, first_bin, n_band, n_phases, n_out):
-    spectra, responses = complex_noise(3, n_bins), complex_noise(n_phases, n_band, seed=2)
+def test_multiply_and_fold(kernel_set, n_bins, first_bin, n_band, n_phases, n_out, own_responses):
+    spectra, responses = complex_noise(3, n_bins), complex_noise(3 if own_responses else 1, n_phases, n_band, seed=2)
     out = filled(3, n_phases, n_out, dtype=np.complex64)
     kernel_set.multiply_and_fold(spectra, responses, first_bin, out)
     expected = np.zeros((3, n_phases, n_out), dtype=complex)
     for b in range(n_band):
-        expected[:, :, (first_bin + b) % n_out] += spectra[:, first_bin + b, None].astype(complex) * responses[:, b]
+        expected[:, :, (first_bin + b) % n_out] += spectra[:, first_bin + b, None].astype(complex) * responses[:, :, b]
     assert np.abs(out - expected).max() < 10 * FLOAT32
 
 
@@ -197,7 +205,7 @@ def test_delay_and_sum_and_envelope(kernel_set, name):
     beams, energy, fused = filled(*shape, dtype=np.complex64), filled(*shape), filled(*shape)
     kernel_set.delay_and_sum(signals, offsets, weights, beams)
     kernel_set.envelope(beams, energy)
-    kernel_set.delay_and_sum_envelope(signals, offsets, weights, fused)
+    kernel_set.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], fused)
     bound = FLOAT32 * np.abs(expected).max()
     assert np.abs(beams - expected).max() < bound
     assert np.abs(energy - np.abs(expected)).max() < bound
@@ -214,7 +222,7 @@ def test_quantise_tiles(kernel_set, shape):
     kernel_set.quantise_tiles(signals, starts, limit, tiles, scales)
     for tile, start in enumerate(starts):
         part = signals[:, :, start : start + width]
-        largest = max(np.abs(part.real).max(), np.abs(part.imag).max())
+        largest = np.abs(part).max()
         assert scales[tile] == pytest.approx(largest / limit)
         back = (tiles[tile, ..., 0] + 1j * tiles[tile, ..., 1])[:, :, : part.shape[2]] * scales[tile]
         assert np.abs(back - part).max() < 0.75 * largest / limit
@@ -248,7 +256,7 @@ def test_delay_and_sum_envelope_int16(kernel_set, n_ranges, n_mics):
     real[0], imag[0] = largest * 7 // 10, largest * 7 // 10
     weights = np.stack([np.stack([real, -imag], -1), np.stack([imag, real], -1)], -2).astype(np.int16)
     scales, out = random.random(n_tiles).astype(np.float32), filled(5, n_ranges)
-    kernel_set.delay_and_sum_envelope_int16(tiles, scales, starts, offsets, weights, np.float32(0.5), out)
+    kernel_set.delay_and_sum_envelope_int16(tiles, scales, starts, n_ranges, offsets, weights, np.float32(0.5), out)
     for tile, start in enumerate(starts):
         flat = tiles[tile].reshape(-1, 2).astype(float) @ [1, 1j]
         stop = min(start + tile_ranges, n_ranges)
@@ -264,7 +272,7 @@ def test_bad_numbers_stay_where_they_are(kernel_set, value):
     signals[3, :, 100] = value
     out = filled(*shape)
     with np.errstate(invalid="ignore"):  # NumPy also says so
-        kernel_set.delay_and_sum_envelope(signals, offsets, weights, out)
+        kernel_set.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], out)
     touched = offsets[:, 3] % signals.shape[2]
     for direction in range(shape[0]):
         place = 100 - touched[direction]
@@ -278,7 +286,8 @@ def test_pipeline_gives_the_same_bits_every_time(precision):
     if precision == "int16" and not KERNELS["cpu"].tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     settings = cases.SHORT.replace(
-        processing=cases.SHORT.processing.replace(directions="2d:1000", range_m=(0.4, 1.0), precision=precision)
+        processing=cases.SHORT.processing.replace(directions="2d:1000", range_m=(0.4, 1.0)),
+        accuracy=cases.SHORT.accuracy.replace(precision=precision),
     )
     pipeline, measurement = Pipeline(settings), cases.noise(settings)
     assert len({pipeline.process(measurement).energy.tobytes() for _ in range(30)}) == 1
@@ -292,7 +301,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
     for count in range(1, cpu.max_threads + 1):
         with cpu.threads(count):
             energy, demodulated = filled(*shape), filled(len(channels), 300)
-            cpu.delay_and_sum_envelope(signals, offsets, weights, energy)
+            cpu.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], energy)
             cpu.demodulate_words(
                 words, channels, np.arange(-30, 31, dtype=np.int16), np.float32(1), 10, 20, 300, demodulated
             )

@@ -187,8 +187,8 @@ class InterpolatedBeamsEnvelope(Protocol):
     """Beams of few nodes, from those the beams of all directions, and their envelopes.
 
     ``nodes[node, range] = Σ_term weights[node, term] · signals.flat[offsets[node, term] + range]`` and
-    ``out[direction, range] = |Σ_pair,k tap_weights[direction, pair, k] · nodes[places[direction, pair] + k, range]|``
-    for k = 0 and 1.
+    ``out[rows[direction], range] = |Σ_pair,k tap_weights[direction, pair, k] · node|`` with the node
+    ``nodes[places[direction, pair] + k, range]``, for k = 0 and 1.
 
     Parameters
     ----------
@@ -198,6 +198,8 @@ class InterpolatedBeamsEnvelope(Protocol):
     places : (direction, pair) int32
         The lower node of each pair.
     tap_weights : (direction, pair, 2) float32
+    rows : (direction,) int32
+        Where each direction belongs in ``out``: those that share nodes should follow each other here.
     first, stop : int
         Ranges to fill.
     n_blocks : int
@@ -213,6 +215,7 @@ class InterpolatedBeamsEnvelope(Protocol):
         weights: Complex,
         places: Index,
         tap_weights: Real,
+        rows: Index,
         first: int,
         stop: int,
         n_blocks: int,
@@ -288,6 +291,7 @@ class InterpolatedBeamsEnvelopeInt16(Protocol):
         As there, of nodes.
     places : (direction, pair) int32
     tap_weights : (direction, pair, 2) int16
+    rows : (direction,) int32
     weight_scale : float32
         Worth of 1 in the sums over nodes, in units of the tile's scale.
     n_blocks : int
@@ -304,6 +308,7 @@ class InterpolatedBeamsEnvelopeInt16(Protocol):
         weights: Short,
         places: Index,
         tap_weights: Short,
+        rows: Index,
         weight_scale: np.float32,
         n_blocks: int,
         out: Real,

@@ -63,9 +63,11 @@ def demodulate_words(
     signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
     unpack_bits(words[start : start + signals.shape[1]], channels, signals)
     # Sums of whole numbers below 2^24 are exact in float32, in whatever order; those of longer taps in float64.
-    exact = np.float32 if taps.dtype == np.int16 else np.float64
-    filtered = _filtered(signals.astype(exact), taps.astype(exact), factor, first * factor - half - start, n_outputs)
-    out[:, :n_outputs] = filtered
+    begin = first * factor - half - start
+    if taps.dtype == np.int16:
+        out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, begin, n_outputs)
+    else:
+        out[:, :n_outputs] = _filtered(signals.astype(np.float64), taps.astype(np.float64), factor, begin, n_outputs)
     out *= scale
     out[:, n_outputs:] = 0
 
@@ -137,6 +139,7 @@ def interpolated_beams_envelope(
     weights: Complex,
     places: Index,
     tap_weights: Real,
+    rows: Index,
     first: int,
     stop: int,
     n_blocks: int,  # noqa: ARG001
@@ -149,7 +152,7 @@ def interpolated_beams_envelope(
     for direction, pairs in enumerate(places):
         near = np.stack([pairs, pairs + 1], axis=1).reshape(-1)
         beam = tap_weights[direction].reshape(-1) @ nodes[near].view(np.float32)
-        np.abs(beam.view(np.complex64), out=out[direction, first:stop])
+        np.abs(beam.view(np.complex64), out=out[rows[direction], first:stop])
 
 
 def quantise_tiles(signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None:
@@ -191,6 +194,7 @@ def interpolated_beams_envelope_int16(
     weights: Short,
     places: Index,
     tap_weights: Short,
+    rows: Index,
     weight_scale: np.float32,
     n_blocks: int,  # noqa: ARG001
     out: Real,
@@ -203,7 +207,7 @@ def interpolated_beams_envelope_int16(
         for direction, pairs in enumerate(places):
             near = nodes[np.stack([pairs, pairs + 1], axis=1)]  # (pair, 2, part, range)
             parts = np.einsum("pktr,pk->tr", near, tap_weights[direction].astype(np.int32))[:, :n_ranges]
-            out[direction, start : start + n_ranges] = _level(parts, scales[tile] * weight_scale)
+            out[rows[direction], start : start + n_ranges] = _level(parts, scales[tile] * weight_scale)
 
 
 def _whole_beam(tile: Short, offsets: Index, weights: Short) -> NDArray[np.int32]:

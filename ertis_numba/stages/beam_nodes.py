@@ -55,7 +55,7 @@ class Aperture:
     @property
     def n_axes(self) -> int:
         """In how many axes the array extends, 0 to 3."""
-        return self.positions_m.shape[1]
+        return int(self.positions_m.shape[1])
 
     def delays_s(
         self, points: NDArray[np.float64], *, sound_speed_m_s: float, range_m: float = math.inf
@@ -109,9 +109,12 @@ class BeamNodes:
         Sum of a beam's squared weights, the mean over directions.
     points : (node, axis) float64
         In the array's plane.
+    rows : (direction,) int32
+        The directions in the order in which they are computed: those that share nodes one after the other.
     places : (direction, pair) int32
-        Lower node of each pair; the other one is the next.
+        Lower node of each pair, in that order; the other one is the next.
     weights : (direction, pair, 2) float64
+        In that order.
     frequency_hz, errors : (wave,) float64
         Power of the error by that of the beam at some frequencies, the mean over uncorrelated microphones and over
         directions.
@@ -159,8 +162,11 @@ class BeamNodes:
         nodes = _around(lowest, n_taps)
         _, one, index = np.unique(_numbers(nodes).reshape(-1), return_index=True, return_inverse=True)
         self.points = nodes.reshape(-1, aperture.n_axes)[one] * spacing
-        self.places = np.ascontiguousarray(index.reshape(len(lowest), -1, 2)[:, :, 0]).astype(np.int32)
-        self.weights = np.ascontiguousarray(found).reshape(len(lowest), -1, 2)
+        places = index.reshape(len(lowest), -1, 2)[:, :, 0]
+        order = np.argsort(places[:, 0], kind="stable")  # who shares nodes finds them in the first cache level
+        self.rows = order.astype(np.int32)
+        self.places = np.ascontiguousarray(places[order], np.int32)
+        self.weights = np.ascontiguousarray(found[order]).reshape(len(lowest), -1, 2)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain of each microphone that goes with the weights: (mic, frequency) complex128."""

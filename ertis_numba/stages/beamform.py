@@ -70,7 +70,7 @@ def beamform(
     if precision == "float32":
         return BeamformFloat32(kernels, window, zones, nodes, threads=threads)
     require_int16(kernels)
-    return BeamformInt16(kernels, window, zones, nodes, n_phases=n_phases, threads=threads)
+    return BeamformInt16(kernels, zones, nodes, n_phases=n_phases, threads=threads)
 
 
 class BeamformFloat32:
@@ -97,7 +97,12 @@ class BeamformFloat32:
     ) -> None:
         self._kernels, self._nodes = kernels, nodes
         self._zones = [
-            (zone.first, zone.stop, zone.table.offsets(window.n_outputs), np.ascontiguousarray(zone.table.weights, np.complex64))
+            (
+                zone.first,
+                zone.stop,
+                zone.table.offsets(window.n_outputs),
+                np.ascontiguousarray(zone.table.weights, np.complex64),
+            )
             for zone in zones
         ]
         if nodes is not None:
@@ -125,6 +130,7 @@ class BeamformFloat32:
                     weights,
                     self._nodes.places,
                     self._tap_weights,
+                    self._nodes.rows,
                     first,
                     stop,
                     self._n_blocks,
@@ -162,7 +168,6 @@ class BeamformInt16:
     def __init__(
         self,
         kernels: KernelSet,
-        window: TimeWindow,
         zones: Sequence[Zone],
         nodes: BeamNodes | None,
         *,
@@ -226,6 +231,7 @@ class BeamformInt16:
                     zone.weights,
                     self._nodes.places,
                     self._tap_weights,
+                    self._nodes.rows,
                     self._weight_scale,
                     self._n_blocks,
                     out,

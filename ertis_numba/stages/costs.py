@@ -1,5 +1,6 @@
 """What each stage takes on this machine: measured once by running its kernels, and kept."""
 
+import functools
 import hashlib
 import json
 import logging
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.kernels import KernelSet
@@ -27,6 +29,7 @@ _RUNS = 5  # the best of which counts
 _FLOOR_S = 2e-4  # runs shorter than this are repeated
 _MICS, _RANGES = 32, 960
 _FEW_PHASES, _MANY_PHASES = 1, 12
+_FEW_PAIRS, _MANY_PAIRS = 2, 10
 _UNITS = (
     "call",
     "demodulate_16",
@@ -170,43 +173,44 @@ def measure(kernels: KernelSet, threads: int) -> Costs:
     return Costs({name: seconds.get(name, 1.0) for name in _UNITS})  # a second each where a device cannot
 
 
-def _best(run: Callable[[], object]) -> float:
-    """Return the least time of some runs."""
-    run()
+def _best(kernel: Callable[..., object], *arguments: object) -> float:
+    """Return the least time of some runs, in seconds."""
+    kernel(*arguments)
     start_s = time.perf_counter()
-    run()
+    kernel(*arguments)
     count = max(1, math.ceil(_FLOOR_S / max(time.perf_counter() - start_s, 1e-7)))
     times_s = []
     for _ in range(_RUNS):
         start_s = time.perf_counter()
         for _ in range(count):
-            run()
+            kernel(*arguments)
         times_s.append((time.perf_counter() - start_s) / count)
     return min(times_s)
 
 
 def _front(kernels: KernelSet, random: np.random.Generator, threads: int) -> dict[str, float]:
-    n_samples, n_taps, factor, n_fft, n_out, n_bins = 4000, 101, 20, 6000, 1200, 1000
+    """Return the costs up to the analytic signals."""
+    n_samples, n_taps, factor, n_fft, n_phases, n_out, n_bins = 4000, 101, 20, 6000, 4, 1200, 1000
     words = random.integers(0, 2**32, (n_samples * factor + n_taps, 1), dtype=np.uint32)
     channels = np.arange(_MICS, dtype=np.int32)
     signals = np.zeros((_MICS, n_fft), dtype=np.float32)
-    tiny, tiny_out = np.zeros((2, 4), dtype=np.complex64), np.zeros((2, 4), dtype=np.float32)
-    found = {"call": _best(lambda: kernels.envelope(tiny, tiny_out))}
+    tiny = np.zeros((2, 4), dtype=np.complex64)
+    found = {"call": _best(kernels.envelope, tiny, np.zeros((2, 4), dtype=np.float32))}
     for bits, dtype in ((16, np.int16), (32, np.int32)):
         taps = np.arange(n_taps).astype(dtype)
         took_s = _best(
-            lambda taps=taps: kernels.demodulate_words(
-                words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals
-            )
+            kernels.demodulate_words, words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals
         )
         found[f"demodulate_{bits}"] = took_s / (n_samples * n_taps)
     transforms = fft.load(kernels.device)
-    found["forward"] = _best(lambda: transforms.forward(signals, threads=threads)) / _MICS / _transform(n_fft)
-    spectra = transforms.forward(signals, threads=threads)
-    out = np.zeros((_MICS, 4, n_out), dtype=np.complex64)
-    responses = np.ones((_MICS, 4, n_bins), dtype=np.complex64)
-    found["fold"] = _best(lambda: kernels.multiply_and_fold(spectra, responses, 300, out)) / (_MICS * 4 * n_bins)
-    found["inverse"] = _best(lambda: transforms.inverse(out, threads=threads)) / (_MICS * 4) / _transform(n_out)
+    forward = functools.partial(transforms.forward, threads=threads)
+    found["forward"] = _best(forward, signals) / _MICS / _transform(n_fft)
+    out = np.zeros((_MICS, n_phases, n_out), dtype=np.complex64)
+    responses = np.ones((_MICS, n_phases, n_bins), dtype=np.complex64)
+    took_s = _best(kernels.multiply_and_fold, forward(signals), responses, 300, out)
+    found["fold"] = took_s / (_MICS * n_phases * n_bins)
+    inverse = functools.partial(transforms.inverse, threads=threads)
+    found["inverse"] = _best(inverse, out) / (_MICS * n_phases) / _transform(n_out)
     return found
 
 
@@ -219,64 +223,67 @@ def _sums(kernels: KernelSet, random: np.random.Generator, n_beams: int) -> dict
         signals = random.standard_normal((_MICS, n_phases, 2 * (_RANGES + 40)), dtype=np.float32).view(np.complex64)
         rows = np.arange(_MICS) * n_phases + random.integers(0, n_phases, (n_beams, _MICS))
         samples = random.integers(0, 16, (n_beams, _MICS))
-        weights = np.full((n_beams, _MICS), 0.01 + 0.02j, dtype=np.complex64)
         offsets = (rows * signals.shape[2] + samples).astype(np.int32)
-        found[f"sum_float32_{name}"] = (
-            _best(lambda: kernels.delay_and_sum_envelope(signals, offsets, weights, 0, _RANGES, energy)) / points
-        )
-        if not kernels.tile_ranges:
-            continue
-        width = kernels.tile_ranges + 20
-        starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
-        tiles = np.zeros((len(starts), _MICS, n_phases, width, 2), dtype=np.int16)
-        scales = np.zeros(len(starts), dtype=np.float32)
-        took_s = _best(lambda: kernels.quantise_tiles(signals, starts, np.float32(8000), tiles, scales))
-        found["quantise"] = took_s / (len(starts) * _MICS * n_phases * width)
-        places, pairs = (rows * width + samples).astype(np.int32), np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
-        took_s = _best(
-            lambda: kernels.delay_and_sum_envelope_int16(
-                tiles, scales, starts, _RANGES, places, pairs, np.float32(1), energy
+        weights = np.full((n_beams, _MICS), 0.01 + 0.02j, dtype=np.complex64)
+        took_s = _best(kernels.delay_and_sum_envelope, signals, offsets, weights, 0, _RANGES, energy)
+        found[f"sum_float32_{name}"] = took_s / points
+        if kernels.tile_ranges:
+            tiles, scales, starts = _tiles(kernels, _MICS, n_phases)
+            took_s = _best(kernels.quantise_tiles, signals, starts, np.float32(8000), tiles, scales)
+            found["quantise"] = took_s / (tiles.size / 2)
+            places = (rows * tiles.shape[3] + samples).astype(np.int32)
+            whole = np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
+            took_s = _best(
+                kernels.delay_and_sum_envelope_int16,
+                *(tiles, scales, starts, _RANGES, places, whole, np.float32(1), energy),
             )
-        )
-        found[f"sum_int16_{name}"] = took_s / points
+            found[f"sum_int16_{name}"] = took_s / points
     return found
 
 
 def _pairs(kernels: KernelSet, random: np.random.Generator, n_directions: int) -> dict[str, float]:
     """Return the cost of a pair of nodes at one range, and of one place in the image."""
-    n_nodes = 400
+    n_nodes, points = 400, n_directions * _RANGES
     energy = np.empty((n_directions, _RANGES), dtype=np.float32)
-    signals = random.standard_normal((1, 1, 2 * (_RANGES + 40)), dtype=np.float32).view(np.complex64)
-    offsets, weights = np.zeros((n_nodes, 1), dtype=np.int32), np.ones((n_nodes, 1), dtype=np.complex64)
-    points = n_directions * _RANGES
+    rows = np.arange(n_directions, dtype=np.int32)
+    offsets = np.zeros((n_nodes, 1), dtype=np.int32)
+    first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # some directions share all nodes
+    took_s: dict[str, list[float]] = {"float32": [], "int16": []}
+    for n_pairs in (_FEW_PAIRS, _MANY_PAIRS):
+        places = (first[:, None] + 8 * np.arange(n_pairs)).astype(np.int32)
+        signals = random.standard_normal((1, 1, 2 * (_RANGES + 40)), dtype=np.float32).view(np.complex64)
+        weights = np.ones((n_nodes, 1), dtype=np.complex64)
+        taps = np.full((n_directions, n_pairs, 2), 0.1, dtype=np.float32)
+        took_s["float32"].append(
+            _best(
+                kernels.interpolated_beams_envelope,
+                *(signals, offsets, weights, places, taps, rows, 0, _RANGES, 1, energy),
+            )
+        )
+        if kernels.tile_ranges:
+            tiles, scales, starts = _tiles(kernels, 1, 1)
+            whole = np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
+            whole_taps = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
+            took_s["int16"].append(
+                _best(
+                    kernels.interpolated_beams_envelope_int16,
+                    *(tiles, scales, starts, _RANGES, offsets, whole, places, whole_taps, rows, np.float32(1), 1),
+                    energy,
+                )
+            )
     found: dict[str, float] = {}
-    for precision in ("float32", "int16") if kernels.tile_ranges else ("float32",):
-        took_s = []
-        for n_pairs in (2, 10):
-            first = np.sort(random.integers(0, n_nodes - 80, n_directions))
-            places = (first[:, None] + 8 * np.arange(n_pairs)).astype(np.int32)
-            if precision == "float32":
-                taps = np.full((n_directions, n_pairs, 2), 0.1, dtype=np.float32)
-                took_s.append(
-                    _best(
-                        lambda places=places, taps=taps: kernels.interpolated_beams_envelope(
-                            signals, offsets, weights, places, taps, 0, _RANGES, 1, energy
-                        )
-                    )
-                )
-            else:
-                width = kernels.tile_ranges + 20
-                starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
-                tiles = np.ones((len(starts), 1, 1, width, 2), dtype=np.int16)
-                scales, pairs = np.ones(len(starts), dtype=np.float32), np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
-                whole = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
-                took_s.append(
-                    _best(
-                        lambda places=places, whole=whole: kernels.interpolated_beams_envelope_int16(
-                            tiles, scales, starts, _RANGES, offsets, pairs, places, whole, np.float32(1), 1, energy
-                        )
-                    )
-                )
-        found[f"pair_{precision}"] = max((took_s[1] - took_s[0]) / 8, 1e-3 * took_s[1]) / points
-        found["image"] = max(took_s[0] / points - 2 * found[f"pair_{precision}"], 1e-12)
+    for precision, times_s in took_s.items():
+        if times_s:
+            few_s, many_s = (time_s / points for time_s in times_s)
+            pair = found[f"pair_{precision}"] = max((many_s - few_s) / (_MANY_PAIRS - _FEW_PAIRS), 1e-3 * many_s)
+            found["image"] = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
     return found
+
+
+def _tiles(
+    kernels: KernelSet, n_mics: int, n_phases: int
+) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int32]]:
+    """Return tiles of ones, their scales and where they start."""
+    starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
+    tiles = np.ones((len(starts), n_mics, n_phases, kernels.tile_ranges + 20, 2), dtype=np.int16)
+    return tiles, np.ones(len(starts), dtype=np.float32), starts

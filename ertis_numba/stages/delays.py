@@ -90,5 +90,3 @@ class Zone:
     first: int
     stop: int
     table: DelayTable
-
-

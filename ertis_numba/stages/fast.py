@@ -82,9 +82,7 @@ class FastChain:
         layout = microphones(settings.array)
         self.grid: Grid = direction_grid(settings.processing)
         speed_m_s = sound_speed_m_s(settings.air)
-        aperture = Aperture.of(
-            layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
-        )
+        aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad))
         spectrum = spectrum_of(settings)
         n_phases = plan.oversampling or 1
         step_s = 1 / (settings.output_rate_hz * n_phases)

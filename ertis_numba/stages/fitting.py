@@ -19,6 +19,7 @@ transforms using min-max interpolation, IEEE Trans. Signal Process. 51, 2003.)
 import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import threadpoolctl
@@ -54,8 +55,9 @@ class Spectrum:
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """Keep BLAS to one thread inside: its matrices here are small, and on busy cores its threads wait for each other."""
-    return threadpoolctl.threadpool_limits(1, user_api="blas")
+    """Keep BLAS to one thread inside: matrices here are small, and on busy cores its threads wait for each other."""
+    limits: AbstractContextManager[object] = threadpoolctl.threadpool_limits(1, user_api="blas")
+    return limits
 
 
 def fit(
@@ -83,7 +85,7 @@ def fit(
     gain : (wave,) complex128
     weights : (tap, target) complex128
     """
-    gain = np.ones(len(taps), dtype=np.complex128)
+    gain: NDArray[Any] = np.ones(len(taps), dtype=np.complex128)
     for _ in range(_TURNS):
         weights = weights_of(gain, taps, targets, power, real=real, least_power=least_power)
         made = taps @ weights
@@ -105,7 +107,7 @@ def weights_of(
     left = np.conj(gained.T) * power
     gram, right = left @ gained, left @ targets
     if real:
-        gram, right = gram.real + 0j, right.real + 0j
+        gram, right = gram.real.astype(np.complex128), right.real.astype(np.complex128)
     gram += least_power * np.trace(gram).real / len(gram) * np.eye(len(gram))
     return np.asarray(np.linalg.solve(gram, right))
 

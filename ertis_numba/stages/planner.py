@@ -133,9 +133,7 @@ class Planner:
         16 bits are asked for, and the device has no dot product for them.
     """
 
-    def __init__(
-        self, settings: Settings, kernels: KernelSet, *, threads: int, texture: Texture | None = None
-    ) -> None:
+    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, texture: Texture | None = None) -> None:
         self._settings, self._kernels = settings, kernels
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
@@ -144,9 +142,7 @@ class Planner:
         self._spectrum = spectrum_of(settings)
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self._n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
-        self._aperture = Aperture.of(
-            layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-        )
+        self._aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
         self._n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
         self._window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)

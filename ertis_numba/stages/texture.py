@@ -71,7 +71,7 @@ def _white_power(settings: Settings) -> float:
     """Return the power of white bits after the matched filter."""
     n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * settings.signal_rate_hz + 256))
     matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=settings.signal_rate_hz)
-    return float(np.sum(np.abs(matched.values) ** 2)) / n_fft / settings.decimation
+    return float(np.sum(np.abs(matched.values) ** 2) / n_fft / settings.decimation)
 
 
 def _noise(words: NDArray[np.unsignedinteger[Any]], settings: Settings, kernels: KernelSet) -> NDArray[np.float64]:

@@ -43,9 +43,7 @@ class TimeWindow:
     start_s: float
 
 
-def time_window(
-    settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0
-) -> TimeWindow:
+def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0) -> TimeWindow:
     """Return the window for beams whose delays stay within ``± largest_delay_s``.
 
     ``n_taps`` is the length of the decimation filter, which lets the record reach over its ends.

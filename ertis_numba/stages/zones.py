@@ -1,16 +1,13 @@
 """Range zones: spherical wavefronts by delays that hold for a stretch of ranges."""
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["bend", "zone_edges"]
+__all__ = ["zone_edges"]
 
 _NEAREST_M = 1e-3  # what stands for range 0, where a wavefront has no curvature to speak of
-
-
-def bend(range_m: float) -> float:
-    """Return the curvature of a wavefront from ``range_m``: 1/m."""
-    return 1 / max(range_m, _NEAREST_M)
 
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
@@ -35,7 +32,4 @@ def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int,
     span = bends[0] - bends[-1]
     zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)
     edges = [0, *(np.flatnonzero(np.diff(np.minimum(zone, count - 1))) + 1).tolist(), len(bends)]
-    return [
-        (first, stop, float(2 / (bends[first] + bends[stop - 1])))
-        for first, stop in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    return [(first, stop, float(2 / (bends[first] + bends[stop - 1]))) for first, stop in itertools.pairwise(edges)]

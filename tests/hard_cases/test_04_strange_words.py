@@ -53,17 +53,17 @@ def require_echo(image, changed_db, abs_db):
     assert level_db(image) - level_db(image_of(echo_words(SETTINGS, **ECHO))) == pytest.approx(changed_db, abs=abs_db)
 
 
-@pytest.mark.parametrize(("method", "largest_db"), [("fast", -110), ("paper", -180)])
+@pytest.mark.parametrize(("method", "largest_db"), [("fast", -130), ("paper", -180)])
 @pytest.mark.parametrize("name", SILENT)
 def test_words_without_sound_give_nothing(name, method, largest_db):
-    """-114 dB of full scale at the most where the record is whole: offset and clock lie far out of the band."""
+    """-146 dB of full scale at the most where the record is whole: offset and clock lie far out of the band."""
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
     assert level_db(image_of(SILENT[name], settings)) < largest_db
 
 
-@pytest.mark.parametrize(("name", "largest_db"), [("all zero", -44), ("all one", -44), ("alternating", -78)])
+@pytest.mark.parametrize(("name", "largest_db"), [("all zero", -70), ("all one", -70), ("alternating", -100)])
 def test_the_step_at_the_beginning_of_the_record_is_all_there_is(name, largest_db):
-    """A constant begins at sample 0, a step of full scale: -45 dB there, and nothing of it beyond."""
+    """A constant begins at sample 0, a step of full scale: -79 dB there, -124 dB beyond 0.5 m."""
     image = image_of(SILENT[name], SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.0, 1.0))))
     assert level_db(image) < largest_db
     assert 20 * np.log10(image.energy[:, image.range_m > 0.5].max()) < -110

@@ -103,9 +103,9 @@ def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("precision", "bound_db"), [("float32", -130), ("int16", -95)])
+@pytest.mark.parametrize(("precision", "bound_db"), [("float32", -120), ("int16", -95)])
 def test_devices_agree(name, precision, bound_db):
-    """Numba and NumPy add up in other orders: -135 dB in float32 and -99.7 dB through 16 bits at the worst."""
+    """Numba and NumPy add up in other orders: -131 dB in float32 and -106 dB through 16 bits at the worst."""
     settings = tuned(CASES[name], precision=precision)
     if precision == "int16" and not all(kernels.load(device).tile_ranges for device in kernels.DEVICES):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")

@@ -108,7 +108,7 @@ class Dot16:
         return builder.fadd(root, builder.fmul(rest, builder.fmul(inverse, half)))
 
     def store_upper_halves(self, target):
-        """Write the upper 16 bits of the sums, rounded, from ``target`` (int16*) on: real parts, then imaginary ones."""
+        """Write the upper 16 bits of the sums, rounded, from ``target`` (int16*) on: real, then imaginary parts."""
         builder = self._builder
         half, shift = (ir.Constant(SUMS, [number] * LANES) for number in (1 << 15, 16))
         for part in (0, 1):

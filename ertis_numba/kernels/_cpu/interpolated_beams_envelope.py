@@ -61,7 +61,7 @@ def _interpolate_tile(typing_context, rows, skipped, places, weights, direction,
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, first, stop, n_blocks, out):
+def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, rows, first, stop, n_blocks, out):
     """See `InterpolatedBeamsEnvelope`."""
     n_directions, n_ranges = out.shape
     n_tiles = (stop - first + TILE - 1) // TILE
@@ -74,14 +74,15 @@ def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, 
         if begin == end:
             continue
         lowest = places[begin:end].min()
-        rows = np.empty((places[begin:end].max() + 2 - lowest, 2, TILE), np.float32)
-        for row in range(rows.shape[0]):
-            _node_tile(signals, offsets, weights, lowest + row, at, rows, row)
+        nodes = np.empty((places[begin:end].max() + 2 - lowest, 2, TILE), np.float32)
+        for node in range(nodes.shape[0]):
+            _node_tile(signals, offsets, weights, lowest + node, at, nodes, node)
         short = np.empty((1, TILE), np.float32)
         for direction in range(begin, end):
             if at < first or at + TILE > stop:
                 begin_range, end_range = max(first, at), min(stop, at + TILE)
-                _interpolate_tile(rows, lowest, places, tap_weights, direction, short, 0)
-                out[direction, begin_range:end_range] = short[0, begin_range - at : end_range - at]
+                _interpolate_tile(nodes, lowest, places, tap_weights, direction, short, 0)
+                out[rows[direction], begin_range:end_range] = short[0, begin_range - at : end_range - at]
             else:
-                _interpolate_tile(rows, lowest, places, tap_weights, direction, out, direction * n_ranges + at)
+                place = rows[direction] * np.int64(n_ranges) + at
+                _interpolate_tile(nodes, lowest, places, tap_weights, direction, out, place)

@@ -20,7 +20,7 @@ _LINE = 64  # bytes of a cache line
 
 @intrinsic
 def _address(typing_context, array):
-    """Address of an array's first number. (``array.ctypes.data`` would keep callers out of Numba's cache.)"""
+    """Address of an array's first number; ``array.ctypes.data`` would keep callers out of Numba's cache."""
     signature = types.intp(array)
 
     def codegen(context, builder, signature, arguments):
@@ -97,17 +97,17 @@ def _node_pairs(tiles, tile, offsets, weights, first, last):
     raw = np.empty((last - first + 1) * 2 * RANGES + _LINE // 4, np.int32)
     ahead = (-_address(raw) % _LINE) // 4
     pairs = raw[ahead : ahead + (last - first + 1) * 2 * RANGES].reshape(last - first + 1, 2, RANGES)
-    rows = np.empty((2, 2 * RANGES), np.int16)
+    both = np.empty((2, 2 * RANGES), np.int16)
     for node in range(first, last + 1):
-        _node_tile(tiles, tile, offsets, weights, node, rows, node % 2)
+        _node_tile(tiles, tile, offsets, weights, node, both, node % 2)
         if node > first:
-            _pair_rows(rows, 1 - node % 2, pairs, node - 1 - first)
+            _pair_rows(both, 1 - node % 2, pairs, node - 1 - first)
     return pairs
 
 
 @njit(parallel=True, nogil=True, cache=True)
 def interpolated_beams_envelope_int16(
-    tiles, scales, starts, stop, offsets, weights, places, tap_weights, weight_scale, n_blocks, out
+    tiles, scales, starts, stop, offsets, weights, places, tap_weights, rows, weight_scale, n_blocks, out
 ):
     """See `InterpolatedBeamsEnvelopeInt16`."""
     n_directions, n_ranges = out.shape
@@ -127,7 +127,7 @@ def interpolated_beams_envelope_int16(
         for direction in range(begin, end):
             if starts[tile] + RANGES > stop:
                 _interpolate_tile(pairs, first, places, tap_weights, direction, scale, short, 0)
-                out[direction, starts[tile] : stop] = short[0, : stop - starts[tile]]
+                out[rows[direction], starts[tile] : stop] = short[0, : stop - starts[tile]]
             else:
-                place = direction * n_ranges + starts[tile]
+                place = rows[direction] * np.int64(n_ranges) + starts[tile]
                 _interpolate_tile(pairs, first, places, tap_weights, direction, scale, out, place)

@@ -1,0 +1,100 @@
+"""Products per place of an image: summed directly, from nodes of the whole array, and from those of sub-arrays.
+
+Nothing is timed here. What is counted is the least number of real products among the nodes that keep an error of
+-36 dB, for arrays that do not exist as well.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.stages.accuracy import decibels
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.fast import spectrum_of
+from ertis_numba.stages.fitting import one_thread
+
+__all__ = ["CASES", "run"]
+
+CASES = ((32, "3000"), (32, "3d:30000"), (256, "3000"), (256, "3d:30000"), (1024, "3d:30000"))
+_PARTS = (1, 2, 4, 8)
+_ERROR_DB = -36.0
+_DELAY_TAPS = 2
+_COMPLEX, _REAL = 4, 2  # real products of a complex number by a complex weight, and by a real one
+_NODES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0)}  # densities by taps
+
+
+def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:  # noqa: ARG001 - there is nothing to repeat
+    """Return the counts; arrays larger than eRTIS have its density of microphones, placed at random."""
+    settings = Settings.from_preset("default_25_50")
+    rows = []
+    for n_mics, directions in CASES:
+        say(f"{n_mics} microphones, {directions} directions")
+        grid = direction_grid(Processing(directions=directions))
+        units = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+        positions_m = _array(settings, n_mics)
+        rows.append(
+            {
+                "microphones": n_mics,
+                "directions": len(grid),
+                "direct": n_mics * _DELAY_TAPS * _COMPLEX,
+                "parts": {str(n): _fewest(settings, _cut(positions_m, n), units) for n in _PARTS},
+            }
+        )
+    return {"error_db": _ERROR_DB, "delay_taps": _DELAY_TAPS, "rows": rows}
+
+
+def _array(settings: Settings, n_mics: int) -> NDArray[np.float64]:
+    own_m = microphones(settings.array).enabled_positions_m
+    if n_mics == len(own_m):
+        return own_m
+    half_m = np.ptp(own_m, axis=0) / 2 * np.sqrt(n_mics / len(own_m))
+    return np.random.default_rng(1).uniform(-half_m, half_m, (n_mics, 3))
+
+
+def _cut(positions_m: NDArray[np.float64], n_parts: int) -> list[NDArray[np.float64]]:
+    """Return sub-arrays of as many microphones each, cut across the longer side."""
+    parts = [positions_m]
+    while len(parts) < n_parts:
+        parts = [half for part in parts for half in _halves(part)]
+    return parts
+
+
+def _halves(part_m: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    order = np.argsort(part_m[:, np.argmax(np.ptp(part_m, axis=0))])
+    yield part_m[order[: len(order) // 2]]
+    yield part_m[order[len(order) // 2 :]]
+
+
+def _fewest(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray[np.float64]) -> int | None:
+    """Return the least number of products per place that keeps the error, None if no nodes do."""
+    counts = []
+    for n_taps, densities in _NODES.items():
+        for density in densities:
+            node_products = [_node_products(settings, part, units, n_taps, density) for part in parts]
+            if None in node_products:
+                continue
+            near = n_taps**2
+            # Beams of sub-arrays are delayed for the second sum, as signals are for the first.
+            second = near * _REAL if len(parts) == 1 else len(parts) * near * _DELAY_TAPS * _COMPLEX
+            counts.append(round(sum(filter(None, node_products)) / len(units)) + second)
+            break  # denser ones cost more
+    return min(counts, default=None)
+
+
+def _node_products(
+    settings: Settings, part_m: NDArray[np.float64], units: NDArray[np.float64], n_taps: int, density: float
+) -> int | None:
+    """Return the products of the beams of a sub-array's nodes at one range, None if they err too much."""
+    aperture = Aperture.of(part_m - part_m.mean(axis=0), units)
+    options = {"high_hz": settings.call.high_frequency_hz, "sound_speed_m_s": sound_speed_m_s(settings.air)}
+    with one_thread():
+        nodes = BeamNodes(aperture, spectrum_of(settings), n_taps=n_taps, density=density, estimate=True, **options)
+    if decibels(float(np.mean(nodes.errors))) > _ERROR_DB:
+        return None
+    count = aperture.count_nodes(aperture.spacing(density, **options), n_taps)
+    return count * len(part_m) * _DELAY_TAPS * _COMPLEX

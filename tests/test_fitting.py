@@ -1,0 +1,159 @@
+"""Fitted weights: they err no more than others, as much as they say, and less with more samples to choose from."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from ertis_numba.settings import INTERPOLATIONS, Call
+from ertis_numba.stages.fitting import DelayFit, Spectrum, fit, weights_of
+from ertis_numba.waveform import matched_spectrum
+
+RATE_HZ = 45_000.0  # of the default ranges
+FLOOR = 1e-12  # power by which the fit is regularised
+calls = st.builds(
+    Call,
+    start_frequency_hz=st.floats(30e3, 90e3),
+    stop_frequency_hz=st.floats(10e3, 29e3),
+    duration_s=st.floats(3e-4, 5e-3),
+    ramp_fraction=st.floats(0, 0.5),
+)
+steps_s = st.floats(10_000.0, 3e6).map(lambda rate_hz: 1 / rate_hz)
+
+
+def spectrum_of(call):
+    return Spectrum(*matched_spectrum(call, n_waves=40))
+
+
+DEFAULT = spectrum_of(Call())
+
+
+def power_of(made):
+    """What a fit errs by in all."""
+    return float((made.errors + made.biases) @ DEFAULT.power)
+
+
+def errors_db(interpolation, n_taps, oversampling):
+    return 10 * np.log10(power_of(DelayFit(interpolation, n_taps, 1 / (RATE_HZ * oversampling), DEFAULT)))
+
+
+@settings(max_examples=40, deadline=None)
+@given(call=calls, step_s=steps_s, other=st.sampled_from(["nearest", "carrier", "linear", "cubic"]))
+def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, step_s, other):
+    spectrum = spectrum_of(call)
+    errors = {}
+    for interpolation in ("fitted", other):
+        made = DelayFit(interpolation, INTERPOLATIONS[other], step_s, spectrum)
+        errors[interpolation] = float((made.errors + made.biases) @ spectrum.power)
+    assert errors["fitted"] <= errors[other] * (1 + 1e-9) + FLOOR
+
+
+@settings(max_examples=40, deadline=None)
+@given(call=calls, step_s=steps_s, n_taps=st.integers(1, 5))
+def test_another_tap_never_errs_more(call, step_s, n_taps):
+    spectrum = spectrum_of(call)
+    few, many = (DelayFit("fitted", count, step_s, spectrum) for count in (n_taps, n_taps + 1))
+    assert (many.errors + many.biases) @ spectrum.power <= 1.001 * (few.errors + few.biases) @ spectrum.power + FLOOR
+
+
+@pytest.mark.parametrize("n_taps", [1, 2, 3, 4])
+def test_errors_fall_with_oversampling_by_6_db_for_each_tap(n_taps):
+    """Of a polynomial of that order, and of anything that does as well."""
+    found_db = [errors_db("fitted", n_taps, oversampling) for oversampling in (4, 8, 16)]
+    assert np.diff(found_db) == pytest.approx(-6.02 * n_taps, abs=0.6)
+
+
+def test_one_fitted_tap_is_the_carrier_turned():
+    assert errors_db("fitted", 1, 8) == pytest.approx(errors_db("carrier", 1, 8), abs=0.1)
+    assert errors_db("carrier", 1, 8) < errors_db("nearest", 1, 8) - 10
+
+
+def plain_errors(made, step_s, frequency_hz):
+    """Variance and squared mean of the error at one frequency, over very many delays."""
+    delays_s = (np.arange(4000) + 0.5) / 1000 * step_s
+    first, fractions = made.split(delays_s)
+    weights = made.weights(fractions)
+    taken_s = (first[:, None] + np.arange(made.n_taps)) * step_s
+    gain = made.gain(np.array([frequency_hz]))[0]
+    wrong = gain * np.sum(weights * np.exp(2j * np.pi * frequency_hz * (taken_s - delays_s[:, None])), axis=1) - 1
+    # Turned to the delayed sample's own phase, errors would be others than the fit's, which are to a kept sample's.
+    wrong *= np.exp(2j * np.pi * frequency_hz * fractions * step_s)
+    return np.var(wrong), np.abs(np.mean(wrong)) ** 2
+
+
+@pytest.mark.parametrize(("interpolation", "n_taps"), [("fitted", n) for n in range(1, 6)] + [
+    ("nearest", None), ("carrier", None), ("linear", None), ("cubic", None)])
+@pytest.mark.parametrize("oversampling", [1, 3, 10])
+def test_errors_are_those_of_a_plain_evaluation(interpolation, n_taps, oversampling):
+    step_s = 1 / (RATE_HZ * oversampling)
+    made = DelayFit(interpolation, n_taps, step_s, DEFAULT)
+    for wave in range(0, 40, 6):
+        varying, shared = plain_errors(made, step_s, DEFAULT.frequency_hz[wave])
+        assert made.errors[wave] == pytest.approx(varying, rel=0.01, abs=FLOOR)
+        assert made.biases[wave] == pytest.approx(shared, rel=0.01, abs=1e-3 * varying + FLOOR)
+
+
+@settings(max_examples=30, deadline=None)
+@given(call=calls, step_s=steps_s, n_taps=st.integers(1, 6), seed=st.integers(0, 99))
+def test_a_delayed_wave_is_made_within_the_predicted_error(call, step_s, n_taps, seed):
+    """Waves of all frequencies at once, with random phases, and delays before and after the first kept sample."""
+    spectrum, random = spectrum_of(call), np.random.default_rng(seed)
+    made = DelayFit("fitted", n_taps, step_s, spectrum)
+    delays_s = random.uniform(-200, 200, 4000) * step_s
+    first, fractions = made.split(delays_s)
+    lowest = (n_taps - 1) // 2 - 0.5 * (n_taps % 2)
+    assert_allclose((first + fractions) * step_s, delays_s, atol=1e-12 * step_s * 1e3)
+    assert ((fractions >= lowest - 1e-9) & (fractions <= lowest + 1 + 1e-9)).all()
+    waves = np.sqrt(spectrum.power) * np.exp(2j * np.pi * random.random(len(spectrum.power)))
+
+    def heard(gain, time_s):
+        return np.exp(2j * np.pi * time_s[..., None] * spectrum.frequency_hz) @ (gain * waves)
+
+    kept = heard(made.gain(spectrum.frequency_hz), (first[:, None] + np.arange(n_taps)) * step_s)
+    wrong = np.sum(made.weights(fractions) * kept, axis=1) - heard(1.0, delays_s)
+    predicted = float((made.errors + made.biases) @ spectrum.power)
+    assert np.mean(np.abs(wrong) ** 2) < 1.3 * predicted + FLOOR
+
+
+@pytest.mark.parametrize("interpolation", ["carrier", "linear", "cubic"])
+def test_simple_weights_are_exact_at_the_carrier(interpolation):
+    step_s = 1 / RATE_HZ
+    made = DelayFit(interpolation, None, step_s, DEFAULT)
+    assert max(plain_errors(made, step_s, DEFAULT.centre_hz)) < 1e-20
+
+
+def test_weights_keep_the_shape_of_the_fractions():
+    made = DelayFit("fitted", 3, 1 / RATE_HZ, DEFAULT)
+    first, fractions = made.split(np.linspace(-1e-4, 1e-4, 20).reshape(4, 5))
+    assert first.shape == fractions.shape == (4, 5)
+    assert made.weights(fractions).shape == (4, 5, 3)
+
+
+def test_no_other_weights_and_no_other_gain_err_less():
+    """What `fit` returns is a minimum in weights and gain: any small step from it errs more."""
+    random = np.random.default_rng(3)
+    taps, targets = np.exp(1j * random.standard_normal((2, 12, 5)))[:, :, :3]
+    power = random.random(12)
+    gain, weights = fit(taps, targets, power)
+
+    def error(gain, weights):
+        return float(power @ np.sum(np.abs(targets - gain[:, None] * (taps @ weights)) ** 2, axis=1))
+
+    least = error(gain, weights)
+    assert least > 0.1
+    for _ in range(50):
+        step = 1e-3 * random.standard_normal((2, *weights.shape)) @ np.eye(3)
+        assert error(gain, weights + step[0] + 1j * step[1]) > least
+        assert error(gain * (1 + 1e-3 * np.exp(2j * np.pi * random.random(12))), weights) > least - 1e-3 * least
+
+
+def test_real_weights_are_the_best_real_ones():
+    random = np.random.default_rng(4)
+    taps, targets = np.exp(1j * random.standard_normal((2, 12, 4)))
+    power = random.random(12)
+    weights = weights_of(np.ones(12, complex), taps, targets, power, real=True)
+    assert not weights.imag.any()
+    root = np.sqrt(power)[:, None]
+    stacked = [np.concatenate([(root * part).real, (root * part).imag]) for part in (taps, targets)]
+    assert_allclose(weights.real, np.linalg.lstsq(*stacked, rcond=None)[0], atol=1e-9)
