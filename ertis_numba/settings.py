@@ -305,7 +305,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
     stop_band_db : float, optional
         Damping of what the decimation would alias into the call's band, 40 to 140.
     zones : int, optional
-        Parts of the range axis with delays of their own, 1 to 1000, where wavefronts are spherical.
+        Parts of the range axis with delays of their own, from 1 on, where wavefronts are spherical.
     """
 
     max_error_db: float = -35.0
@@ -322,7 +322,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
         checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, 1000)):
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, 100_000)):
             if getattr(self, name) is not None:
                 checks.whole(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:
@@ -361,6 +361,7 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
                 f"give {_NARROWEST_HZ:g} Hz or more, or method 'fast'"
             )
+        self._check_adaptive()
         step = self.processing.range_decimation
         if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
             raise ArgumentError(
@@ -368,6 +369,23 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"{self._largest_decimation}, the decimation that suits the call; give one that has, such as a "
                 f"multiple of {self._largest_decimation}, or give processing.decimation"
             )
+
+    def _check_adaptive(self) -> None:
+        """Refuse plans that only sums have."""
+        if self.processing.beamformer == "delay_and_sum":
+            return
+        accuracy = self.accuracy
+        taps = accuracy.delay_taps or INTERPOLATIONS[accuracy.interpolation] or 1
+        for name, value, wanted in (
+            ("beam_taps", accuracy.beam_taps or 0, 0),
+            ("delay_taps", taps, 1),
+            ("precision", "float32" if accuracy.precision == "auto" else accuracy.precision, "float32"),
+        ):
+            if value != wanted:
+                raise ArgumentError(
+                    f"accuracy.{name} is {value!r}, which processing.beamformer {self.processing.beamformer!r} cannot "
+                    f"use; leave it out or give {wanted!r}"
+                )
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:

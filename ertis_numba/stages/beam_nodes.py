@@ -16,15 +16,21 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.stages.fitting import Spectrum, fit, weights_of
 
-__all__ = ["Aperture", "BeamNodes"]
+__all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "require_nodes"]
+
+FEWEST_RANGES = 64
+"""Of an image whose beams are interpolated: the kernels read signals as far."""
+
 
 _FLAT_M = 1e-6  # an axis along which microphones differ by less is none
 _LEAST_POWER = 1e-8  # large weights that cancel each other would let 16 bits be heard
 _MOST_FITTED = 96  # directions and microphones from which gain and error are found
 _WAVES = 17  # frequencies, over which the gain of a microphone is smooth
-_MOST_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # for an error within a quarter of a decibel
+_MOST_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # for an error within some tenths of a decibel
+_FEWEST_EQUATIONS = 120  # microphones by frequencies: weights would suit fewer better than what lies between them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +93,23 @@ class Aperture:
         return len(np.unique(_numbers(_around(self.lowest_nodes(spacing, n_taps), n_taps))))
 
 
+def require_nodes(aperture: Aperture, n_ranges: int) -> None:
+    """Refuse an array or an image whose beams cannot be interpolated.
+
+    Raises
+    ------
+    ArgumentError
+    """
+    if aperture.n_axes not in {1, 2}:
+        extent = "has no extent" if aperture.n_axes == 0 else "is neither a line nor a plane"
+        raise ArgumentError(f"accuracy.beam_taps is above 0, but the array {extent}; give 0 or leave it out")
+    if n_ranges < FEWEST_RANGES:
+        raise ArgumentError(
+            f"accuracy.beam_taps is above 0, but the image has {n_ranges} ranges, fewer than {FEWEST_RANGES}; "
+            "give 0 or leave it out"
+        )
+
+
 def _around(lowest: NDArray[np.int64], n_taps: int) -> NDArray[np.int64]:
     """Return the nodes around directions, neighbours along the first axis side by side: (direction, tap, axis)."""
     steps = np.indices((n_taps,) * lowest.shape[1]).reshape(lowest.shape[1], -1)[::-1].T
@@ -140,7 +163,7 @@ class BeamNodes:
         patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
         most, n_waves = (_MOST_ESTIMATED, _WAVES_ESTIMATED) if estimate else (_MOST_FITTED, _WAVES)
         mics, directions = (_some(count, most) for count in (len(aperture.positions_m), len(lowest)))
-        n_waves = min(n_waves, len(spectrum.power))
+        n_waves = min(max(n_waves, _FEWEST_EQUATIONS // len(mics)), len(spectrum.power))
         chosen = np.unique(np.linspace(0, len(spectrum.power) - 1, n_waves).astype(int))
         self.frequency_hz = spectrum.frequency_hz[chosen]
         power = np.tile(spectrum.power[chosen] / spectrum.power[chosen].sum() / len(mics), len(mics))

@@ -1,5 +1,6 @@
 """The fast chain: only the window of the record, and only the beams, that the image needs."""
 
+import functools
 import math
 from queue import Empty, LifoQueue
 from typing import Any, NamedTuple
@@ -11,9 +12,9 @@ from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Call, Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import Buffers, beamform
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import Demodulate
@@ -31,7 +32,13 @@ _WAVES = 40
 
 def spectrum_of(settings: Settings) -> Spectrum:
     """Return where the matched filter has its power, as if its input were white."""
-    return Spectrum(*matched_spectrum(settings.call, n_waves=_WAVES))
+    return _spectrum_of(settings.call)
+
+
+@functools.lru_cache(maxsize=8)
+def _spectrum_of(call: Call) -> Spectrum:
+    """Return the same spectrum for the same call, so that what is fitted to it can be kept as well."""
+    return Spectrum(*matched_spectrum(call, n_waves=_WAVES))
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
@@ -88,7 +95,7 @@ class FastChain:
         step_s = 1 / (settings.output_rate_hz * n_phases)
         fit = DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum)
         nodes = None
-        if plan.beam_taps:
+        if plan.beam_taps and aperture.n_axes in {1, 2}:
             nodes = BeamNodes(
                 aperture,
                 spectrum,
@@ -113,6 +120,8 @@ class FastChain:
             n_taps=len(taps),
             ringing_db=ringing_db(plan.stop_band_db or 60.0),
         )
+        if plan.beam_taps:
+            require_nodes(aperture, len(window.range_m))
         self.range_m = window.range_m
         self._lead = window.lead
         self._kernels = kernels

@@ -15,11 +15,11 @@ from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import INTERPOLATIONS, Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import require_int16, whole_limits
 from ertis_numba.stages.costs import Costs, Work, costs_of
 from ertis_numba.stages.fast import chain_taps, spectrum_of
-from ertis_numba.stages.fitting import DelayFit, one_thread
+from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import matched_band_hz
 
@@ -30,9 +30,7 @@ _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
 _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
 _STOP_BANDS_DB = (40.0, 60.0, 80.0, 100.0, 120.0, 140.0)
 _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
-_MOST_ZONES = 1000
-_FEWEST_RANGES = 64  # of an image whose beams are interpolated: the kernels read as far
-_MOST_BYTES = 2**31  # of a plan's signals
+_MOST_BYTES = 2**31  # of a plan's signals, and of its delays
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
@@ -146,6 +144,8 @@ class Planner:
         self._n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
         self._window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
+        if settings.accuracy.beam_taps:
+            require_nodes(self._aperture, len(self._window.range_m))
         self._delays = functools.cache(self._made_delays)
         self._nodes = functools.cache(self._made_nodes)
         self._filter = functools.cache(self._made_filter)
@@ -212,7 +212,7 @@ class Planner:
         if nodes is not None:
             parts["beams"] = nodes.error
         if self._settings.processing.wavefront == "spherical":
-            parts["zones"] = self._one_zone / plan.zones**2
+            parts["zones"] = 0.0 if plan.zones >= len(self._window.range_m) else self._one_zone / plan.zones**2
         if plan.precision == "int16":
             parts["samples"] = self._whole_numbers(delays, nodes)
         work = Work(
@@ -252,7 +252,13 @@ class Planner:
                 precisions, phases, taps, self._open_nodes(budget, adaptive=adaptive), self._stop_bands_db(budget)
             )
             if n_phases * bytes_per_phase <= _MOST_BYTES
+            and self._table_bytes(n_taps, beam_taps, density) * self._zone_count(budget) <= _MOST_BYTES
         ]
+
+    def _table_bytes(self, n_taps: int, beam_taps: int, density: float) -> int:
+        """Return the size of a zone's delays and weights."""
+        nodes = self._nodes(beam_taps, density) if beam_taps else None
+        return 12 * (self._n_directions if nodes is None else nodes.count) * self._n_mics * n_taps
 
     def _open_nodes(self, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
         """Return which nodes are worth a try, and that every direction's own beam is."""
@@ -285,7 +291,8 @@ class Planner:
             return self._settings.accuracy.zones
         if self._settings.processing.wavefront == "plane":
             return 1
-        return min(_MOST_ZONES, max(1, math.ceil(math.sqrt(self._one_zone / (_SMALL * budget)))))
+        wanted = math.ceil(math.sqrt(self._one_zone / (_SMALL * budget)))
+        return min(len(self._window.range_m), max(1, wanted))
 
     @functools.cached_property
     def _one_zone(self) -> float:
@@ -294,8 +301,7 @@ class Planner:
     def _made_delays(self, n_phases: int, n_taps: int) -> _Delays:
         accuracy = self._settings.accuracy
         step_s = 1 / (self._settings.output_rate_hz * n_phases)
-        fit = DelayFit(accuracy.interpolation, n_taps, step_s, self._spectrum)
-        weights = np.abs(fit.weights(fit.fractions))
+        fit, weights = _fitted(self._spectrum, accuracy.interpolation, n_taps, step_s)
         return _Delays(
             n_taps=fit.n_taps,
             error=self.model.delays(fit),
@@ -306,7 +312,7 @@ class Planner:
     def _made_nodes(self, n_taps: int, density: float) -> _Nodes | None:
         """Return what so many nodes mean; None where there is no use in them, or no way."""
         aperture = self._aperture
-        if aperture.n_axes not in {1, 2} or len(self._window.range_m) < _FEWEST_RANGES:
+        if aperture.n_axes not in {1, 2} or len(self._window.range_m) < FEWEST_RANGES:
             return None
         high_hz = self._settings.call.high_frequency_hz
         spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
@@ -352,6 +358,13 @@ class Planner:
     def _reach_s(self) -> float:
         positions_m = self._aperture.square_m2
         return math.sqrt(float(np.max(positions_m, initial=0.0))) / self._speed_m_s
+
+
+@functools.lru_cache(maxsize=4 * len(_PHASES) * len(_DELAY_TAPS))
+def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
+    """Return a fit and the magnitudes of its weights; kept, as most of a planner's time would go into them."""
+    fit = DelayFit(interpolation, n_taps, step_s, spectrum)
+    return fit, np.abs(fit.weights(fit.fractions))
 
 
 def _worst(chosen: Chosen) -> str:

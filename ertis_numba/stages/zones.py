@@ -21,13 +21,15 @@ def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int,
     range_m : (range,) float64
         Ascending.
     count : int
-        Zones; there are fewer where some would hold no range.
+        Zones; there are fewer where some would hold no range, and one for each where there are not fewer ranges.
 
     Returns
     -------
     list of (first, stop, distance)
         Ranges ``first … stop - 1`` of each zone and the distance in metres whose delays it has.
     """
+    if count >= len(range_m):
+        return [(k, k + 1, max(float(distance_m), _NEAREST_M)) for k, distance_m in enumerate(range_m)]
     bends = 1 / np.maximum(range_m, _NEAREST_M)
     span = bends[0] - bends[-1]
     zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)

@@ -10,7 +10,7 @@ from numba.core import cgutils
 
 from ertis_numba.kernels._cpu.features import target_features
 
-__all__ = ["HAS_INT16_DOT", "LANES", "RANGES", "VECTORS", "Dot16"]
+__all__ = ["HAS_INT16_DOT", "INT32", "LANES", "RANGES", "SHORTS", "SUMS", "VECTORS", "Dot16"]
 
 _FEATURES = target_features()
 HAS_INT16_DOT = not _FEATURES.isdisjoint({"avx512vnni", "avxvnni"})
@@ -30,6 +30,8 @@ class Dot16:
         self._builder = builder
         name = f"llvm.x86.avx512.vpdpwssd.{32 * LANES}"
         self._dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(SUMS, [SUMS, PAIRS, PAIRS]), name)
+        root = ir.FunctionType(FLOATS, [FLOATS])
+        self._root = cgutils.get_or_insert_function(builder.module, root, f"llvm.sqrt.v{LANES}f32")
         self._sums = [[cgutils.alloca_once(builder, SUMS) for _ in range(VECTORS)] for _ in ("re", "im")]
         for total in self._sums[0] + self._sums[1]:
             builder.store(ir.Constant(SUMS, [0] * LANES), total)
@@ -84,28 +86,9 @@ class Dot16:
         for vector in range(VECTORS):
             x, y = (builder.sitofp(builder.load(self._sums[part][vector]), FLOATS) for part in (0, 1))
             power = builder.fadd(builder.fmul(x, x), builder.fmul(y, y))
-            level = builder.fmul(self._root(power), scales)
+            level = builder.fmul(builder.call(self._root, [power]), scales)
             place = builder.gep(target, [ir.Constant(ir.IntType(64), vector * LANES)])
             builder.store(level, builder.bitcast(place, FLOATS.as_pointer())).align = 4
-
-    def _root(self, power):
-        """Return the square root; with AVX-512 by one Newton step from its estimate, which is off by 2⁻²⁶ at most.
-
-        The processor's own square root would take longer than all products of an interpolated beam.
-        """
-        builder = self._builder
-        if LANES < 16:
-            function = ir.FunctionType(FLOATS, [FLOATS])
-            root = cgutils.get_or_insert_function(builder.module, function, f"llvm.sqrt.v{LANES}f32")
-            return builder.call(root, [power])
-        function = ir.FunctionType(FLOATS, [FLOATS, FLOATS, INT16])
-        estimate = cgutils.get_or_insert_function(builder.module, function, "llvm.x86.avx512.rsqrt14.ps.512")
-        tiny, half = (ir.Constant(FLOATS, [number] * LANES) for number in (2.0**-100, 0.5))
-        blank, all_lanes = ir.Constant(FLOATS, ir.Undefined), ir.Constant(INT16, -1)
-        inverse = builder.call(estimate, [builder.fadd(power, tiny), blank, all_lanes])  # 0 must not give infinity
-        root = builder.fmul(power, inverse)
-        rest = builder.fsub(power, builder.fmul(root, root))
-        return builder.fadd(root, builder.fmul(rest, builder.fmul(inverse, half)))
 
     def store_upper_halves(self, target):
         """Write the upper 16 bits of the sums, rounded, from ``target`` (int16*) on: real, then imaginary parts."""

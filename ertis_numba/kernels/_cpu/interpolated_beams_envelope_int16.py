@@ -11,7 +11,7 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, VECTORS, Dot16
+from ertis_numba.kernels._cpu.dot16 import INT32, LANES, RANGES, SHORTS, SUMS, VECTORS, Dot16
 
 __all__ = ["interpolated_beams_envelope_int16"]
 
@@ -49,6 +49,35 @@ def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
 
 
 @intrinsic
+def _pair_rows(typing_context, rows, lower, pairs, node):
+    """Fill ``pairs[node]`` with the row ``lower`` and, in the upper bits, the other one; no loop would be vectorised."""
+    signature = types.void(rows, types.intp, pairs, types.intp)
+
+    def codegen(context, builder, signature, arguments):
+        def array(k):
+            return context.make_array(signature.args[k])(context, builder, arguments[k])
+
+        size = arguments[1].type
+        low = builder.mul(arguments[1], ir.Constant(size, 2 * RANGES))
+        high = builder.sub(ir.Constant(size, 2 * RANGES), low)
+        begin = builder.mul(arguments[3], ir.Constant(size, 2 * RANGES))
+        for ahead in range(0, 2 * RANGES, LANES):
+            step = ir.Constant(size, ahead)
+            parts = []
+            for row in (low, high):
+                place = builder.gep(array(0).data, [builder.add(row, step)])
+                loaded = builder.load(builder.bitcast(place, SHORTS.as_pointer()))
+                loaded.align = 2
+                parts.append(builder.zext(loaded, SUMS))
+            both = builder.or_(parts[0], builder.shl(parts[1], ir.Constant(SUMS, [16] * LANES)))
+            place = builder.gep(array(2).data, [builder.add(begin, step)])
+            builder.store(both, builder.bitcast(place, SUMS.as_pointer())).align = _LINE
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
 def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction, scale, out, place):
     """Fill ``out.flat[place : place + RANGES]`` from the pairs of nodes around ``direction``.
 
@@ -80,15 +109,6 @@ def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction
         return context.get_dummy_value()
 
     return signature, codegen
-
-
-@njit(nogil=True, cache=True)
-def _pair_rows(rows, lower, pairs, node):
-    """Put the row ``lower`` and the other one side by side."""
-    low, high = rows[lower], rows[1 - lower]
-    target = pairs[node].reshape(-1)
-    for k in range(target.size):
-        target[k] = np.int32(np.int32(high[k]) << np.int32(16)) | (np.int32(low[k]) & np.int32(0xFFFF))
 
 
 @njit(nogil=True, cache=True)
