@@ -1,18 +1,20 @@
 """The benchmarks measure what they say, refuse wrong results, and write their tables where they belong."""
 
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import checks, machine, paper, scaling, simulation, subject, tables, timing
+from ertis_bench import accuracy, checks, exact, machine, paper, plans, scaling, simulation, subject, tables, timing
 from ertis_cli.main import cli
 
-from ertis_numba import kernels
+from ertis_numba import figures, kernels
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy
 from ertis_numba.simulation.names import EFFECTS
 from tests.cases import SHORT, noise
 
@@ -70,24 +72,25 @@ def test_scaling_measures_every_series(monkeypatch):
     monkeypatch.setattr(scaling, "SERIES", series)
     monkeypatch.setattr(scaling, "_STREAM", 2**16)
     report = scaling.run(count=1, say=lambda _: None)
-    found = {(row["series"], row["precision"], row["value"]) for row in report["rows"]}
+    found = {(row["series"], row["plan"], row["value"]) for row in report["rows"]}
     assert {
+        ("directions", "default", 90.0),
         ("directions", "float32", 90.0),
         ("directions", "float32", 180.0),
-        ("last_range_m", "auto", 1.0),
-        ("microphones", "auto", 40.0),
-        ("threads", "auto", 1.0),
+        ("last_range_m", "default", 1.0),
+        ("microphones", "default", 40.0),
+        ("threads", "default", 1.0),
     } <= found
     assert report["ceilings"][-1]["float32_gop_s"] > 1
     assert report["delay_and_sum"][0]["precision"] == "float32"
     text = tables.scaling(report)
-    for name in ("directions, float32", "last range, m", "microphones", "threads"):
+    for name in ("directions", "directions, every own beam in float32", "last range, m", "microphones", "threads"):
         assert f"| {name} | ms, mean ± std (median) | ranges |" in text
 
 
 def test_delay_and_sum_is_the_slope_over_directions():
     rows = [
-        {"series": series, "precision": "int16", "value": n, "n_ranges": 1000, "median_ms": 2.0 + n / 1000}
+        {"series": series, "plan": "int16", "value": n, "n_ranges": 1000, "median_ms": 2.0 + n / 1000}
         for series, n in (("directions", 100), ("directions", 1000), ("directions", 5000), ("threads", 1))
     ]
     found = scaling.reached(rows, "int16", {"copy_gb_s": 40.0, "int16_gop_s": 512.0})
@@ -184,11 +187,102 @@ def test_published_times_have_one_entry_per_configuration():
     assert all(len(times) == len(paper.DIRECTIONS) for times in paper.PUBLISHED_MS.values())
 
 
-@pytest.mark.parametrize("name", ["paper", "scaling"])
-def test_generated_readme_has_both_tables(name):
+@pytest.mark.parametrize("name", ["paper", "accuracy", "scaling"])
+def test_generated_readme_has_all_tables(name):
     text = (Path(__file__).parents[1] / "bench" / "README.md").read_text("utf-8")
     table = text.partition(f"<!-- ertis bench {name} -->")[2].partition(f"<!-- /ertis bench {name} -->")[0]
     assert "| ---: |" in table
+
+
+FEW = [("float32", "nearest", 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("int16", 2, 2, 40.0, (4, 1.75))]
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few plans, and calls that are hardly warmed up."""
+    monkeypatch.setattr(timing, "_WARM_UP", 1)
+    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
+    monkeypatch.setattr(plans, "PLANS", FEW)
+
+
+def bench_accuracy(*arguments):
+    done = CliRunner().invoke(cli, ["bench", "accuracy", "--count", "1", "--directions", "2d:90", *map(str, arguments)])
+    assert done.exit_code == 0, (done.output, done.exception)
+    return done
+
+
+@pytest.mark.usefixtures("quick")
+def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
+    full, short, picture = tmp_path / "full.md", tmp_path / "short.md", tmp_path / "front.png"
+    full.write_text(MARKED.format("accuracy"), "utf-8")
+    short.write_text(MARKED.format("accuracy front"), "utf-8")
+    done = bench_accuracy("--json", "--update", full, "--update", short, "--plot", picture)
+    report = json.loads(done.stdout)
+    assert [entry["subject"] for entry in report["subjects"]] == ["real", "synthetic"]
+    assert all(entry["exact_db"] < -110 for entry in report["subjects"])
+    for subject_name in ("real", "synthetic"):
+        rows = [row for row in report["rows"] if row["subject"] == subject_name]
+        names = [row["plan"].partition(":")[0] for row in rows]
+        assert {accuracy.PAPER, *ERROR_PRESETS_DB} <= set(names)
+        assert "float32, nearest sample of 2 per range, 40 dB" in names
+        assert [row["error_db"] for row in rows] == sorted((row["error_db"] for row in rows), reverse=True)
+        for row in rows:
+            assert row["time_ms"] > 0
+            if row["plan"] == accuracy.PAPER:
+                assert row["predicted_db"] is None
+                assert not row["on_front"]
+            else:
+                assert abs(row["predicted_db"] - row["error_db"]) < 5
+        budgets = {row["plan"].partition(":")[0]: row["error_db"] for row in rows}
+        assert all(budgets[preset] <= max_error_db for preset, max_error_db in ERROR_PRESETS_DB.items())
+        exact_row = rows[-1]
+        assert exact_row["on_front"]  # nothing is more exact
+        assert (exact_row["peaks_lost"], exact_row["peak_level_db"]) == (0, 0.0)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert full.read_text("utf-8").count("the paper's method |") == 2
+    assert "| float32, nearest sample of 2 per range, 40 dB |" in full.read_text("utf-8")
+    assert "bench/README.md has all of them" in short.read_text("utf-8")
+    assert "\nold\n" not in full.read_text("utf-8") + short.read_text("utf-8")
+
+
+@pytest.mark.usefixtures("quick")
+def test_accuracy_says_what_it_leaves_out(monkeypatch):
+    monkeypatch.setattr(subject, "_DISTRIBUTION", "no-such-distribution")
+    monkeypatch.setattr(plans, "PLANS", FEW[:1])
+    done = bench_accuracy()
+    assert "real measurement: left out, as the package rtisdev, which has it, is not installed" in done.stderr
+    assert "Left out, as it is not installed here: real measurement." in done.stdout
+    assert "| synthetic (data/synthetic/reflectors.h5) |" in done.stdout
+    assert "| real" not in done.stdout
+
+
+def test_accuracy_refuses_an_exact_image_that_is_not(monkeypatch):
+    rough = Accuracy(
+        precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=80.0, zones=1
+    )
+    monkeypatch.setattr(exact, "exact_plan", lambda *_, **__: rough)
+    with pytest.raises(DataError, match=r"dB off the exact one; wanted at most -100 dB"):
+        accuracy.run(count=1, say=lambda _: None, directions="2d:9")
+
+
+def test_front_is_what_nothing_beats():
+    row = {"error_db": -40.0, "time_ms": 3.0}
+    assert accuracy.beats({"error_db": -41.0, "time_ms": 3.0}, row)
+    assert accuracy.beats({"error_db": -40.0, "time_ms": 2.0}, row)
+    assert not accuracy.beats(row, row)
+    assert not accuracy.beats({"error_db": -50.0, "time_ms": 3.1}, row)
+
+
+def test_front_is_joined_by_a_line_and_labelled():
+    rated = functools.partial(figures.Rated, series="room", time_ms=2.0)
+    points = [rated(error_db=-20.0, on_front=True, label="draft"), rated(error_db=-10.0, on_front=False)]
+    points += [rated(error_db=-60.0, on_front=True), rated(series="hall", error_db=-30.0, on_front=True)]
+    axes = figures.front(points, title="T", note="N").axes[0]
+    assert [line.get_xdata().tolist() for line in axes.lines] == [[-10.0], [-60.0, -20.0], [], [-30.0]]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["room", "hall"]
+    assert [text.get_text() for text in axes.texts] == ["draft"]
+    with pytest.raises(ArgumentError, match="theme 'blue' is unknown"):
+        figures.front(points, title="T", theme="blue")
 
 
 def test_simulation_times_a_free_field_and_everything(monkeypatch, tmp_path):

@@ -162,7 +162,7 @@ def test_settings_file_changes_what_it_holds(recording, tmp_path):
     with open_energyscapes(tmp_path / "img.h5") as back:
         assert back.settings.air == SMALL.air.replace(temperature_c=0.0)
         assert back.settings.processing.directions == "2d:5"
-        assert back.settings.processing.oversampling == SMALL.processing.oversampling
+        assert back.settings.processing.range_decimation == SMALL.processing.range_decimation
         assert len(back.azimuth_rad) == 5
 
 

@@ -12,8 +12,11 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Processing, Settings
+from tests import reference
 from tests.cases import noise
+from tests.test_real import RAW
 
 ERTIS = [sys.executable, "-m", "ertis_cli"]
 
@@ -72,3 +75,25 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
     # Not getrusage: what it says begins with the size of the process that started this one.
     (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", done.stderr)
     assert int(peak_kb) * 1024 < 400e6
+
+
+@pytest.fixture(scope="module", params=["2d:181", "3000"])
+def real(request):
+    """The real measurement, and the exact image of some of the directions of a grid."""
+    settings = Settings.from_preset("default_25_50")
+    settings = settings.replace(processing=settings.processing.replace(directions=request.param))
+    measurement = Measurement(np.fromfile(RAW, dtype="<u4"), settings)
+    axes = ertis.Pipeline(settings)
+    some = np.unique(np.linspace(0, len(axes.grid) - 1, 24).astype(int))
+    directions = unit_vectors(axes.grid.azimuth_rad[some], axes.grid.elevation_rad[some])
+    return measurement, some, reference.exact(measurement.words, settings, directions, axes.range_m)
+
+
+@pytest.mark.parametrize("budget", ["draft", "standard", "fine", "exact"])
+def test_images_of_the_real_measurement_are_as_exact_as_asked_for(real, budget):
+    """Plans that know nothing of what is heard keep their budget; the standard one is that of the default settings."""
+    measurement, some, exact = real
+    budget_db = {"draft": -20, "standard": -35, "fine": -60, "exact": -100}[budget]
+    pipeline = ertis.Pipeline(measurement.settings, max_error_db=None if budget == "standard" else budget_db)
+    image = pipeline.process(measurement).energy[some]
+    assert reference.error_db(image, exact) < budget_db

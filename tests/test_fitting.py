@@ -19,11 +19,15 @@ calls = st.builds(
     duration_s=st.floats(3e-4, 5e-3),
     ramp_fraction=st.floats(0, 0.5),
 )
-steps_s = st.floats(10_000.0, 3e6).map(lambda rate_hz: 1 / rate_hz)
+rates = st.floats(1.2, 50.0)  # by the bandwidth: samples that are fewer cannot tell
 
 
 def spectrum_of(call):
     return Spectrum(*matched_spectrum(call, n_waves=40))
+
+
+def step_s_of(call, rate):
+    return 1 / (rate * (call.high_frequency_hz - call.low_frequency_hz))
 
 
 DEFAULT = spectrum_of(Call())
@@ -39,9 +43,9 @@ def errors_db(interpolation, n_taps, oversampling):
 
 
 @settings(max_examples=40, deadline=None)
-@given(call=calls, step_s=steps_s, other=st.sampled_from(["nearest", "carrier", "linear", "cubic"]))
-def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, step_s, other):
-    spectrum = spectrum_of(call)
+@given(call=calls, rate=rates, other=st.sampled_from(["nearest", "carrier", "linear", "cubic"]))
+def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, rate, other):
+    spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
     errors = {}
     for interpolation in ("fitted", other):
         made = DelayFit(interpolation, INTERPOLATIONS[other], step_s, spectrum)
@@ -50,9 +54,9 @@ def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, step_s, 
 
 
 @settings(max_examples=40, deadline=None)
-@given(call=calls, step_s=steps_s, n_taps=st.integers(1, 5))
-def test_another_tap_never_errs_more(call, step_s, n_taps):
-    spectrum = spectrum_of(call)
+@given(call=calls, rate=rates, n_taps=st.integers(1, 5))
+def test_another_tap_never_errs_more(call, rate, n_taps):
+    spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
     few, many = (DelayFit("fitted", count, step_s, spectrum) for count in (n_taps, n_taps + 1))
     assert (many.errors + many.biases) @ spectrum.power <= 1.001 * (few.errors + few.biases) @ spectrum.power + FLOOR
 
@@ -82,8 +86,10 @@ def plain_errors(made, step_s, frequency_hz):
     return np.var(wrong), np.abs(np.mean(wrong)) ** 2
 
 
-@pytest.mark.parametrize(("interpolation", "n_taps"), [("fitted", n) for n in range(1, 6)] + [
-    ("nearest", None), ("carrier", None), ("linear", None), ("cubic", None)])
+@pytest.mark.parametrize(
+    ("interpolation", "n_taps"),
+    [("fitted", n) for n in range(1, 6)] + [("nearest", None), ("carrier", None), ("linear", None), ("cubic", None)],
+)
 @pytest.mark.parametrize("oversampling", [1, 3, 10])
 def test_errors_are_those_of_a_plain_evaluation(interpolation, n_taps, oversampling):
     step_s = 1 / (RATE_HZ * oversampling)
@@ -94,16 +100,16 @@ def test_errors_are_those_of_a_plain_evaluation(interpolation, n_taps, oversampl
         assert made.biases[wave] == pytest.approx(shared, rel=0.01, abs=1e-3 * varying + FLOOR)
 
 
-@settings(max_examples=30, deadline=None)
-@given(call=calls, step_s=steps_s, n_taps=st.integers(1, 6), seed=st.integers(0, 99))
-def test_a_delayed_wave_is_made_within_the_predicted_error(call, step_s, n_taps, seed):
+@settings(max_examples=20, deadline=None)
+@given(call=calls, rate=rates, n_taps=st.integers(1, 6), seed=st.integers(0, 99))
+def test_a_delayed_wave_is_made_within_the_predicted_error(call, rate, n_taps, seed):
     """Waves of all frequencies at once, with random phases, and delays before and after the first kept sample."""
-    spectrum, random = spectrum_of(call), np.random.default_rng(seed)
+    spectrum, step_s, random = spectrum_of(call), step_s_of(call, rate), np.random.default_rng(seed)
     made = DelayFit("fitted", n_taps, step_s, spectrum)
-    delays_s = random.uniform(-200, 200, 4000) * step_s
+    delays_s = random.uniform(-0.1, 0.1, 1500)  # so long that no two waves agree
     first, fractions = made.split(delays_s)
     lowest = (n_taps - 1) // 2 - 0.5 * (n_taps % 2)
-    assert_allclose((first + fractions) * step_s, delays_s, atol=1e-12 * step_s * 1e3)
+    assert_allclose((first + fractions) * step_s, delays_s, atol=1e-14)
     assert ((fractions >= lowest - 1e-9) & (fractions <= lowest + 1 + 1e-9)).all()
     waves = np.sqrt(spectrum.power) * np.exp(2j * np.pi * random.random(len(spectrum.power)))
 

@@ -11,7 +11,7 @@ import pytest
 
 from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Air, Array, Call, Processing, Recording
+from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import Plan, make_plan
@@ -150,8 +150,10 @@ def _sensor(dice):
 
 @functools.lru_cache(maxsize=2)
 def chain(settings):
-    processing = settings.processing.replace(precision="float32")
-    return FastChain(settings.replace(processing=processing), kernels.load("cpu"), threads=2)
+    plan = Accuracy(
+        precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=60.0, zones=1
+    )
+    return FastChain(settings.replace(accuracy=plan), kernels.load("cpu"), threads=2)
 
 
 def images(scene, plan):

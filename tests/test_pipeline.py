@@ -21,6 +21,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Settings
 from tests import cases, reference
 from tests.cases import CASES, SHORT, noise
+from tests.hard_cases.tuned import tuned
 
 DEVICES = ("cpu", "numpy")
 
@@ -41,23 +42,22 @@ def test_image_is_the_exact_one(name, device, precision):
     if precision == "int16" and not has_int16(device):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     one_range = SHORT.replace(processing=SHORT.processing.replace(range_m=(0.7, 0.7)))
-    settings = CASES.get(name, one_range)
-    settings = settings.replace(processing=settings.processing.replace(precision=precision))
+    settings = tuned(CASES.get(name, one_range), precision=precision)
     pipeline = Pipeline(settings, device=device)
     measurement = noise(settings)
     image = pipeline.process(measurement)
     assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
     assert np.isfinite(image.energy).all()
-    # 32 phases leave -45 dB for 25 kHz of bandwidth and -40 dB for 60 kHz.
-    bound_db = -39 if name == "wide band" else -42
-    assert reference.error_db(image.energy, exact(pipeline, measurement)) < bound_db
+    assert reference.error_db(image.energy, exact(pipeline, measurement)) < settings.accuracy.max_error_db
 
 
 def test_error_falls_by_6_db_when_the_phases_double():
-    measurement = noise(SHORT)
+    settings = SHORT.replace(processing=SHORT.processing.replace(directions="2d:41"))
+    measurement = noise(settings)
     errors_db = []
     for oversampling in (8, 16, 32):
-        pipeline = Pipeline(SHORT.replace(processing=SHORT.processing.replace(oversampling=oversampling)))
+        plan = {"oversampling": oversampling, "delay_taps": 1, "beam_taps": 0, "stop_band_db": 80.0}
+        pipeline = Pipeline(tuned(settings, precision="float32", max_error_db=0.0, **plan))
         errors_db.append(reference.error_db(pipeline.process(measurement).energy, exact(pipeline, measurement)))
     assert np.diff(errors_db) == pytest.approx([-6, -6], abs=1)
 
@@ -68,7 +68,7 @@ def test_window_leaves_out_what_the_image_does_not_need():
     measurement = noise(SHORT)
     expected = exact(part, measurement)
     assert len(part.range_m) < len(whole.range_m) / 2
-    assert reference.error_db(part.process(measurement).energy, expected) < -42
+    assert reference.error_db(part.process(measurement).energy, expected) < SHORT.accuracy.max_error_db
 
 
 @pytest.mark.parametrize("method", ["fast", "paper"])

@@ -12,7 +12,18 @@ from hypothesis import strategies as st
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Energyscape, Stamp
-from ertis_numba.settings import PRESETS, Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings import (
+    ERROR_PRESETS_DB,
+    INTERPOLATIONS,
+    PRESETS,
+    Accuracy,
+    Air,
+    Array,
+    Call,
+    Processing,
+    Recording,
+    Settings,
+)
 
 TWO = ((0.0, 0.0, 0.0), (0.0, 0.01, 0.0))
 
@@ -66,7 +77,18 @@ any_settings = st.builds(
         range_m=ordered(0, 100),
         decimation=st.sampled_from([None, 1, 4, 10, 16]),
         range_decimation=st.integers(1, 100).map(lambda count: 80 * count),
-        oversampling=st.integers(1, 64),
+        wavefront=st.just("plane"),
+    ),
+    accuracy=st.builds(
+        Accuracy,
+        max_error_db=st.floats(-200, 0),
+        precision=st.sampled_from(["auto", "float32", "int16"]),
+        oversampling=st.none() | st.integers(1, 64),
+        delay_taps=st.none() | st.integers(1, 8),
+        beam_taps=st.sampled_from([None, 0, 2, 4, 6]),
+        beam_density=st.none() | st.floats(1.1, 8),
+        stop_band_db=st.none() | st.floats(40, 140),
+        zones=st.none() | st.integers(1, 1000),
     ),
 )
 
@@ -140,7 +162,24 @@ def test_nothing_can_be_changed_in_place():
             "[processing]\ndecimation = 7",
             r"processing\.decimation is 7; give a divisor of processing\.range_decimation",
         ),
-        ("[processing]\noversampling = 65", r"processing\.oversampling is 65; give a whole number from 1 to 64"),
+        ("[processing]\noversampling = 10", r"s, line 2, processing: unknown key `oversampling`"),
+        ("[accuracy]\nmax_error_db = 3", r"accuracy\.max_error_db is 3; give a number from -200 to 0"),
+        ("[accuracy]\nprecision = 'int8'", r"s, line 2, accuracy\.precision: Invalid enum value 'int8'"),
+        ("[accuracy]\noversampling = 65", r"accuracy\.oversampling is 65; give a whole number from 1 to 64"),
+        ("[accuracy]\ninterpolation = 'sinc'", r"s, line 2, accuracy\.interpolation: Invalid enum value 'sinc'"),
+        ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; give a whole number from 1 to 8"),
+        ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
+        ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; give a number from 1\.1 to 8"),
+        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stop_band_db is 30; give a number from 40 to 140"),
+        ("[accuracy]\nzones = 0", r"accuracy\.zones is 0; give a whole number from 1 to"),
+        (
+            "[accuracy]\ninterpolation = 'linear'\ndelay_taps = 4",
+            r"accuracy\.delay_taps is 4, but interpolation 'linear' takes 2; leave it out",
+        ),
+        (
+            "[processing]\nmethod = 'paper'\nwavefront = 'spherical'",
+            r"processing\.wavefront is 'spherical', which the paper's method knows nothing of; give 'plane'",
+        ),
         ("[processing]\nrange_m = [2, 1]", r"processing\.range_m runs from 2 to 1; give the smaller number first"),
         ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
         ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
@@ -173,6 +212,17 @@ def test_bad_settings_are_refused(text, message):
 def test_bad_arguments_are_refused(make, message):
     with pytest.raises(ArgumentError, match=message):
         make()
+
+
+def test_each_interpolation_takes_the_taps_that_it_implies():
+    for interpolation, taps in INTERPOLATIONS.items():
+        assert Accuracy(interpolation=interpolation, delay_taps=taps).delay_taps == taps
+
+
+def test_error_presets_are_budgets_in_order():
+    assert Accuracy().max_error_db == ERROR_PRESETS_DB["standard"]
+    budgets_db = [Accuracy(max_error_db=budget_db).max_error_db for budget_db in ERROR_PRESETS_DB.values()]
+    assert budgets_db == sorted(budgets_db, reverse=True)
 
 
 @pytest.mark.parametrize("content", [None, b"\xff\xfe"])
@@ -211,7 +261,7 @@ def test_stamps_and_images_are_frozen():
 
 
 def test_every_section_refuses_unknown_fields():
-    for section in (Array, Call, Recording, Air, Processing, Settings):
+    for section in (Array, Call, Recording, Air, Processing, Accuracy, Settings):
         with pytest.raises(msgspec.ValidationError, match="unknown field"):
             msgspec.convert({"colour": 1}, section)
 

@@ -21,8 +21,8 @@ _NEAR_M = 0.01
 _SAME_LEVEL_DB = 1.5
 
 
-def require_exact(image: Energyscape, measurement: Measurement) -> float:
-    """Return the error of an image in dB; refuse one above `MAX_ERROR_DB`.
+def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db: float = MAX_ERROR_DB) -> float:
+    """Return the error of an image of plane wavefronts in dB; refuse one above ``max_error_db``.
 
     The referee works in float64, at the PDM rate, with delays that are exact phase shifts.
 
@@ -35,10 +35,10 @@ def require_exact(image: Energyscape, measurement: Measurement) -> float:
     expected = _exact(image, measurement, chosen)
     difference = np.linalg.norm(image.energy[chosen] - expected)
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
-    if not error_db <= MAX_ERROR_DB:
+    if not error_db <= max_error_db:
         raise DataError(
             f"image of {len(image.energy)} directions is {error_db:.1f} dB off the exact one; wanted at most "
-            f"{MAX_ERROR_DB:g} dB: the times would be those of a wrong result"
+            f"{max_error_db:g} dB: the times would be those of a wrong result"
         )
     return error_db
 

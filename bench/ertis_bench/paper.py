@@ -9,6 +9,7 @@ import numpy as np
 from ertis_bench import checks, machine, subject, timing
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.stages.fitting import one_thread
 
 __all__ = ["BACKENDS", "DIRECTIONS", "PUBLISHED_MS", "run"]
 
@@ -48,15 +49,8 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         A result is wrong, so it is not timed.
     """
     measurement, source = subject.measurement()
-    rows, errors_db = [], {}
-    for n_directions in DIRECTIONS:
-        say(f"{n_directions} directions: checking results")
-        pipelines = {name: _pipeline(measurement, n_directions, **which) for name, which in BACKENDS.items()}
-        errors_db[str(n_directions)] = _check(pipelines, measurement)
-        say(f"{n_directions} directions: timing {count} of each on {', '.join(pipelines)}")
-        subjects = {name: _into_one_array(pipeline, measurement) for name, pipeline in pipelines.items()}
-        for name, times_ms in timing.round_robin(subjects, count=count).items():
-            rows.append({"backend": name, "directions": n_directions, **timing.summary(times_ms)})
+    with one_thread():
+        rows, errors_db = _measure(measurement, count, say)
     return {
         "machine": machine.describe(),
         "rows": rows,
@@ -66,6 +60,22 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         "range_m": list(RANGE_M),
         "error_db": errors_db,
     }
+
+
+def _measure(
+    measurement: Measurement, count: int, say: Callable[[str], None]
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, float]]]:
+    """Return the rows, and the errors of those that approximate the exact image by number of directions."""
+    rows, errors_db = [], {}
+    for n_directions in DIRECTIONS:
+        say(f"{n_directions} directions: checking results")
+        pipelines = {name: _pipeline(measurement, n_directions, **which) for name, which in BACKENDS.items()}
+        errors_db[str(n_directions)] = _check(pipelines, measurement)
+        say(f"{n_directions} directions: timing {count} of each on {', '.join(pipelines)}")
+        subjects = {name: _into_one_array(pipeline, measurement) for name, pipeline in pipelines.items()}
+        for name, times_ms in timing.round_robin(subjects, count=count).items():
+            rows.append({"backend": name, "directions": n_directions, **timing.summary(times_ms)})
+    return rows, errors_db
 
 
 def _pipeline(measurement: Measurement, n_directions: int, *, method: str, device: str) -> Pipeline:

@@ -14,14 +14,15 @@ from ertis_numba.settings import Array, Settings
 
 __all__ = ["OPERATIONS_PER_POINT", "SERIES", "reached", "run"]
 
-OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone
+OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone, in direct sums
+_DEFAULT = "default"  # plan; the others are direct sums, called by their precision
 _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
 SERIES: dict[str, tuple[float, ...]] = {
     "directions": (90, 250, 500, 1000, 1850, 3000, 6000),
     "last_range_m": (1.0, 2.0, 3.0, 4.0, 5.0),
     "microphones": (8, 16, 32, 64, 128),
 }
-"""What is varied; everything else stays at 1850 directions, 0.5-5 m, 32 microphones, all threads."""
+"""What is varied; everything else stays at 1850 directions, 0.5-5 m, 32 microphones, all threads, the default plan."""
 
 _FIRST_RANGE_M = 0.5
 _APERTURE_M = 0.1
@@ -46,9 +47,9 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         A result is wrong, so it is not timed.
     """
     rows = []
-    for series, precision in _series():
-        say(f"{series}, {precision}: checking and timing {count} measurements each")
-        rows += [{"series": series, "precision": precision, **row} for row in _measure(series, precision, count)]
+    for series, plan in _series():
+        say(f"{series}, {plan}: checking and timing {count} measurements each")
+        rows += [{"series": series, "plan": plan, **row} for row in _measure(series, plan, count)]
     say("ceilings")
     ceilings_found = [_ceilings(n_threads, count) for n_threads in _thread_counts()]
     return {
@@ -61,22 +62,22 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _series() -> Iterator[tuple[str, str]]:
-    """Directions are varied at each precision, since that tells what delay-and-sum reaches."""
+    """Directions are varied with direct sums as well, since those tell what delay-and-sum reaches."""
     for series in (*SERIES, "threads"):
-        for precision in _precisions() if series == "directions" else ["auto"]:
-            yield series, precision
+        for plan in [_DEFAULT, *_precisions()] if series == "directions" else [_DEFAULT]:
+            yield series, plan
 
 
 def _precisions() -> list[str]:
     return list(dict.fromkeys(["float32", kernels.load("cpu").fastest_precision]))
 
 
-def _measure(series: str, precision: str, count: int) -> Iterator[dict[str, Any]]:
+def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
     """Yield a row per value; the values take turns, so that a drift does not look like a trend."""
     subjects, n_ranges = {}, {}
     for value in _thread_counts() if series == "threads" else SERIES[series]:
         threads = int(value) if series == "threads" else None
-        settings, n_words = _settings(precision, **{**_BASE, **({series: value} if series in _BASE else {})})
+        settings, n_words = _settings(plan, **{**_BASE, **({series: value} if series in _BASE else {})})
         pipeline, measurement = Pipeline(settings, "cpu", threads), subject.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
         checks.require_exact(image, measurement)
@@ -91,7 +92,7 @@ def _thread_counts() -> list[int]:
     return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < most] + [most]
 
 
-def _settings(precision: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
+def _settings(plan: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
     """Return settings and words per sample, with microphones at random places on a disc."""
     n_mics, settings = int(microphones), Settings.from_preset("default_25_50")
     random = np.random.default_rng(1)
@@ -100,9 +101,13 @@ def _settings(precision: str, *, directions: float, last_range_m: float, microph
     positions_m = np.stack([np.zeros(n_mics), radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], axis=1)
     array = Array(layout=f"disc of {n_mics}", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32)
     processing = settings.processing.replace(
-        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m)), precision=precision
+        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m))
     )
-    return settings.replace(array=array, processing=processing), -(-n_mics // array.word_bits)
+    accuracy = settings.accuracy
+    if plan != _DEFAULT:
+        accuracy = accuracy.replace(max_error_db=checks.MAX_ERROR_DB, precision=plan, beam_taps=0, delay_taps=1)
+    settings = settings.replace(array=array, processing=processing, accuracy=accuracy)
+    return settings, -(-n_mics // array.word_bits)
 
 
 def _ceilings(n_threads: int, count: int) -> dict[str, float]:
@@ -139,12 +144,12 @@ def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float
     Parameters
     ----------
     rows : list of dict
-        Those of the series ``directions`` at this precision are used.
+        Those of the series ``directions`` whose plan is direct sums at this precision are used.
     precision : {"float32", "int16"}
     ceiling : dict
         What the machine does on as many threads.
     """
-    points = [row for row in rows if (row["series"], row["precision"]) == ("directions", precision)]
+    points = [row for row in rows if (row["series"], row["plan"]) == ("directions", precision)]
     directions = np.array([row["value"] for row in points])
     medians_ms = np.array([row["median_ms"] for row in points])
     slope_ms, start_ms = np.polyfit(directions, medians_ms, 1)

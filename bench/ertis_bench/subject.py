@@ -1,16 +1,19 @@
 """What is processed in a benchmark."""
 
+import importlib.metadata
 from pathlib import Path
 
 import numpy as np
 
 from ertis_numba.frames import Measurement
+from ertis_numba.interop import open_raw
 from ertis_numba.settings import Settings
 from ertis_numba.storage import open_recording
 
-__all__ = ["measurement", "noise"]
+__all__ = ["measurement", "noise", "real"]
 
 _RECORDING = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
+_DISTRIBUTION = "rtisdev"
 
 
 def measurement() -> tuple[Measurement, str]:
@@ -22,6 +25,22 @@ def measurement() -> tuple[Measurement, str]:
         return noise(Settings.from_preset("default_25_50")), "white noise, seed 1"
     with open_recording(_RECORDING) as recording:
         return recording[0], "data/synthetic/reflectors.h5"
+
+
+def real() -> tuple[Measurement, str] | None:
+    """Return the one measurement that the package rtisdev has of a room, and what it is; None where that is not.
+
+    The package's code is not imported.
+    """
+    try:
+        found = importlib.metadata.distribution(_DISTRIBUTION)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    raw = Path(str(found.locate_file(f"{_DISTRIBUTION}/simulate.bin")))
+    if not raw.exists():
+        return None
+    (only,) = open_raw(raw, Settings.from_preset("default_25_50"), sensor="eRTIS")
+    return only, f"simulate.bin of {_DISTRIBUTION} {found.version}"
 
 
 def noise(settings: Settings, *, n_words: int = 1) -> Measurement:

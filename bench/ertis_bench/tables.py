@@ -1,15 +1,18 @@
 """Reports as Markdown, and where they go."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ertis_bench import timing
+from ertis_bench.accuracy import PAPER, TURN
+from ertis_bench.exact import PEAKS
 from ertis_bench.machine import sentence
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["around", "paper", "scaling", "simulation", "update"]
+__all__ = ["FORMS", "accuracy", "accuracy_front", "around", "paper", "place", "scaling", "simulation", "update"]
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
@@ -48,6 +51,23 @@ def around(path: Path, name: str) -> tuple[str, str]:
     if not (found and closed):
         raise ArgumentError(f"{path} has no place for this table; give a file with the lines {begin} and {end}")
     return head + begin, end + tail
+
+
+def place(path: Path, command: str) -> str:
+    """Return which form of a command's table a file has a place for: one of `FORMS`.
+
+    Raises
+    ------
+    ArgumentError
+        As in `around`.
+    """
+    first, *others = FORMS[command]
+    for name in others:
+        with suppress(ArgumentError):
+            around(path, name)
+            return name
+    around(path, first)
+    return first
 
 
 def paper(report: dict[str, Any]) -> str:
@@ -102,12 +122,78 @@ def _conditions(report: dict[str, Any]) -> str:
     )
 
 
+def accuracy(report: dict[str, Any]) -> str:
+    """Return all plans of each subject, and how they were measured."""
+    head = ["error, dB", "predicted, dB", "ms (median)", "times faster", "level, dB", "range, mm", "angle, °", "lost"]
+    parts = []
+    for name, rows, paper_ms in _subjects(report):
+        cells = [
+            [
+                f"**{row['plan']}**" if row["on_front"] else row["plan"],
+                f"{row['error_db']:.1f}",
+                _or_dash(row["predicted_db"], 1),
+                f"{row['time_ms']:.2f}",
+                f"{paper_ms / row['time_ms']:.1f}×",
+                *(_or_dash(row[key], 3) for key in ("peak_level_db", "peak_range_mm", "peak_angle_deg")),
+                f"{row['peaks_lost']}",
+            ]
+            for row in rows
+        ]
+        parts.append(_table([name, *head], cells))
+    return "\n\n".join([*parts, f"Measured on {sentence(report['machine'])}", _accuracy_conditions(report)])
+
+
+def accuracy_front(report: dict[str, Any]) -> str:
+    """Return the plans that no other one beats, and the paper's method."""
+    parts = []
+    for name, rows, paper_ms in _subjects(report):
+        cells = [
+            [row["plan"], f"{row['error_db']:.1f}", f"{row['time_ms']:.2f}", f"{paper_ms / row['time_ms']:.1f}×"]
+            for row in rows
+            if row["on_front"] or row["plan"] == PAPER
+        ]
+        parts.append(_table([name, "error, dB", "ms (median)", "times faster"], cells))
+    conditions = (
+        f"Medians of {report['count']} measurements, {report['directions']} directions. Shown are plans that no other "
+        "one beats in both error and time, and the paper's method; bench/README.md has all of them and says how they "
+        "were measured."
+    )
+    return "\n\n".join([*parts, f"Measured on {sentence(report['machine'])}", conditions])
+
+
+def _subjects(report: dict[str, Any]) -> Iterable[tuple[str, list[dict[str, Any]], float]]:
+    """Yield the name of each subject, its rows, and the time of the paper's method."""
+    for entry in report["subjects"]:
+        rows = [row for row in report["rows"] if row["subject"] == entry["subject"]]
+        paper_ms = next(row["time_ms"] for row in rows if row["plan"] == PAPER)
+        yield f"{entry['subject']} ({entry['source']})", rows, paper_ms
+
+
+def _accuracy_conditions(report: dict[str, Any]) -> str:
+    first_m, last_m = report["range_m"]
+    exact_db = max(entry["exact_db"] for entry in report["subjects"])
+    left_out = "".join(f" Left out, as it is not installed here: {name}." for name in report["left_out"])
+    return (
+        f"{report['directions']} directions, {first_m:g}–{last_m:g} m, device `cpu`, all threads, the paper's method "
+        f"on one; medians of {report['count']} measurements in turns of {TURN}, calls for a fifth of a second to warm "
+        "up not counted. Bold: no other plan is both faster and more exact. A plan's name has the precision of its "
+        "samples, what a delayed sample is made of and how many samples are kept per range, nodes along each axis of "
+        "the array and their density where beams are interpolated, and the stop band of the decimation; draft, "
+        "standard, fine and exact are what the planner chooses here. Error: norm of the difference by that of the "
+        "exact image, over all directions and ranges; the exact image itself is at most "
+        f"{exact_db:.1f} dB off the float64 referee in the directions that were checked. Predicted: by the error model "
+        "and the texture of the measurement, before the image is made. Level, range, angle: largest errors among the "
+        f"strongest {PEAKS} reflectors, levels below the strongest; lost are those of which `find_peaks` shows none "
+        f"within 5° and 2 cm.{left_out}"
+    )
+
+
 def scaling(report: dict[str, Any]) -> str:
     """Return one table per series, the ceilings, and what is reached of them."""
     series: dict[str, list[list[str]]] = {}
     for row in report["rows"]:
-        precision = "" if row["precision"] == "auto" else f", {row['precision']}"
-        name = row["series"].replace("_m", ", m").replace("_", " ") + precision
+        sums = "" if row["plan"] == "default" else f", every own beam in {row['plan']}"
+        name = row["series"].replace("_m", ", m").replace("_", " ") + sums
         series.setdefault(name, []).append([f"{row['value']:g}", _spread(**row), f"{row['n_ranges']}"])
     parts = [_table([name, "ms, mean ± std (median)", "ranges"], rows) for name, rows in series.items()]
     columns = {
@@ -124,9 +210,10 @@ def scaling(report: dict[str, Any]) -> str:
     parts.append(f"Measured on {sentence(report['machine'])}")
     parts.append(
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
-        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads and, "
-        "where none is named, the precision that is the fastest here. Every image was checked against the exact one "
-        "before it was timed; "
+        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. The plan "
+        "is the one that settings without any wish give here, chosen anew for each line; where a precision is named, "
+        "every direction's own beam is summed instead, one sample per microphone. "
+        "Every image was checked against the exact one before it was timed; "
         "calls for a fifth of a second to warm up are not counted. "
         "Ceilings are the best of as many runs, over arrays of 64 MiB and in "
         "registers; a multiplication and an addition are two operations."
@@ -189,6 +276,19 @@ def _spread(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> 
     return f"{mean_ms:.2f} ± {std_ms:.2f} ({median_ms:.2f})"
 
 
+def _or_dash(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     rule = ["---", *["---:"] * (len(head) - 1)]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
+    "paper": {"paper": paper},
+    "scaling": {"scaling": scaling},
+    "simulation": {"simulation": simulation},
+    "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
+}
+"""What each command writes between which markers: a file chooses a form by the marker that it has."""

@@ -14,20 +14,22 @@ _WARM_UP_S = 0.2  # … and so long: after other work it takes a hundred short c
 BURST = 100  # calls in a row, as in a stream
 
 
-def round_robin(subjects: Mapping[str, Callable[[], object]], *, count: int) -> dict[str, NDArray[np.float64]]:
+def round_robin(
+    subjects: Mapping[str, Callable[[], object]], *, count: int, burst: int = BURST
+) -> dict[str, NDArray[np.float64]]:
     """Return the times of ``count`` calls of each subject in milliseconds: (call,) float64 each.
 
-    Subjects take turns, so that whatever slows the machine for a while hits all of them. The first
-    calls of each turn are not counted, and the garbage collector is off.
+    Subjects take turns of ``burst`` calls, so that whatever slows the machine for a while hits all of them. The
+    first calls of each turn are not counted, and the garbage collector is off.
     """
     times_ms: dict[str, list[float]] = {name: [] for name in subjects}
     collecting = gc.isenabled()
     gc.disable()
     try:
-        for begin in range(0, count, BURST):
+        for begin in range(0, count, burst):
             for name, subject in subjects.items():
                 _warm_up(subject)
-                for _ in range(begin, min(begin + BURST, count)):
+                for _ in range(begin, min(begin + burst, count)):
                     start_ns = time.perf_counter_ns()
                     subject()
                     times_ms[name].append((time.perf_counter_ns() - start_ns) / 1e6)

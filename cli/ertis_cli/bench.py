@@ -55,6 +55,28 @@ def paper(**given: Any) -> None:
 
 
 @bench.command()
+@_count(20)
+@click.option("--directions", metavar="GRID", default="3000", show_default=True, help="As in 'ertis process'.")
+@click.option(
+    "--plot",
+    "picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FRONT.png",
+    help="Draw error against time into this file, whether it is there or not.",
+)
+@_update
+@options.quiet
+@options.as_json
+def accuracy(*, picture: Path | None, **given: Any) -> None:
+    """Error of the image against time, for some forty plans and the paper's method."""
+    from ertis_bench import accuracy as benchmark
+
+    report = _run("accuracy", benchmark, **given)
+    if picture:
+        benchmark.plot(report, picture)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet
@@ -79,17 +101,16 @@ def simulation(**given: Any) -> None:
 
 
 def _run(
-    name: str, benchmark: ModuleType, *, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool
-) -> None:
+    name: str, benchmark: ModuleType, *, targets: tuple[Path, ...], quiet: bool, as_json: bool, **given: Any
+) -> dict[str, Any]:
     from ertis_bench import tables
 
-    for target in targets:
-        tables.around(target, name)  # refused now rather than after minutes
-    report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
-    table: str = getattr(tables, name)(report)
-    for target in targets:
-        tables.update(target, name, table)
+    places = [(target, tables.place(target, name)) for target in targets]  # refused now rather than after minutes
+    report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)
+    for target, place in places:
+        tables.update(target, place, tables.FORMS[name][place](report))
     if as_json:
         options.print_json(report)
     elif not targets:
-        click.echo(table)
+        click.echo(tables.FORMS[name][name](report))
+    return report

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ertis_numba.stages.compare import Comparison
 
 __all__ = [
+    "ERROR_BUDGET",
     "INTERVAL",
     "as_json",
     "comparisons",
@@ -60,6 +61,20 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         return self.fail(f"{value!r} is no interval, give two numbers as in 0.5:5", param, ctx)
 
 
+class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
+    name = "DB"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        from ertis_numba.settings import ERROR_PRESETS_DB
+
+        if value in ERROR_PRESETS_DB:
+            return ERROR_PRESETS_DB[value]
+        with suppress(ValueError):
+            return float(value)
+        return self.fail(f"{value!r} is no error, give dB as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx)
+
+
+ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
 _FILE = click.Path(path_type=Path)
 
@@ -137,10 +152,12 @@ def place(index: int, count: int) -> int:
     return checks.whole("--measurement", index, 0, count - 1)
 
 
-def settings_with(recorded: "Settings", *, settings_file: Path | None = None, **options: Any) -> "Settings":
+def settings_with(
+    recorded: "Settings", *, settings_file: Path | None = None, max_error_db: float | None = None, **options: Any
+) -> "Settings":
     """Return the settings of a recording, changed by a settings file and then by options.
 
-    A settings file changes the keys that it holds; an array is replaced as a whole. Options are named
+    A settings file changes the keys that it holds; an array is replaced as a whole. Other options are named
     like the fields of `Processing`; those that are None change nothing.
     """
     from ertis_numba.geometry import PAPER_GRIDS
@@ -153,7 +170,10 @@ def settings_with(recorded: "Settings", *, settings_file: Path | None = None, **
             f"directions {directions} have limits of their own; give 2d:N or 3d:N with limits",
             ctx=click.get_current_context(),
         )
-    return settings.replace(processing=settings.processing.replace(**given))
+    settings = settings.replace(processing=settings.processing.replace(**given))
+    if max_error_db is None:
+        return settings
+    return settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
 
 
 def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":

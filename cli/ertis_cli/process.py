@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import options
+from ertis_cli import options, plans
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
@@ -32,6 +32,24 @@ __all__ = ["process"]
     "--beamformer",
     type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
     help="How microphones are combined; the recording's own choice by default.",
+)
+@click.option(
+    "--wavefront",
+    type=click.Choice(["plane", "spherical"]),
+    help="What an echo looks like to the array; the recording's own choice by default.",
+)
+@click.option(
+    "--max-error",
+    "max_error_db",
+    type=options.ERROR_BUDGET,
+    metavar="DB|PRESET",
+    help="Error that images may have, as in -40, or draft, standard, fine, exact; the settings' own by default.",
+)
+@click.option("--explain", is_flag=True, help="Tell the plan first: what it does, its predicted error and time.")
+@click.option(
+    "--verify",
+    is_flag=True,
+    help="Measure the error of each sensor's first measurement; write nothing if it is beyond --max-error.",
 )
 @click.option(
     "--settings",
@@ -65,6 +83,10 @@ def process(
     range_m: tuple[float, float] | None,
     method: str | None,
     beamformer: str | None,
+    wavefront: str | None,
+    max_error_db: float | None,
+    explain: bool,
+    verify: bool,
     settings_file: Path | None,
     dtype: Literal["float32", "float16"],
     strict: bool,
@@ -79,6 +101,9 @@ def process(
     Settings come from the recording, then from the settings file, then from the options. The same
     recording gives the same energies, bit by bit, whatever the number of threads. All sensors of a
     recording go into one file, each with its own settings.
+
+    The fast method plans how exact to be: it takes the fastest way whose predicted error keeps --max-error.
+    The error is that of the image against the exact one, over all directions and ranges.
     """
     from ertis_numba.storage import EnergyscapeWriter, open_recording
 
@@ -97,14 +122,19 @@ def process(
                 range_m=range_m,
                 method=method,
                 beamformer=beamformer,
+                wavefront=wavefront,
+                max_error_db=max_error_db,
             )
             for recording in recordings
         ]
+        for given in settings:
+            plans.require_plan(given, explain=explain, verify=verify, max_error_db=max_error_db)
         writer = EnergyscapeWriter(target, recording=recordings, dtype=dtype, overwrite=force)
         runs = [_Run(options.pipeline(given, device=device, threads=threads, quiet=quiet)) for given in settings]
         for run, recording in zip(runs, recordings, strict=True):
             first = replace(recording[0], settings=run.pipeline.settings)
             _tell_faults(f"{path}: sensor {recording.sensor}", first, strict=strict)
+            run.told = plans.tell(run.pipeline, first, threads=threads, explain=explain, verify=verify, silent=as_json)
         measurements = (
             (run, measurement, recording.settings)
             for run, recording in zip(runs, recordings, strict=True)
@@ -119,7 +149,7 @@ def process(
     report = {
         "output": str(target),
         "measurements": len(times_ms),
-        **({name: rows[0][name] for name in ("directions", "ranges")} if len(rows) == 1 else {}),
+        **({name: rows[0][name] for name in ("directions", "ranges", *runs[0].told)} if len(rows) == 1 else {}),
         "device": runs[0].pipeline.device,
         "median_ms": round(statistics.median(times_ms), 3),
         "sensors": rows,
@@ -153,11 +183,12 @@ def _tell_faults(name: str, measurement: "Measurement", *, strict: bool) -> None
 
 
 class _Run:
-    """The pipeline of one sensor, and how long it took for each measurement."""
+    """The pipeline of one sensor, what was said of its plan, and how long it took for each measurement."""
 
     def __init__(self, pipeline: "Pipeline") -> None:
         self.pipeline = pipeline
         self.times_ms: list[float] = []
+        self.told: dict[str, Any] = {}
 
     def __call__(self, measurement: "Measurement", recorded: "Settings") -> "Energyscape":
         settings = self.pipeline.settings
@@ -176,4 +207,5 @@ class _Run:
             "directions": len(self.pipeline.grid),
             "ranges": len(self.pipeline.range_m),
             "median_ms": round(statistics.median(self.times_ms), 3),
+            **self.told,
         }

@@ -1,4 +1,4 @@
-"""Pictures of energyscapes. The only door to Matplotlib.
+"""Pictures of energyscapes, and of what exactness costs. The only door to Matplotlib.
 
 They are drawn without pyplot, so that no global state and no window system is needed. As x is
 forward, y left and z up in the sensor frame, positive azimuth is on the left: a sector is seen from
@@ -11,11 +11,35 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from ertis_numba import checks
-from ertis_numba.figures import _curve, _sector, _sphere
+from ertis_numba.figures import _curve, _front, _sector, _sphere
 from ertis_numba.figures._canvas import THEMES, Canvas
+from ertis_numba.figures._front import Rated
 from ertis_numba.frames import Energyscape, Peak
 
-__all__ = ["plot"]
+__all__ = ["Rated", "front", "plot"]
+
+
+def front(points: Sequence[Rated], *, title: str, note: str = "", theme: Literal["dark", "light"] = "dark") -> Figure:
+    """Draw error and time of plans; those that no other one beats are joined by a line.
+
+    Parameters
+    ----------
+    points : sequence of Rated
+    title, note : str
+        Heading, and the line below it.
+    theme : {"dark", "light"}
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ArgumentError
+        The theme is unknown.
+    """
+    checks.choice("theme", theme, THEMES)
+    return _front.draw(Canvas(THEMES[theme], 1.0, ()), points, title=title, note=note)
 
 
 def plot(

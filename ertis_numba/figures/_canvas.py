@@ -45,12 +45,16 @@ class Canvas:
 
     def figure(self, image: Energyscape, *, width_in: float, height_in: float) -> Figure:
         """Return an empty page under a heading that says what is seen, and with which settings."""
+        title = f"Energyscape · {image.stamp.sensor} · measurement {image.stamp.sequence}"
+        return self.page(title, _settings_line(image), width_in=width_in, height_in=height_in)
+
+    def page(self, title: str, line: str, *, width_in: float, height_in: float) -> Figure:
+        """Return an empty page under a heading of two lines."""
         figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor=self.theme.page)
         FigureCanvasAgg(figure)
-        title = f"Energyscape · {image.stamp.sensor} · measurement {image.stamp.sequence}"
         left, top = 0.42 / width_in, 1 - 0.42 / height_in
         figure.text(left, top, title, color=self.theme.ink, fontsize=14, fontweight="bold")
-        figure.text(left, top - 0.27 / height_in, _settings_line(image), color=self.theme.faint, fontsize=9)
+        figure.text(left, top - 0.27 / height_in, line, color=self.theme.faint, fontsize=9)
         return figure
 
     def level_db(self, energy: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -40,7 +40,7 @@ PARTS: Final = {
 """Name of each part of the error, and what it is due to."""
 
 _WAVES = 40
-_ARITHMETIC = 10 ** (-112 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
+_ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
@@ -70,6 +70,10 @@ class Texture:
         Power density of the bits from 0 to half the PDM rate, by that of white bits.
     level : float
         Power after the matched filter, in the ranges of the image, by that of white bits.
+    places : (quantile,) float64
+        Power of the image at its places, from the darkest to the brightest, by the mean.
+    covariance : (tile, wave, mic, mic) complex128, optional
+        Of what some microphones hear in each tile of ranges, at the frequencies of an estimate of `BeamNodes`.
     colour : float
         By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
     """
@@ -79,6 +83,8 @@ class Texture:
     crest: float
     noise: NDArray[np.float64]
     level: float
+    places: NDArray[np.float64]
+    covariance: NDArray[np.complex128] | None = None
     colour: float = 1.0
 
     @classmethod
@@ -88,7 +94,7 @@ class Texture:
         frequency_hz = np.linspace(0, settings.recording.pdm_rate_hz / 2, 1025)
         corner_hz = _NOISE_CORNER_HZ * settings.recording.pdm_rate_hz / _NOISE_RATE_HZ
         noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
-        return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, _SAFE_COLOUR)
+        return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
 
 
 class ErrorModel:
@@ -118,9 +124,24 @@ class ErrorModel:
         return texture.colour * (0.5 * varying / texture.gain + (0.5 if fit.is_fitted else 1.0) * shared)
 
     def beams(self, nodes: BeamNodes) -> float:
-        """Return the part of interpolated beams, in the same way, and a fifth more for what differs between images."""
-        errors = np.exp(np.interp(self.frequency_hz, nodes.frequency_hz, np.log(np.maximum(nodes.errors, 1e-30))))
-        return self._of(1.2 * self.texture.colour * float(errors @ self.texture.shares))
+        """Return the part of interpolated beams, from an estimate of `BeamNodes`.
+
+        Without a measurement in the same way as `delays`. With one, from what each tile's sound makes of the errors:
+        beam ``b = hᵀx`` and error ``e = dᵀx`` are sums of the same signals, of covariance R; an envelope errs by
+
+            Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*  and so on.
+        """
+        covariance = self.texture.covariance
+        if covariance is None:
+            return self._of(1.2 * self.texture.colour * float(nodes.errors @ self.texture.shares))
+        heard = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.steering), optimize=True)
+        missed = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.wrong), optimize=True)
+        beams = np.einsum("mwu,tmwu->tu", nodes.steering, heard).real
+        both = np.einsum("mwu,tmwu->tu", nodes.wrong, heard)
+        errors = np.einsum("mwu,tmwu->tu", nodes.wrong, missed).real
+        beams = np.maximum(beams, 1e-9 * beams.max(initial=1e-30))
+        wrong = both.real**2 / beams + 0.5 * np.maximum(errors - np.abs(both) ** 2 / beams, 0.0)
+        return 1.3 * float(wrong.sum() / beams.sum())
 
     def zones(self, aperture: Aperture, range_m: NDArray[np.float64], count: int, *, sound_speed_m_s: float) -> float:
         """Return the part of zones in which delays are those of their middle.
@@ -162,7 +183,7 @@ class ErrorModel:
         of_weights = n_terms / weight_limit**2 / 6
         return self._of(taps * (of_samples + of_weights))
 
-    def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float) -> float:
+    def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float, filled: float) -> float:
         """Return the part of beams of nodes of which 16 bits are kept: 2⁻¹⁵ of what all terms at full scale add up to.
 
         Parameters
@@ -172,14 +193,17 @@ class ErrorModel:
             Sum of the magnitudes of one microphone's weights, 1 where it has one.
         taps : float
             As for `samples`.
+        filled : float
+            What they add up to by 2³¹, at most 1.
         """
-        step_2 = self.texture.crest * n_mics * sum_of_terms**2 / 2.0**30
+        step_2 = self.texture.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
         return self._of(taps * step_2 / 6)
 
     def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
         """Return the part of what the decimation folds into the band: noise beyond it, through the filter's stop band.
 
-        The filter is the one in whole numbers, so that what rounding leaves of its stop band counts.
+        The filter is the one in whole numbers, so that what rounding leaves of its stop band counts. Noise is
+        everywhere, and where the image is darker than that, it changes magnitudes by all of itself.
         """
         settings, noise = self._settings, self.texture.noise
         low_hz, high_hz = matched_band_hz(settings.call)
@@ -192,7 +216,9 @@ class ErrorModel:
         distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
         outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
         passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
-        return self._of(passed / self.texture.level)
+        power = 1.25 * passed / self.texture.level / self.texture.gain  # a quarter more for what differs between images
+        dark = np.exp(-4 * np.sqrt(self.texture.places / max(power, 1e-30)))  # near the mean of Rice's distribution
+        return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
         """Return the part of single precision."""

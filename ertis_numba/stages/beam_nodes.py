@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError
 from ertis_numba.stages.fitting import Spectrum, fit, weights_of
 
-__all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "require_nodes"]
+__all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "estimated_mics", "require_nodes"]
 
 FEWEST_RANGES = 64
 """Of an image whose beams are interpolated: the kernels read signals as far."""
@@ -128,6 +128,8 @@ class BeamNodes:
 
     Attributes
     ----------
+    steering, wrong : (mic, wave, direction) complex128
+        Of an estimate: plane waves of some directions at some microphones, and by how much they are missed.
     squares : float
         Sum of a beam's squared weights, the mean over directions.
     points : (node, axis) float64
@@ -139,7 +141,7 @@ class BeamNodes:
     weights : (direction, pair, 2) float64
         In that order.
     frequency_hz, errors : (wave,) float64
-        Power of the error by that of the beam at some frequencies, the mean over uncorrelated microphones and over
+        Of an estimate: power of the error by that of the beam, the mean over uncorrelated microphones and over
         directions.
     """
 
@@ -161,18 +163,15 @@ class BeamNodes:
         # A patch looks the same wherever it lies: only where the direction is in it matters.
         self._inside = aperture.directions - lowest * spacing
         patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
-        most, n_waves = (_MOST_ESTIMATED, _WAVES_ESTIMATED) if estimate else (_MOST_FITTED, _WAVES)
-        mics, directions = (_some(count, most) for count in (len(aperture.positions_m), len(lowest)))
-        n_waves = min(max(n_waves, _FEWEST_EQUATIONS // len(mics)), len(spectrum.power))
-        chosen = np.unique(np.linspace(0, len(spectrum.power) - 1, n_waves).astype(int))
+        mics, chosen = _mics_and_waves(len(aperture.positions_m), len(spectrum.power), estimate=estimate)
+        directions = _some(len(lowest), _MOST_ESTIMATED if estimate else _MOST_FITTED)
         self.frequency_hz = spectrum.frequency_hz[chosen]
         power = np.tile(spectrum.power[chosen] / spectrum.power[chosen].sum() / len(mics), len(mics))
         taps, wanted = (self._waves(points, mics) for points in (patch, self._inside[directions]))
         gain, weights = fit(taps, wanted, power, real=True, least_power=_LEAST_POWER)
-        errors = np.mean(np.abs(gain[:, None] * (taps @ weights) - wanted) ** 2, axis=1)
         self.squares = float(np.mean(np.sum(np.abs(weights) ** 2, axis=0)))
-        self.errors = errors.reshape(len(mics), n_waves).mean(axis=0)
         if estimate:
+            self._estimate(lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum)
             return
         self._patch, self._fitted_weights = patch, weights
         self._fitted_directions = directions
@@ -190,6 +189,25 @@ class BeamNodes:
         self.rows = order.astype(np.int32)
         self.places = np.ascontiguousarray(places[order], np.int32)
         self.weights = np.ascontiguousarray(found[order]).reshape(len(lowest), -1, 2)
+
+    def _estimate(
+        self,
+        moved: NDArray[np.float64],
+        patch: NDArray[np.float64],
+        inside: NDArray[np.float64],
+        mics: NDArray[np.intp],
+        weights: NDArray[np.complex128],
+        spectrum: Spectrum,
+    ) -> None:
+        """Evaluate what is missed at all frequencies of the spectrum."""
+        self.frequency_hz = spectrum.frequency_hz
+        made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
+        gain = np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+        wrong = gain[:, None] * made - wanted
+        shape = (len(mics), len(self.frequency_hz), len(inside))
+        self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))
+        there = self._waves(moved, mics)  # from the lowest node of each patch to the centre of the array
+        self.steering, self.wrong = (there * wanted).reshape(shape), (there * wrong).reshape(shape)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain of each microphone that goes with the weights: (mic, frequency) complex128."""
@@ -211,6 +229,18 @@ class BeamNodes:
         delay_s = -self._aperture.positions_m[mics] @ points.T / self._sound_speed_m_s
         turns = delay_s[:, None, :] * self.frequency_hz[:, None]
         return np.asarray(np.exp(2j * math.pi * turns).reshape(-1, len(points)))
+
+
+def estimated_mics(n_mics: int) -> NDArray[np.intp]:
+    """Return the microphones from which errors are estimated."""
+    return _some(n_mics, _MOST_ESTIMATED)
+
+
+def _mics_and_waves(n_mics: int, n_waves: int, *, estimate: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the microphones and the frequencies of the spectrum from which weights are found."""
+    mics = estimated_mics(n_mics) if estimate else _some(n_mics, _MOST_FITTED)
+    enough = max(_WAVES_ESTIMATED if estimate else _WAVES, _FEWEST_EQUATIONS // len(mics))
+    return mics, _some(n_waves, enough)
 
 
 def _some(count: int, most: int) -> NDArray[np.intp]:

@@ -141,8 +141,9 @@ class BeamformFloat32:
 def whole_limits(sum_of_weights: float) -> tuple[int, int]:
     """Return the largest whole numbers of weights and of samples, for a sum of weights by the largest of them."""
     bits = math.log2(_SAFE) + 31 - math.log2(sum_of_weights)
-    weight_bits = min(_WEIGHT_BITS, math.floor(bits / 2))
-    # One off for rounding, and a sample has 15 bits at most.
+    # A sample has 15 bits at most: what few microphones leave over goes to the weights.
+    weight_bits = min(max(_WEIGHT_BITS, math.floor(bits) - 15), math.floor(bits / 2), 15)
+    # One off for rounding.
     return 2**weight_bits - 1, math.floor(min(2.0 ** (bits - weight_bits), 2.0**15)) - 1
 
 

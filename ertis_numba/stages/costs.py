@@ -150,13 +150,17 @@ def _kept(path: Path) -> Costs | None:
 def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
     _LOG.info("measuring what the kernels of device %r take here; kept in %s", kernels.device, path)
     costs = measure(kernels, threads)
+    part: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:
+            part = Path(file.name)
             json.dump(costs.seconds, file, indent=1)
-        Path(file.name).replace(path)
+        part.replace(path)
     except OSError as error:
         _LOG.info("costs cannot be kept (%s)", error)
+        if part is not None:
+            part.unlink(missing_ok=True)
     return costs
 
 

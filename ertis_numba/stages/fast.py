@@ -171,13 +171,15 @@ class FastChain:
             self._demodulate(words, buffers.signals)
             self._finish(buffers, out)
 
-    def analytic(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> NDArray[np.complex64]:
-        """Do as `process` and return the analytic signals from the first range on: (mic, phase, sample) complex64."""
+    def analytic(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]
+    ) -> tuple[NDArray[np.complex64], int]:
+        """Do as `process`; return the analytic signals too, (mic, phase, sample), and the sample of the first range."""
         buffers = self._take_buffers()
         with self._kernels.threads(self._threads):
             self._demodulate(words, buffers.signals)
             self._finish(buffers, out)
-        return buffers.analytic[:, :, self._lead :].copy()
+        return buffers.analytic.copy(), self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""

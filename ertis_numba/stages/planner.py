@@ -67,6 +67,7 @@ class _Plan(NamedTuple):
 
     precision: str
     n_phases: int
+    interpolation: str
     delay_taps: int
     beam_taps: int
     density: float
@@ -182,6 +183,7 @@ class Planner:
         plan = _Plan(
             accuracy.precision,
             accuracy.oversampling or 1,
+            accuracy.interpolation,
             accuracy.delay_taps or 1,
             accuracy.beam_taps or 0,
             accuracy.beam_density or 2.0,
@@ -203,7 +205,7 @@ class Planner:
 
     def _rate(self, plan: _Plan) -> tuple[dict[str, float], dict[str, float]]:
         """Return the parts of a plan's error and what its stages take, in milliseconds."""
-        delays = self._delays(plan.n_phases, plan.delay_taps)
+        delays = self._delays(plan.n_phases, plan.interpolation, plan.delay_taps)
         nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         taps, filter_error = self._filter(plan.stop_band_db)
         parts = dict.fromkeys(PARTS, 0.0)
@@ -211,6 +213,7 @@ class Planner:
         parts["arithmetic"] = self.model.arithmetic()
         if nodes is not None:
             parts["beams"] = nodes.error
+            parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
         if self._settings.processing.wavefront == "spherical":
             parts["zones"] = 0.0 if plan.zones >= len(self._window.range_m) else self._one_zone / plan.zones**2
         if plan.precision == "int16":
@@ -247,7 +250,16 @@ class Planner:
             taps = (INTERPOLATIONS[given.interpolation] or 1,)
         bytes_per_phase = 8 * self._n_mics * self._window.n_outputs
         return [
-            _Plan(precision, n_phases, n_taps, beam_taps, density, stop_band_db, self._zone_count(budget))
+            _Plan(
+                precision,
+                n_phases,
+                given.interpolation,
+                n_taps,
+                beam_taps,
+                density,
+                stop_band_db,
+                self._zone_count(budget),
+            )
             for precision, n_phases, n_taps, (beam_taps, density), stop_band_db in itertools.product(
                 precisions, phases, taps, self._open_nodes(budget, adaptive=adaptive), self._stop_bands_db(budget)
             )
@@ -263,15 +275,16 @@ class Planner:
     def _open_nodes(self, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
         """Return which nodes are worth a try, and that every direction's own beam is."""
         given = self._settings.accuracy
-        if adaptive or given.beam_taps == 0:
+        flat = self._aperture.n_axes in {1, 2} and len(self._window.range_m) >= FEWEST_RANGES
+        if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
             return [(0, given.beam_density or 2.0)]
         found: list[tuple[int, float]] = [] if given.beam_taps else [(0, given.beam_density or 2.0)]
         for beam_taps in [given.beam_taps] if given.beam_taps else _DENSITIES:
             densities = _DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
             for density in reversed(densities):  # the coarser, the cheaper, until they err too much
-                nodes = self._nodes(beam_taps, density)
-                if nodes is None:
+                if not given.beam_taps and self._count_nodes(beam_taps, density) >= self._n_directions:
                     continue
+                nodes = self._nodes(beam_taps, density)
                 if nodes.error > budget and not given.beam_taps:
                     break
                 found.append((beam_taps, density))
@@ -298,10 +311,9 @@ class Planner:
     def _one_zone(self) -> float:
         return self.model.zones(self._aperture, self._window.range_m, 1, sound_speed_m_s=self._speed_m_s)
 
-    def _made_delays(self, n_phases: int, n_taps: int) -> _Delays:
-        accuracy = self._settings.accuracy
+    def _made_delays(self, n_phases: int, interpolation: str, n_taps: int) -> _Delays:
         step_s = 1 / (self._settings.output_rate_hz * n_phases)
-        fit, weights = _fitted(self._spectrum, accuracy.interpolation, n_taps, step_s)
+        fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
         return _Delays(
             n_taps=fit.n_taps,
             error=self.model.delays(fit),
@@ -309,27 +321,24 @@ class Planner:
             squares=float(np.mean(np.sum(weights**2, axis=1))),
         )
 
-    def _made_nodes(self, n_taps: int, density: float) -> _Nodes | None:
-        """Return what so many nodes mean; None where there is no use in them, or no way."""
-        aperture = self._aperture
-        if aperture.n_axes not in {1, 2} or len(self._window.range_m) < FEWEST_RANGES:
-            return None
+    def _count_nodes(self, n_taps: int, density: float) -> int:
         high_hz = self._settings.call.high_frequency_hz
-        spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
-        count = aperture.count_nodes(spacing, n_taps)
-        if count >= self._n_directions and self._settings.accuracy.beam_taps is None:
-            return None
+        spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
+        return self._aperture.count_nodes(spacing, n_taps)
+
+    def _made_nodes(self, n_taps: int, density: float) -> _Nodes:
+        require_nodes(self._aperture, len(self._window.range_m))
         nodes = BeamNodes(
-            aperture,
+            self._aperture,
             self._spectrum,
             n_taps=n_taps,
             density=density,
-            high_hz=high_hz,
+            high_hz=self._settings.call.high_frequency_hz,
             sound_speed_m_s=self._speed_m_s,
             estimate=True,
         )
-        n_pairs = n_taps**aperture.n_axes // 2
-        return _Nodes(count, n_pairs, self.model.beams(nodes), nodes.squares)
+        n_pairs = n_taps**self._aperture.n_axes // 2
+        return _Nodes(self._count_nodes(n_taps, density), n_pairs, self.model.beams(nodes), nodes.squares)
 
     def _made_filter(self, stop_band_db: float) -> tuple[NDArray[Any], float]:
         try:
@@ -347,7 +356,10 @@ class Planner:
             n_terms=delays.n_taps, terms=delays.squares, limit=limit, weight_limit=weight_limit, taps=squares
         )
         if nodes is not None:
-            error += self.model.nodes(n_mics=self._n_mics, sum_of_terms=delays.sum_of_weights, taps=squares)
+            filled = limit * weight_limit * self._n_mics * delays.sum_of_weights / 2**31
+            error += self.model.nodes(
+                n_mics=self._n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
+            )
         return error
 
     @functools.cached_property

@@ -12,6 +12,7 @@ from ertis_numba.geometry import microphones
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import Texture
+from ertis_numba.stages.beam_nodes import estimated_mics
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.waveform import matched_filter, matched_spectrum
 
@@ -21,6 +22,8 @@ _TILE = 96  # ranges
 _MOST_MICS = 8  # whose bits are looked at
 _SEGMENT = 4096
 _WAVES = 40
+_TAPERED = 0.5  # of the ranges, at each end
+_QUANTILES = (np.arange(16) + 0.5) / 16
 
 
 def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet, *, threads: int = 1) -> Texture:
@@ -30,33 +33,47 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     """
     rough = settings.replace(
         accuracy=Accuracy(
-            precision="float32", oversampling=2, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=60.0, zones=8
+            precision="float32",
+            oversampling=2,
+            interpolation="linear",
+            delay_taps=2,
+            beam_taps=0,
+            beam_density=2.0,
+            stop_band_db=60.0,
+            zones=8,
         ),
         processing=settings.processing.replace(beamformer="delay_and_sum"),
     )
     chain = FastChain(rough, kernels, threads=threads)
     words = np.require(measurement.words, requirements=["C", "A", "W"]).reshape(len(measurement.words), -1)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
-    analytic = chain.analytic(words, image)  # (mic, phase, sample), from the first range on
+    heard, lead = chain.analytic(words, image)
+    analytic = heard[:, :, lead:]
     n_mics, n_phases, _ = analytic.shape
     series = np.moveaxis(analytic, 1, 2)[:, : len(chain.range_m)].reshape(n_mics, -1)
     power = float(np.mean(np.abs(series) ** 2)) or 1e-30
     image_power = float(np.mean(np.square(image, dtype=np.float64)))
-    powers = np.abs(series) ** 2
-    starts = range(0, powers.shape[1], n_phases * _TILE)
-    largest = np.array([powers[:, start : start + n_phases * _TILE].max() for start in starts], dtype=np.float64)
+    # A tile reaches as far over its ranges as delays do.
+    starts = range(0, len(chain.range_m), _TILE)
+    largest = [np.max(np.abs(heard[:, :, start : start + _TILE + 2 * lead])) ** 2 for start in starts]
+    covariance = _covariance(series, settings, n_phases * settings.output_rate_hz)
     return Texture(
         shares=_shares(series, settings, n_phases * settings.output_rate_hz),
         gain=max(image_power / (power / n_mics), 1e-3),
         crest=float(np.mean(largest)) / power,
         noise=_noise(words, settings, kernels),
         level=max(power / _white_power(settings), 1e-12),
+        covariance=covariance,
+        places=np.quantile(np.square(image, dtype=np.float64), _QUANTILES) / (image_power or 1.0),
     )
 
 
 def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.float64]:
     """Return how power is spread over the frequencies of the model."""
-    found = np.sum(np.abs(scipy.fft.fft(series, axis=1)) ** 2, axis=0)
+    # Cut off sharply, what is strong would spread to the edges of the band, where interpolation errs most.
+    edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
+    taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
+    found = np.sum(np.abs(scipy.fft.fft(series * taper, axis=1)) ** 2, axis=0)
     centres_hz, nominal = matched_spectrum(settings.call, n_waves=_WAVES)
     # Sampling at this rate has moved the band by a multiple of it.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
@@ -65,6 +82,28 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
     shares = found[around].mean(axis=1) * np.gradient(centres_hz) if len(bins) > 1 else np.ones(1)
     shares = np.where(nominal > 0, shares, 0.0)
     return np.asarray(shares / shares.sum()) if shares.sum() > 0 else nominal
+
+
+def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.complex128]:
+    """Return what microphones have in common, tile by tile: (tile, wave, mic, mic) complex128."""
+    layout = microphones(settings.array)
+    centres_hz, _ = matched_spectrum(settings.call, n_waves=_WAVES)
+    mics = estimated_mics(len(series))
+    length = max(8, round(_TILE * rate_hz / settings.output_rate_hz))
+    half = length // 2
+    padded = np.pad(series[mics], ((0, 0), (half, length + half)))
+    tiles = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)[:, :: max(1, half)]
+    # Cut off sharply, what is strong would spread to the edges of the band, where interpolation errs most.
+    spectra = scipy.fft.fft(tiles * np.hanning(length), axis=2)
+    # Sampling has moved the band by multiples of the rate: a bin stands for the frequency that lies in the band.
+    bins_hz = np.arange(length) * rate_hz / length
+    frequency_hz = bins_hz + rate_hz * np.rint(((centres_hz[0] + centres_hz[-1]) / 2 - bins_hz) / rate_hz)
+    late_s, gain = (values[layout.enabled][mics, None, None] for values in (layout.delay_s, layout.gain))
+    spectra = spectra * np.exp(2j * np.pi * late_s * frequency_hz) / gain
+    nearest = np.argmin(np.abs(frequency_hz[:, None] - centres_hz), axis=1)
+    inside = (frequency_hz > centres_hz[0]) & (frequency_hz < centres_hz[-1])
+    found = [spectra[:, :, (nearest == wave) & inside] for wave in range(len(centres_hz))]
+    return np.stack([np.einsum("mtb,ntb->tmn", part, np.conj(part)) for part in found], axis=1)
 
 
 def _white_power(settings: Settings) -> float:

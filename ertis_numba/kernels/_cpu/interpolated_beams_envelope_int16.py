@@ -50,7 +50,7 @@ def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
 
 @intrinsic
 def _pair_rows(typing_context, rows, lower, pairs, node):
-    """Fill ``pairs[node]`` with the row ``lower`` and, in the upper bits, the other one; no loop would be vectorised."""
+    """Fill ``pairs[node]`` with the row ``lower`` and above its bits those of the other one: no loop is vectorised."""
     signature = types.void(rows, types.intp, pairs, types.intp)
 
     def codegen(context, builder, signature, arguments):

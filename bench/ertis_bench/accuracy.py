@@ -1,0 +1,189 @@
+"""Error against time: many plans, and which of them no other one beats."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ertis_bench import checks, exact, machine, subject, timing
+from ertis_bench.plans import in_words, plans
+from ertis_numba import figures, kernels
+from ertis_numba.frames import Measurement, Peak
+from ertis_numba.kernels import KernelSet
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import ERROR_PRESETS_DB, Settings
+from ertis_numba.stages.detect import find_peaks
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.texture import texture_of
+
+__all__ = ["DIRECTIONS", "PAPER", "TURN", "beats", "plot", "run"]
+
+DIRECTIONS = "3000"
+PAPER = "the paper's method"
+_RANGE_M = (0.5, 5.0)
+_EXACT_DB = -100.0  # what stands for the exact image is off by that at most
+TURN = 5
+"""Calls in a row, few because a turn of all plans takes some seconds, over which machines change."""
+
+
+def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS) -> dict[str, Any]:
+    """Measure error and time of all plans on each subject, and return the report.
+
+    Parameters
+    ----------
+    count : int
+        Measurements per plan.
+    say : callable
+        Told what goes on.
+    directions : str
+        As ``processing.directions``.
+
+    Raises
+    ------
+    DataError
+        What stands for the exact image is not exact.
+    """
+    kernel_set = kernels.load("cpu")
+    found, left_out = _subjects(say)
+    rows, sources = [], []
+    for name, (measurement, source) in found.items():
+        settings = _settings(measurement.settings, directions)
+        scene = _Subject(name, measurement, settings, kernel_set, say)
+        sources.append({"subject": name, "source": source, "exact_db": round(scene.exact_db, 1)})
+        rows += scene.rows(count)
+    return {
+        "machine": machine.describe(),
+        "rows": rows,
+        "count": count,
+        "directions": directions,
+        "range_m": list(_RANGE_M),
+        "subjects": sources,
+        "left_out": left_out,
+    }
+
+
+def plot(report: dict[str, Any], path: Path) -> None:
+    """Draw error and time of all plans; the first subject's presets are named."""
+    points = []
+    for row in report["rows"]:
+        label = PAPER if row["plan"] == PAPER else row["plan"].partition(":")[0] if ":" in row["plan"] else ""
+        points.append(
+            figures.Rated(
+                series=row["subject"],
+                error_db=row["error_db"],
+                time_ms=row["time_ms"],
+                on_front=row["on_front"],
+                label=label if row["subject"] == report["rows"][0]["subject"] else "",
+            )
+        )
+    title = f"What exactness costs · {report['directions']} directions"
+    figures.front(points, title=title, note=report["machine"]["cpu"]).savefig(path)
+
+
+def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, str]], list[str]]:
+    """Return what is measured on, and what cannot be."""
+    found, left_out = {}, []
+    room = subject.real()
+    if room is None:
+        left_out.append("real measurement")
+        say("real measurement: left out, as the package rtisdev, which has it, is not installed")
+    else:
+        found["real"] = room
+    found["synthetic"] = subject.measurement()
+    return found, left_out
+
+
+def _settings(settings: Settings, directions: str) -> Settings:
+    """Return settings with the range axis of the paper's method, so that all images have the same."""
+    processing = settings.processing.replace(directions=directions, range_m=_RANGE_M, wavefront="plane")
+    range_m = Pipeline(settings.replace(processing=processing.replace(method="paper"))).range_m
+    half_m = float(range_m[1] - range_m[0]) / 2
+    window_m = (float(range_m[0]), float(range_m[-1]) + half_m)
+    return settings.replace(processing=processing.replace(method="fast", range_m=window_m))
+
+
+class _Subject:
+    """One measurement, its exact image and its texture."""
+
+    def __init__(
+        self,
+        name: str,
+        measurement: Measurement,
+        settings: Settings,
+        kernel_set: KernelSet,
+        say: Callable[[str], None],
+    ) -> None:
+        self._name, self._measurement, self._settings = name, measurement, settings
+        self._kernels, self._threads, self._say = kernel_set, kernel_set.max_threads, say
+        say(f"{name}: checking the exact image")
+        plan = exact.exact_plan(settings, kernel_set, threads=self._threads)
+        image = Pipeline(settings.replace(accuracy=plan)).process(measurement)
+        self.exact_db = checks.require_exact(image, measurement, max_error_db=_EXACT_DB)
+        self._exact = image.energy
+        self._wanted: Sequence[Peak] = find_peaks(image, top=exact.PEAKS)
+        self._texture = texture_of(measurement, settings, kernel_set, threads=self._threads)
+
+    def rows(self, count: int) -> list[dict[str, Any]]:
+        """Return a row per plan, those that err most first."""
+        self._say(f"{self._name}: making plans")
+        pipelines = dict(self._pipelines())
+        self._say(f"{self._name}: errors of {len(pipelines)} plans")
+        rows = [self._row(name, pipeline) for name, pipeline in pipelines.items()]
+        self._say(f"{self._name}: timing {count} of each")
+        out = np.empty_like(self._exact)
+        calls = {
+            name: functools.partial(pipeline.process, self._measurement, out=out)
+            for name, pipeline in pipelines.items()
+        }
+        times_ms = timing.round_robin(calls, count=count, burst=TURN)
+        for row in rows:
+            row["time_ms"] = timing.summary(times_ms[row["plan"]])["median_ms"]
+        for row in rows:
+            row["on_front"] = not any(beats(other, row) for other in rows)
+        return sorted(rows, key=lambda row: -row["error_db"])
+
+    def _pipelines(self) -> Iterator[tuple[str, Pipeline]]:
+        settings = self._settings
+        processing = settings.processing.replace(method="paper")
+        yield PAPER, Pipeline(settings.replace(processing=processing))
+        chosen = {}
+        for preset, max_error_db in ERROR_PRESETS_DB.items():
+            pipeline = Pipeline(settings, max_error_db=max_error_db)
+            chosen[in_words(pipeline.settings.accuracy)] = preset, pipeline
+        for plan in plans(self._kernels):
+            if in_words(plan) not in chosen:
+                yield in_words(plan), Pipeline(settings.replace(accuracy=plan))
+        for words, (preset, pipeline) in chosen.items():
+            yield f"{preset}: {words}", pipeline
+
+    def _row(self, name: str, pipeline: Pipeline) -> dict[str, Any]:
+        image = pipeline.process(self._measurement)
+        peaks = exact.peak_errors(image, self._wanted)
+        return {
+            "subject": self._name,
+            "plan": name,
+            "error_db": round(exact.error_db(image.energy, self._exact), 1),
+            "predicted_db": None if name == PAPER else round(self._predicted_db(pipeline.settings), 1),
+            "time_ms": 0.0,
+            "on_front": False,
+            "peak_level_db": _rounded(peaks.level_db),
+            "peak_range_mm": _rounded(peaks.range_mm),
+            "peak_angle_deg": _rounded(peaks.angle_deg),
+            "peaks_lost": peaks.lost,
+        }
+
+    def _predicted_db(self, settings: Settings) -> float:
+        planner = Planner(settings, self._kernels, threads=self._threads, texture=self._texture)
+        return planner.chosen(settings.accuracy).error_db
+
+
+def beats(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether a plan errs no more and takes no longer than another, and is better in one of them."""
+    pairs = [(one[key], other[key]) for key in ("error_db", "time_ms")]
+    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)

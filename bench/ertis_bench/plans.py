@@ -1,0 +1,88 @@
+"""Plans that are worth comparing, and what to call them."""
+
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import INTERPOLATIONS, Accuracy
+
+__all__ = ["PLANS", "in_words", "plans"]
+
+_SAMPLES = {
+    "nearest": "nearest sample of {n} per range",
+    "carrier": "nearest of {n} per range, carrier turned",
+    "linear": "linear between {n} per range",
+    "cubic": "cubic between {n} per range",
+}
+
+PLANS: tuple[tuple[str, str | int, int, float, tuple[int, float] | None], ...] = (
+    ("float32", "nearest", 2, 40.0, None),
+    ("float32", "nearest", 8, 40.0, None),
+    ("float32", "nearest", 32, 40.0, None),
+    ("float32", "carrier", 2, 40.0, None),
+    ("float32", "carrier", 8, 40.0, None),
+    ("float32", "linear", 2, 40.0, None),
+    ("float32", "linear", 8, 80.0, None),
+    ("float32", "cubic", 2, 80.0, None),
+    ("float32", "cubic", 8, 80.0, None),
+    ("float32", 1, 8, 40.0, None),
+    ("float32", 1, 32, 80.0, None),
+    ("float32", 2, 2, 40.0, None),
+    ("float32", 2, 8, 80.0, None),
+    ("float32", 3, 2, 40.0, None),
+    ("float32", 3, 6, 100.0, None),
+    ("float32", 4, 2, 100.0, None),
+    ("float32", 4, 4, 140.0, None),
+    ("float32", 5, 2, 100.0, None),
+    ("float32", 6, 2, 140.0, None),
+    ("int16", 1, 2, 40.0, None),
+    ("int16", 1, 8, 40.0, None),
+    ("int16", 2, 2, 40.0, None),
+    ("int16", 2, 4, 80.0, None),
+    ("int16", 3, 2, 80.0, None),
+    ("int16", 4, 2, 80.0, None),
+    ("int16", 2, 1, 40.0, (2, 1.5)),
+    ("int16", 2, 1, 40.0, (2, 3.0)),
+    ("int16", 2, 2, 40.0, (4, 1.25)),
+    ("float32", 2, 2, 40.0, (4, 1.75)),
+    ("int16", 2, 4, 80.0, (4, 2.5)),
+    ("int16", 2, 8, 100.0, (6, 2.5)),
+    ("float32", 3, 6, 100.0, (6, 3.0)),
+    ("float32", 3, 4, 40.0, None),
+    ("float32", 3, 4, 60.0, None),
+    ("float32", 3, 4, 80.0, None),
+    ("float32", 3, 4, 120.0, None),
+)
+"""Precision; the way of interpolation, or from how many samples where it is fitted; samples per range; stop band in dB;
+nodes along each axis and their density, None where every direction's own beam is summed. The naive ones first."""
+
+
+def in_words(accuracy: Accuracy) -> str:
+    """Return a complete plan in a few words, such as ``int16, 2 samples of 2 per range, nodes 4 × 1.75, 60 dB``."""
+    n_phases, n_taps = accuracy.oversampling, accuracy.delay_taps
+    fitted = f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"
+    parts = [accuracy.precision, _SAMPLES.get(accuracy.interpolation, fitted).format(n=n_phases)]
+    if accuracy.beam_taps:
+        parts.append(f"nodes {accuracy.beam_taps} × {accuracy.beam_density:g}")
+    parts.append(f"{accuracy.stop_band_db:g} dB")
+    if accuracy.zones and accuracy.zones > 1:
+        parts.append(f"{accuracy.zones} zones")
+    return ", ".join(parts)
+
+
+def plans(kernels: KernelSet) -> list[Accuracy]:
+    """Return `PLANS`, complete; those in 16 bits where the device can."""
+    return [_plan(*row) for row in PLANS if row[0] != "int16" or kernels.tile_ranges]
+
+
+def _plan(
+    precision: str, way: str | int, n_phases: int, stop_band_db: float, nodes: tuple[int, float] | None
+) -> Accuracy:
+    beam_taps, beam_density = nodes or (0, 2.0)
+    return Accuracy().replace(
+        precision=precision,
+        oversampling=n_phases,
+        interpolation=way if isinstance(way, str) else "fitted",
+        delay_taps=INTERPOLATIONS[way] if isinstance(way, str) else way,
+        beam_taps=beam_taps,
+        beam_density=beam_density,
+        stop_band_db=stop_band_db,
+        zones=1,
+    )

@@ -1,0 +1,123 @@
+"""The error model: what it predicts, knowing what is heard, is what images err by."""
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.stages.accuracy import PARTS, Texture, decibels
+from ertis_numba.stages.planner import Planner
+from tests import reference
+from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, random_measurement, rated
+from tests.test_real import RAW
+
+OPTIMISTIC_DB, PESSIMISTIC_DB = 1.0, 3.0
+FLOOR_DB = -105.0  # what stands for the exact image errs by little less, and rounds as all plans do
+SCENES = 50
+EVERY = 6  # plans of a scene are tried, others of each
+
+
+@pytest.fixture(scope="module")
+def real():
+    """The real measurement, its best image and its texture."""
+    settings = Settings.from_preset("default_25_50")
+    settings = settings.replace(processing=settings.processing.replace(directions="2d:181", range_m=(0.8, 5.0)))
+    return Rated(Measurement(np.fromfile(RAW, dtype="<u4"), settings), settings)
+
+
+def wrong(case, plan):
+    """Predicted and measured error where they differ too much."""
+    chosen, measured_db = case.predicted(plan), case.measured_db(plan)
+    if measured_db < FLOOR_DB or -OPTIMISTIC_DB < chosen.error_db - measured_db < PESSIMISTIC_DB:
+        return None
+    largest = max(chosen.parts, key=lambda part: chosen.parts[part])
+    return f"{chosen.error_db:.2f} predicted, {measured_db:.2f} measured, mostly {largest}"
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_predictions_for_the_real_measurement(real, name):
+    assert wrong(real, PLANS[name]) is None
+
+
+@pytest.mark.parametrize("batch", range(SCENES // 10))
+def test_predictions_for_random_scenes(batch):
+    found = {
+        f"scene {seed}, {name}": wrong(rated(seed), PLANS[name])
+        for seed in range(10 * batch, 10 * batch + 10)
+        for place, name in enumerate(PLANS)
+        if (place + seed) % EVERY == 0
+    }
+    assert {case: said for case, said in found.items() if said} == {}
+
+
+def test_what_stands_for_the_exact_image_is_exact(real):
+    some = slice(0, 181, 45)
+    settings = real.settings.replace(accuracy=BEST)
+    azimuth_rad = np.radians(np.linspace(-90, 90, 181))[some]
+    range_m = ertis.Pipeline(settings).range_m
+    directions = unit_vectors(azimuth_rad, np.zeros_like(azimuth_rad))
+    exact = reference.exact(real.measurement.words, settings, directions, range_m)
+    assert reference.error_db(image_of(real.measurement, settings)[some], exact) < -115
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_without_a_measurement_predictions_err_on_the_safe_side(seed):
+    measurement, settings = random_measurement(seed)
+    case = Rated(measurement, settings)
+    for name in list(PLANS)[seed % 5 :: 5]:
+        plan = PLANS[name]
+        measured_db = case.measured_db(plan)
+        chosen = Planner(settings.replace(accuracy=plan), CPU, threads=1).chosen(plan)
+        # By how much the modulators' noise is louder than echoes, nobody can know beforehand.
+        if chosen.parts["filter"] < 0.01 * sum(chosen.parts.values()) and measured_db > FLOOR_DB:
+            assert chosen.error_db > measured_db - 0.5, name
+
+
+def test_the_model_names_each_part_that_a_plan_has(real):
+    wanted = {
+        "delays 2 2": {"delays"},
+        "nodes 4 2": {"delays", "beams"},
+        "16 bits": {"delays", "samples"},
+        "16 bits, nodes": {"delays", "beams", "samples"},
+    }
+    for name, parts in wanted.items():
+        chosen = real.predicted(PLANS[name])
+        assert set(chosen.parts) == set(PARTS)
+        assert {part for part, power in chosen.parts.items() if power > 0} == parts | {"filter", "arithmetic"}
+        assert chosen.error_db == pytest.approx(decibels(sum(chosen.parts.values())))
+
+
+def test_texture_is_that_of_what_is_heard():
+    """Noise of microphones that have nothing in common: a gain of 1, and a flat spectrum."""
+    settings = Settings(processing=Processing(directions="2d:91"), accuracy=Accuracy())
+    words = np.random.default_rng(1).integers(0, 2**32, settings.recording.n_samples, dtype=np.uint32)
+    texture = Rated(Measurement(words, settings), settings).texture
+    assert texture.gain == pytest.approx(1.0, rel=0.1)
+    assert texture.level == pytest.approx(1.0, rel=0.05)
+    assert texture.noise[1:-1] == pytest.approx(1.0, rel=0.5)
+    assert texture.shares.sum() == pytest.approx(1.0)
+    assert texture.shares == pytest.approx(Texture.unknown(settings).shares, rel=0.3, abs=1e-3)
+    # Of complex noise, the largest of thousands: the logarithm of their number.
+    assert 8 < texture.crest < 20
+
+
+def test_silence_has_a_texture():
+    settings = Settings(processing=Processing(directions="2d:9"))
+    case = Rated(Measurement(np.zeros(settings.recording.n_samples, dtype=np.uint32), settings), settings)
+    chosen = case.predicted(PLANS["standard"])
+    assert all(np.isfinite(power) and power >= 0 for power in chosen.parts.values())
+
+
+def test_nothing_has_a_level():
+    assert decibels(0.0) == -300.0
+    assert decibels(0.1) == pytest.approx(-10.0)
+
+
+def test_more_damping_lets_less_noise_through():
+    """From 60 dB on; taps of 16 bits do no better than 40 dB for long, which is what the model is there to know."""
+    planner = Planner(Settings(), CPU, threads=1)
+    powers = [planner.chosen(BEST.replace(stop_band_db=float(db))).parts["filter"] for db in range(40, 141, 20)]
+    assert powers[1] < 1.5 * powers[0]
+    assert (np.diff(np.log10(powers[1:])) < -1).all()

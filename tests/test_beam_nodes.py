@@ -1,0 +1,180 @@
+"""Beams made of those of nodes: within the error that the nodes themselves predict, for any flat array."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Accuracy, Air, Array, Call, Processing
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.fitting import Spectrum
+from ertis_numba.stages.planner import Planner
+from ertis_numba.waveform import matched_spectrum
+from tests import reference
+from tests.cases import SHORT, noise
+from tests.hard_cases.tuned import tuned
+
+SPEED_M_S = sound_speed_m_s(Air())
+CALL = Call()
+SPECTRUM = Spectrum(*matched_spectrum(CALL, n_waves=40))
+
+
+def random_plane(n_mics, seed):
+    """Microphones anywhere in a tilted plane, off the origin."""
+    random = np.random.default_rng(seed)
+    axes = np.linalg.qr(random.standard_normal((3, 2)))[0]
+    places = random.uniform(-0.03, 0.03, (n_mics, 2)) @ axes.T
+    return places - places.mean(axis=0)
+
+
+ARRAYS_M = {
+    "eRTIS": microphones(Array()).enabled_positions_m,
+    "line of 16": np.stack([np.zeros(16), 0.004 * (np.arange(16) - 7.5), np.zeros(16)], axis=1),
+    "two microphones": np.array([[0.0, -0.01, 0.005], [0.0, 0.01, -0.005]]),
+    "random plane": random_plane(24, 1),
+    "three in a corner": random_plane(3, 2),
+}
+GRIDS = {"half circle": "2d:181", "half sphere": "3d:500"}
+CHOICES = [(2, 2.0), (2, 4.0), (4, 1.25), (4, 2.0), (6, 1.75), (6, 3.0)]
+
+
+def apertures(array, grid):
+    axes = direction_grid(Processing(directions=GRIDS[grid]))
+    return Aperture.of(ARRAYS_M[array], unit_vectors(axes.azimuth_rad, axes.elevation_rad))
+
+
+def nodes_of(aperture, n_taps, density, **more):
+    return BeamNodes(
+        aperture,
+        SPECTRUM,
+        n_taps=n_taps,
+        density=density,
+        high_hz=CALL.high_frequency_hz,
+        sound_speed_m_s=SPEED_M_S,
+        **more,
+    )
+
+
+def predicted_db_of(nodes):
+    """The error of the nodes, weighted by what is heard at each frequency."""
+    errors = np.exp(np.interp(SPECTRUM.frequency_hz, nodes.frequency_hz, np.log(nodes.errors)))
+    return 10 * np.log10(errors @ SPECTRUM.power)
+
+
+def beams_of(aperture, points, spectra):
+    """Sums over microphones at every frequency: (point, wave) complex128."""
+    delays_s = aperture.delays_s(points, sound_speed_m_s=SPEED_M_S)
+    return np.einsum("mw,pmw->pw", spectra, np.exp(2j * math.pi * delays_s[:, :, None] * SPECTRUM.frequency_hz))
+
+
+@pytest.mark.parametrize(("n_taps", "density"), CHOICES)
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("array", ARRAYS_M)
+def test_nodes_make_all_beams_within_their_own_error(array, grid, n_taps, density):
+    """Of microphones that hear noise of their own, the mean over some noises."""
+    aperture = apertures(array, grid)
+    nodes = nodes_of(aperture, n_taps, density)
+    random = np.random.default_rng(5)
+    wrong = right = 0.0
+    for _ in range(4):
+        spectra = random.standard_normal((2, len(ARRAYS_M[array]), len(SPECTRUM.power)))
+        spectra = (spectra[0] + 1j * spectra[1]) * np.sqrt(SPECTRUM.power)
+        kept = beams_of(aperture, nodes.points, spectra * nodes.gain(SPECTRUM.frequency_hz))
+        near = kept[nodes.places[:, :, None] + np.arange(2)]  # (direction, pair, 2, wave)
+        made = np.einsum("dpk,dpkw->dw", nodes.weights, near)
+        wanted = beams_of(aperture, aperture.directions, spectra)[nodes.rows]
+        wrong += np.sum(np.abs(made - wanted) ** 2)
+        right += np.sum(np.abs(wanted) ** 2)
+    assert predicted_db_of(nodes) - 2 < 10 * np.log10(wrong / right) < predicted_db_of(nodes) + 1
+
+
+@pytest.mark.parametrize("array", ["eRTIS", "random plane", "line of 16", "three in a corner"])
+def test_an_estimate_is_within_a_decibel(array):
+    aperture = apertures(array, "half sphere")
+    for n_taps, density in CHOICES:
+        rough, made = (nodes_of(aperture, n_taps, density, estimate=estimate) for estimate in (True, False))
+        assert predicted_db_of(rough) == pytest.approx(predicted_db_of(made), abs=1.0)
+        assert rough.squares == pytest.approx(made.squares, rel=0.1)
+
+
+@pytest.mark.parametrize("array", ARRAYS_M)
+def test_nodes_lie_around_every_direction(array):
+    """Those about the rim of the half sphere lie beyond it, as points of the plane that are no directions."""
+    aperture = apertures(array, "half sphere")
+    spacing = aperture.spacing(2.0, high_hz=CALL.high_frequency_hz, sound_speed_m_s=SPEED_M_S)
+    nodes = nodes_of(aperture, 4, 2.0)
+    assert len(nodes.points) == aperture.count_nodes(spacing, 4) == len(np.unique(nodes.points.round(9), axis=0))
+    assert sorted(nodes.rows) == list(range(len(aperture.directions)))
+    assert np.linalg.norm(nodes.points, axis=1).max() > 1
+    near = nodes.points[nodes.places[:, :, None] + np.arange(2)]
+    away = (near - aperture.directions[nodes.rows][:, None, None]) / spacing
+    assert np.abs(away).max() < 2 + 1e-9
+    assert (away.min(axis=(1, 2)) <= -1 + 1e-9).all()
+    assert (away.max(axis=(1, 2)) >= 1 - 1e-9).all()
+
+
+@pytest.mark.parametrize("range_m", [0.08, 0.5, math.inf])
+@pytest.mark.parametrize("array", ARRAYS_M)
+def test_delays_of_points_are_the_plain_ones(array, range_m):
+    aperture = apertures(array, "half sphere")
+    axes = direction_grid(Processing(directions=GRIDS["half sphere"]))
+    directions = unit_vectors(axes.azimuth_rad, axes.elevation_rad)
+    found_s = aperture.delays_s(aperture.directions, sound_speed_m_s=SPEED_M_S, range_m=range_m)
+    if math.isinf(range_m):
+        wanted_m = -directions @ ARRAYS_M[array].T
+    else:
+        wanted_m = np.linalg.norm(range_m * directions[:, None] - ARRAYS_M[array], axis=2) - range_m
+    assert_allclose(found_s, wanted_m / SPEED_M_S, atol=1e-15)
+
+
+BALL = random_plane(12, 3) + 0.01 * np.random.default_rng(4).standard_normal((12, 3))
+NO_PLANE = {
+    "not flat": Array(layout="ball", positions_m=tuple(map(tuple, BALL.tolist())), word_bits=16),
+    "one microphone": Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8),
+}
+
+
+@pytest.mark.parametrize("array", NO_PLANE)
+def test_arrays_that_are_no_plane_get_direct_sums(array):
+    settings = tuned(SHORT, max_error_db=-35.0).replace(
+        array=NO_PLANE[array], processing=SHORT.processing.replace(directions="3d:800")
+    )
+    pipeline, measurement = Pipeline(settings), noise(settings)
+    assert pipeline.settings.accuracy.beam_taps == 0
+    some = np.arange(0, len(pipeline.grid), 100)
+    directions = unit_vectors(pipeline.grid.azimuth_rad[some], pipeline.grid.elevation_rad[some])
+    wanted = reference.exact(measurement.words, settings, directions, pipeline.range_m)
+    assert reference.error_db(pipeline.process(measurement).energy[some], wanted) < -35
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        Accuracy(beam_taps=4),
+        Accuracy(
+            precision="float32", oversampling=2, delay_taps=2, beam_taps=4, beam_density=2.0, stop_band_db=60.0, zones=1
+        ),
+    ],
+)
+@pytest.mark.parametrize("array", NO_PLANE)
+def test_arrays_that_are_no_plane_refuse_nodes(array, plan):
+    settings = SHORT.replace(array=NO_PLANE[array], accuracy=plan)
+    with pytest.raises(ArgumentError, match=r"accuracy\.beam_taps is .*the array (has no extent|is neither).*give 0"):
+        Pipeline(settings)
+
+
+def test_many_directions_are_made_of_nodes_and_few_are_not():
+    counts = {}
+    for directions in ("3d:60", "3d:3000"):
+        settings = tuned(SHORT, max_error_db=-35.0)
+        settings = settings.replace(processing=SHORT.processing.replace(directions=directions))
+        chosen = Planner(settings, kernels.load("cpu"), threads=1).choose()
+        counts[directions] = chosen.settings.accuracy.beam_taps
+    assert counts["3d:60"] == 0
+    assert counts["3d:3000"] > 0

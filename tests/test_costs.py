@@ -1,0 +1,121 @@
+"""What stages take on this machine: measured once, kept, and measured again where the file is of no use."""
+
+import json
+import logging
+import math
+
+import pytest
+
+from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.stages import costs
+from tests.cases import SHORT, noise
+
+CPU = kernels.load("cpu")
+
+
+@pytest.fixture
+def measured(monkeypatch, tmp_path):
+    """A folder of its own, nothing known, and a list that tells how often costs were measured."""
+    found = costs.costs_of(CPU, 1)
+    times = []
+
+    def once_more(kernel_set, threads):
+        times.append((kernel_set.device, threads))
+        return found
+
+    monkeypatch.setattr(costs, "_KNOWN", {})
+    monkeypatch.setattr(costs, "measure", once_more)
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path / "cache"))
+    return times
+
+
+def forget():
+    costs._KNOWN.clear()  # noqa: SLF001 - as in a process of its own
+
+
+@pytest.mark.parametrize("device", kernels.DEVICES)
+def test_measured_costs_are_times(device):
+    found = costs.measure(kernels.load(device), 1).seconds
+    assert all(0 < value < math.inf for value in found.values())
+    assert 1e-13 < found["sum_float32_few"] < 1e-6
+    assert found["demodulate_16"] < 1e-4
+
+
+def test_costs_are_kept(measured, caplog):
+    with caplog.at_level(logging.INFO, logger="ertis_numba"):
+        first = costs.costs_of(CPU, 1)
+    assert "measuring what the kernels of device 'cpu' take here; kept in" in caplog.text
+    path = costs.cache_file("cpu", 1)
+    assert json.loads(path.read_text("utf-8")) == first.seconds
+    assert list(path.parent.iterdir()) == [path]  # nothing half written is left
+    assert costs.costs_of(CPU, 1) is first
+    forget()
+    assert costs.costs_of(CPU, 1) == first
+    assert measured == [("cpu", 1)]
+
+
+def test_devices_and_threads_have_costs_of_their_own(measured):
+    costs.costs_of(CPU, 1)
+    costs.costs_of(CPU, 2)
+    costs.costs_of(kernels.load("numpy"), 1)
+    assert measured == [("cpu", 1), ("cpu", 2), ("numpy", 1)]
+    assert len(list(costs.cache_file("cpu", 1).parent.iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda _: "",
+        lambda text: text[: len(text) // 2],
+        lambda _: "[1, 2]",
+        lambda _: "null",
+        lambda text: text.replace('"image"', '"imago"'),
+        lambda text: text.replace('"image": ', '"image": -'),
+        lambda text: text.replace('"image": ', '"image": NaN, "was": '),
+        lambda text: text.replace('"image": ', '"image": "fast", "was": '),
+        lambda text: text.replace('"image": ', '"image": [], "was": '),
+        lambda text: text.replace('"image": ', '"image": 1e999, "was": '),
+        lambda _: b"\xff\xfe\x00",
+    ],
+)
+def test_spoilt_files_are_measured_again(measured, spoil):
+    found = costs.costs_of(CPU, 1)
+    path = costs.cache_file("cpu", 1)
+    spoilt = spoil(path.read_text("utf-8"))
+    path.write_bytes(spoilt if isinstance(spoilt, bytes) else spoilt.encode())
+    forget()
+    assert costs.costs_of(CPU, 1) == found
+    assert len(measured) == 2
+    assert json.loads(path.read_text("utf-8")) == found.seconds
+
+
+def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").write_text("no folder", "utf-8")
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path / "file" / "below"))
+    with caplog.at_level(logging.INFO, logger="ertis_numba"):
+        pipeline = Pipeline(SHORT, device="cpu", threads=1)
+    assert "costs cannot be kept (" in caplog.text
+    assert pipeline.process(noise(SHORT)).energy.any()
+    assert measured == [("cpu", 1)]
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_folder_in_the_way_of_the_file_does_no_harm():
+    costs.cache_file("cpu", 1).mkdir(parents=True)
+    assert costs.costs_of(CPU, 1).seconds
+    assert list(costs.cache_file("cpu", 1).parent.iterdir()) == [costs.cache_file("cpu", 1)]
+
+
+def test_more_work_takes_longer():
+    found = costs.costs_of(CPU, 1)
+    work = {
+        "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,
+        "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_beams": 300, "n_terms": 64,
+        "n_pairs": 8, "precision": "float32",
+    }  # fmt: skip
+    usual_ms = sum(found.stages_ms(costs.Work(**work)).values())
+    assert usual_ms > 0
+    for name in work.keys() - {"precision", "tap_bits"}:
+        more = work | {name: 2 * work[name]}
+        assert sum(found.stages_ms(costs.Work(**more)).values()) > usual_ms, name

@@ -1,0 +1,183 @@
+"""Plans: the budget is kept by the true error, what is given is kept, and exactness has its price."""
+
+import numpy as np
+import pytest
+
+from ertis_numba import kernels
+from ertis_numba.errors import ArgumentError, DeviceError
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import ERROR_PRESETS_DB, INTERPOLATIONS, Accuracy, Array, Call, Processing
+from ertis_numba.stages import planner
+from ertis_numba.stages.planner import Planner, complete, is_complete
+from tests import error_cases, reference
+from tests.cases import CASES, LINE_8, SHORT, noise
+from tests.hard_cases.tuned import tuned
+
+CPU = kernels.load("cpu")
+SMALL = SHORT.replace(processing=SHORT.processing.replace(directions="3d:300"), accuracy=Accuracy())
+
+
+def chosen_for(settings, **pinned):
+    return Planner(tuned(settings, **pinned), CPU, threads=1).choose()
+
+
+def random_settings(seed):
+    """Any array, grid, call and budget."""
+    random = np.random.default_rng(seed)
+    extent_m = random.uniform(0.01, 0.08, 3) * (1, 1, random.random() < 0.3) * (random.random(3) < 0.9)
+    positions_m = random.uniform(-0.5, 0.5, (random.integers(1, 33), 3)) * extent_m[::-1]
+    call = (
+        Call(start_frequency_hz=float(random.uniform(45e3, 85e3)), stop_frequency_hz=float(random.uniform(18e3, 35e3)))
+        if random.random() < 0.5
+        else Call()
+    )
+    return SHORT.replace(
+        array=Array(layout="random", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32),
+        call=call,
+        processing=Processing(
+            directions=f"{random.choice(['2d', '3d'])}:{random.integers(1, 400)}",
+            range_m=(0.3, float(random.uniform(0.32, 1.0))),
+            range_decimation=int(random.choice([20, 40, 100])),
+        ),
+        accuracy=Accuracy(max_error_db=float(random.uniform(-95, -15))),
+    )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_true_error_keeps_the_budget(seed):
+    """On noise, which is heard in the whole band and by microphones that have nothing in common."""
+    settings, measurement = random_settings(seed), noise(random_settings(seed), seed)
+    chosen = chosen_for(settings)
+    images = [
+        error_cases.image_of(measurement, settings.replace(accuracy=plan)).astype(float)
+        for plan in (chosen.settings.accuracy, error_cases.BEST)
+    ]
+    assert chosen.error_db <= settings.accuracy.max_error_db
+    assert reference.error_db(*images) < settings.accuracy.max_error_db
+
+
+@pytest.mark.parametrize("device", ["cpu", "numpy"])
+@pytest.mark.parametrize("budget_db", ERROR_PRESETS_DB.values())
+def test_pipelines_of_all_presets_keep_them(device, budget_db):
+    measurement = noise(SHORT)
+    pipeline = Pipeline(SHORT, device=device, max_error_db=budget_db)
+    assert is_complete(pipeline.settings.accuracy)
+    assert pipeline.settings.accuracy.max_error_db == budget_db
+    exact = error_cases.image_of(measurement, SHORT.replace(accuracy=error_cases.BEST))
+    assert reference.error_db(pipeline.process(measurement).energy.astype(float), exact.astype(float)) < budget_db
+
+
+@pytest.mark.parametrize(
+    "pinned",
+    [
+        {"precision": "float32"},
+        {"oversampling": 7},
+        {"delay_taps": 5},
+        {"beam_taps": 0},
+        {"beam_taps": 6},
+        {"beam_density": 2.2},
+        {"beam_taps": 4, "beam_density": 3.5, "oversampling": 3, "delay_taps": 3},
+        {"stop_band_db": 77.0},
+        {"zones": 3},
+        {"interpolation": "cubic"},
+        {"interpolation": "linear", "oversampling": 12},
+    ],
+)
+def test_what_is_given_is_kept(pinned):
+    found = chosen_for(SMALL, **pinned).settings.accuracy
+    assert is_complete(found)
+    assert {name: getattr(found, name) for name in pinned} == pinned
+    assert found.delay_taps == (INTERPOLATIONS[found.interpolation] or found.delay_taps)
+
+
+def test_16_bits_are_kept_or_refused():
+    if CPU.tile_ranges:
+        assert chosen_for(SMALL, precision="int16").settings.accuracy.precision == "int16"
+    else:
+        with pytest.raises(DeviceError, match=r"accuracy\.precision is 'int16', but this processor has no 16-bit dot"):
+            chosen_for(SMALL, precision="int16")
+
+
+@pytest.mark.parametrize(
+    ("pinned", "part"),
+    [
+        ({}, "single precision"),
+        ({"interpolation": "nearest", "oversampling": 12}, "interpolation of delayed samples"),
+        ({"beam_taps": 2, "beam_density": 1.5}, "interpolation of beams between nodes"),
+        ({"stop_band_db": 40.0}, "modulator noise that the decimation lets through"),
+    ],
+)
+def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part):
+    with pytest.raises(
+        ArgumentError, match=rf"max_error_db is -160, and the best that .*by {part}\); give -\d+ or"
+    ) as no:
+        chosen_for(SMALL, max_error_db=-160.0, **pinned)
+    least_db = float(str(no.value).partition("; give ")[2].split()[0])
+    assert chosen_for(SMALL, max_error_db=least_db, **pinned).error_db <= least_db
+    with pytest.raises(ArgumentError, match="and the best that"):
+        chosen_for(SMALL, max_error_db=least_db - 1.01, **pinned)
+
+
+@pytest.mark.parametrize("name", ["default", "wide band", "solid angle", "line of 8", "64 bits, two words"])
+def test_less_exact_is_never_slower(name):
+    settings = CASES[name].replace(processing=CASES[name].processing.replace(directions="3d:700"))
+    times_ms = [chosen_for(settings, max_error_db=float(budget_db)).time_ms for budget_db in range(-100, 0, 10)]
+    assert (np.diff(times_ms) <= 1e-9).all()
+    assert times_ms[-1] < 0.7 * times_ms[0]
+
+
+def test_the_same_costs_give_the_same_plan():
+    plans = {chosen_for(SMALL, max_error_db=budget_db).settings for budget_db in (-35.0, -60.0, -35.0, -60.0)}
+    assert len(plans) == 2
+
+
+def test_costs_decide(monkeypatch):
+    """Where nothing but sums takes time, beams are interpolated; where interpolation is dear, they are not."""
+    usual = planner.costs_of(CPU, 1)
+    many = SMALL.replace(processing=SMALL.processing.replace(directions="3d:2000"))
+    for dear, wanted in (("sum", True), ("pair", False)):
+        seconds = {name: 1e-9 if name.startswith(dear) else 1e-15 for name in usual.seconds}
+        monkeypatch.setattr(planner, "costs_of", lambda _kernels, _threads, seconds=seconds: type(usual)(seconds))
+        assert bool(chosen_for(many).settings.accuracy.beam_taps) == wanted
+
+
+def test_complete_plans_are_left_alone():
+    settings = SMALL.replace(accuracy=error_cases.BEST)
+    assert is_complete(settings.accuracy)
+    assert complete(settings, CPU, threads=1) is settings
+    done = complete(SMALL, CPU, threads=1)
+    assert is_complete(done.accuracy)
+    assert done.replace(accuracy=SMALL.accuracy) == SMALL
+    assert complete(done, CPU, threads=1) is done
+
+
+def test_the_papers_method_has_no_plan():
+    settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
+    assert complete(settings, CPU, threads=1) is settings
+    assert Pipeline(settings).settings is settings
+
+
+@pytest.mark.parametrize("beamformer", ["coherence_factor", "dmas", "capon"])
+def test_other_beamformers_get_plans_that_they_can_use(beamformer):
+    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
+    found = chosen_for(settings).settings.accuracy
+    assert (found.precision, found.delay_taps, found.beam_taps) == ("float32", 1, 0)
+
+
+def test_any_plan_is_rated_as_if_it_had_been_asked_for():
+    """Whatever the planner's own settings leave open or do not."""
+    open_planner = Planner(SMALL, CPU, threads=1)
+    for name in ("cubic", "nearest", "nodes 6 3", "nodes 2 2", "standard", "stop band 60"):
+        plan = error_cases.PLANS[name].replace(max_error_db=-35.0)
+        own = Planner(SMALL.replace(accuracy=plan), CPU, threads=1).chosen(plan)
+        found = open_planner.chosen(plan)
+        assert (found.parts, found.stages_ms) == (own.parts, own.stages_ms)
+        assert (found.parts["beams"] > 0) == bool(plan.beam_taps)
+
+
+def test_lines_have_fewer_nodes_than_planes():
+    line = SMALL.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8))
+    assert (
+        chosen_for(line, beam_taps=4).stages_ms["interpolation"]
+        < chosen_for(SMALL, beam_taps=4).stages_ms["interpolation"]
+    )

@@ -1,0 +1,207 @@
+"""The command line tells plans, measures their errors, and writes nothing that errs too much."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_bench import exact
+from ertis_bench.plans import PLANS, in_words, plans
+from ertis_cli.main import cli
+
+from ertis_numba import kernels
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Peak
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests import reference
+from tests.files import SMALL, noise
+
+THREADS = {"kernels": kernels.load("cpu"), "threads": 1}
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, ["process", *(str(argument) for argument in arguments)])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+def report(*arguments):
+    done = run(*arguments, "--json")
+    assert done.stdout.count("\n") == 1
+    assert "dB" not in done.stderr  # all of it is in the object
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "rec.h5", noise(count=1))
+
+
+def test_budget_goes_into_the_plan(recording, tmp_path):
+    for given, wanted_db in [("-48.5", -48.5), *ERROR_PRESETS_DB.items()]:
+        output = tmp_path / f"{given}.h5"
+        run(recording, "-o", output, "--max-error", given)
+        with open_energyscapes(output) as images:
+            accuracy = images.settings.accuracy
+        assert accuracy.max_error_db == wanted_db
+        assert accuracy.oversampling is not None
+
+
+def test_explains_the_plan(recording, tmp_path):
+    plan = report(recording, "-o", tmp_path / "a.h5", "--explain", "--max-error", -30)["plan"]
+    assert plan["accuracy"]["max_error_db"] == -30
+    assert plan["safe_db"] <= -30
+    assert plan["predicted_db"] < plan["safe_db"]  # noise holds none of the surprises that the safe side reckons with
+    for total, key in (("safe_db", "safe_db"), ("predicted_db", "predicted_db")):
+        parts = 10 * np.log10(sum(10 ** (part[key] / 10) for part in plan["parts"]))
+        assert parts == pytest.approx(plan[total], abs=0.2)
+    assert plan["time_ms"] == pytest.approx(sum(plan["stages_ms"].values()), abs=0.01)
+    near, far = plan["plane_waves"]
+    assert (near["range_m"], far["range_m"]) == (0.4, 0.9)
+    # The phase that plane waves are wrong by falls with range.
+    assert near["error_db"] - far["error_db"] == pytest.approx(20 * np.log10(0.9 / 0.4), abs=0.1)
+
+
+def test_explains_in_words(recording, tmp_path):
+    plain = run(recording, "-o", tmp_path / "a.h5", "--explain", "--quiet")
+    assert plain.stdout == ""
+    lines = plain.stderr.splitlines()
+    assert lines[0] == "plan of eRTIS-7, for an error of -35 dB at the most:"
+    assert "against spherical ones" in plain.stderr
+    assert any(line.startswith("    interpolation of delayed samples") for line in lines)
+    assert any(line.startswith("    in total") for line in lines)
+    assert lines[-1].startswith("  predicted time")
+    bent = run(recording, "-o", tmp_path / "b.h5", "--explain", "--wavefront", "spherical").stderr
+    assert "spherical wavefronts, with delays of their own in" in bent
+    assert "against spherical ones" not in bent
+    assert "    one set of delays for all ranges of a zone" in bent
+
+
+def test_explains_simple_interpolation(recording, tmp_path):
+    wishes = tmp_path / "wishes.toml"
+    wishes.write_text('[accuracy]\ninterpolation = "linear"\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
+    told = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
+    assert "single precision" in told
+    assert "made of two of them along a straight line" in told
+    assert "every direction's own beam is summed" in told
+
+
+@pytest.mark.parametrize("wavefront", ["plane", "spherical"])
+def test_verifies(recording, tmp_path, wavefront):
+    output = tmp_path / "a.h5"
+    found = report(recording, "-o", output, "--verify", "--max-error", -50, "--wavefront", wavefront)["verified"]
+    assert (found["max_error_db"], found["directions"], found["sequence"]) == (-50, 7, 10)
+    (measurement,) = noise(count=1)
+    with open_energyscapes(output) as images:
+        image = images[0]
+    vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    wanted = reference.exact(measurement.words, SMALL, vectors, image.range_m, spherical=wavefront == "spherical")
+    assert found["error_db"] == pytest.approx(reference.error_db(image.energy, wanted), abs=0.2)
+    assert found["error_db"] <= found["safe_db"] <= -50
+    assert -1 <= found["predicted_db"] - found["error_db"] <= 3
+    assert found["peaks"]["wanted"] == 10
+    assert found["peaks"]["lost"] == 0
+    assert found["peaks"]["level_db"] < 0.1
+
+
+def test_verifies_in_words(recording, tmp_path):
+    told = run(recording, "-o", tmp_path / "a.h5", "--verify").stderr.splitlines()
+    assert told[0].startswith("measurement 10 of eRTIS-7: error -")
+    assert told[0].endswith("allowed -35 dB")
+    assert told[1].startswith("  10 of the strongest 10 reflectors found, within ")
+
+
+def test_writes_nothing_that_errs_too_much(recording, tmp_path):
+    output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
+    # Nothing is left open, so that there is nothing to plan: only a measurement tells.
+    wishes.write_text(
+        '[accuracy]\nprecision = "float32"\noversampling = 2\ninterpolation = "nearest"\ndelay_taps = 1\n'
+        "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nzones = 1\n",
+        "utf-8",
+    )
+    done = run(recording, "-o", output, "--verify", "--settings", wishes, code=1)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("ertis: error: image of sensor eRTIS-7 errs by -")
+    assert last.endswith("allowed are -35 dB; give a lower --max-error, or leave more of [accuracy] open")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "wishes.toml"]
+
+
+def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
+    done = run(recording, "-o", tmp_path / "a.h5", "--max-error", -150, code=1)
+    assert done.stderr.splitlines()[-1].startswith("ertis: error: accuracy.max_error_db is -150, and the best")
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--max-error", "good"], "'good' is no error, give dB as in -40, or draft, standard, fine, exact"),
+        (["--method", "paper", "--explain"], "--explain is for --method fast; the paper's method has no plan"),
+        (["--method", "paper", "--max-error", "fine"], "--max-error is for --method fast"),
+        (["--verify", "--beamformer", "capon"], "--verify knows the exact image of delay_and_sum only, not of capon"),
+    ],
+)
+def test_refuses_what_has_no_plan(recording, arguments, told):
+    assert told in run(recording, *arguments, code=2).stderr
+
+
+def test_some_directions_stand_for_many(monkeypatch):
+    monkeypatch.setattr(exact, "_MOST_BEAMS", 4)
+    (measurement,) = noise(count=1)
+    image = Pipeline(SMALL, threads=1).process(measurement)
+    some = exact.measure(image, measurement, **THREADS)
+    assert (some.n_directions, some.peaks) == (4, None)
+    vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)[[0, 2, 4, 6]]
+    wanted = reference.exact(measurement.words, SMALL, vectors, image.range_m)
+    assert some.error_db == pytest.approx(reference.error_db(image.energy[[0, 2, 4, 6]], wanted), abs=0.1)
+
+
+def test_exact_plan_has_more_samples_where_ranges_lie_far_apart():
+    assert exact.exact_plan(SMALL, **THREADS).oversampling == 6
+    coarse = SMALL.replace(processing=SMALL.processing.replace(range_decimation=200))
+    plan = exact.exact_plan(coarse, **THREADS)
+    assert plan.oversampling > 6
+    (measurement,) = noise(coarse, count=1)
+    image = Pipeline(coarse.replace(accuracy=plan), threads=1).process(measurement)
+    vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    assert reference.error_db(image.energy, reference.exact(measurement.words, coarse, vectors, image.range_m)) < -100
+
+
+def test_silence_has_no_error():
+    with pytest.raises(DataError, match="the exact image is silent"):
+        exact.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
+
+
+def test_no_number_is_the_largest_error():
+    assert exact.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
+
+
+def test_peaks_are_compared_with_the_nearest(monkeypatch):
+    def peak(azimuth_deg, range_m, level_db):
+        return Peak(azimuth_deg=azimuth_deg, elevation_deg=0.0, range_m=range_m, level_db=level_db)
+
+    found = [peak(0.5, 1.001, 0.0), peak(3.0, 1.0, -1.0), peak(40.0, 2.05, -3.0)]
+    monkeypatch.setattr(exact, "find_peaks", lambda *_, **__: found)
+    errors = exact.peak_errors(None, [peak(0.0, 1.0, 0.0), peak(40.0, 2.0, -2.0), peak(4.0, 1.0, -3.0)])
+    assert (errors.wanted, errors.lost) == (3, 1)  # five centimetres off is another reflector
+    assert errors.level_db == pytest.approx(2.0)
+    assert errors.range_mm == pytest.approx(1.0)
+    assert errors.angle_deg == pytest.approx(1.0)
+    none = exact.peak_errors(None, [peak(-80.0, 1.0, 0.0)])
+    assert (none.lost, none.level_db) == (1, None)
+
+
+def test_words_of_a_plan():
+    made = plans(kernels.load("cpu"))
+    assert len(made) >= 20
+    assert len({in_words(plan) for plan in made}) == len(made)
+    without_16_bits = dataclasses.replace(kernels.load("cpu"), tile_ranges=0)
+    assert len(plans(without_16_bits)) == sum(row[0] == "float32" for row in PLANS)
+    plan = Accuracy(
+        precision="int16", oversampling=2, delay_taps=2, beam_taps=4, beam_density=1.75, stop_band_db=60.0, zones=8
+    )
+    assert in_words(plan) == "int16, 2 samples of 2 per range, nodes 4 × 1.75, 60 dB, 8 zones"
