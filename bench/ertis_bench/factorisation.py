@@ -28,7 +28,7 @@ _COMPLEX, _REAL = 4, 2  # real products of a complex number by a complex weight,
 _NODES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0)}  # densities by taps
 
 
-def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:  # noqa: ARG001 - there is nothing to repeat
+def run(*, say: Callable[[str], None]) -> dict[str, Any]:
     """Return the counts; arrays larger than eRTIS have its density of microphones, placed at random."""
     settings = Settings.from_preset("default_25_50")
     rows = []

@@ -12,7 +12,18 @@ from ertis_bench.machine import sentence
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["FORMS", "accuracy", "accuracy_front", "around", "paper", "place", "scaling", "simulation", "update"]
+__all__ = [
+    "FORMS",
+    "accuracy",
+    "accuracy_front",
+    "around",
+    "factorisation",
+    "paper",
+    "place",
+    "scaling",
+    "simulation",
+    "update",
+]
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
@@ -243,6 +254,19 @@ def simulation(report: dict[str, Any]) -> str:
     )
 
 
+def factorisation(report: dict[str, Any]) -> str:
+    """Return products per place: summed directly, from nodes of the whole array, and from those of its parts."""
+    parts = list(report["rows"][0]["parts"])
+    head = ["microphones", "directions", "each beam by itself", "nodes of the whole array"]
+    head += [f"of {n} sub-arrays" for n in parts[1:]]
+    rows = [
+        [str(row["microphones"]), str(row["directions"]), str(row["direct"])]
+        + [_or_dash(row["parts"][n], 0) for n in parts]
+        for row in report["rows"]
+    ]
+    return _table(head, rows)
+
+
 def _scene_conditions(report: dict[str, Any]) -> str:
     return (
         f"{report['count']} measurements each, in turns of {timing.BURST}: {report['words']:,} words of 32 "
@@ -289,6 +313,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
     "scaling": {"scaling": scaling},
     "simulation": {"simulation": simulation},
+    "factorisation": {"factorisation": factorisation},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }
 """What each command writes between which markers: a file chooses a form by the marker that it has."""

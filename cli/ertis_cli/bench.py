@@ -100,6 +100,17 @@ def simulation(**given: Any) -> None:
     _run("simulation", benchmark, **given)
 
 
+@bench.command()
+@_update
+@options.quiet
+@options.as_json
+def factorisation(**given: Any) -> None:
+    """Products per place of an image, with sub-arrays and without; nothing is timed."""
+    from ertis_bench import factorisation as benchmark
+
+    _run("factorisation", benchmark, **given)
+
+
 def _run(
     name: str, benchmark: ModuleType, *, targets: tuple[Path, ...], quiet: bool, as_json: bool, **given: Any
 ) -> dict[str, Any]:
