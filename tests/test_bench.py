@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import accuracy, checks, exact, machine, paper, plans, scaling, simulation, subject, tables, timing
+from ertis_bench import accuracy, checks, machine, paper, plans, scaling, simulation, subject, tables, timing
 from ertis_cli.main import cli
 
-from ertis_numba import figures, kernels
+from ertis_numba import figures, kernels, verification
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
@@ -260,7 +260,7 @@ def test_accuracy_refuses_an_exact_image_that_is_not(monkeypatch):
     rough = Accuracy(
         precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=80.0, zones=1
     )
-    monkeypatch.setattr(exact, "exact_plan", lambda *_, **__: rough)
+    monkeypatch.setattr(verification, "exact_plan", lambda *_, **__: rough)
     with pytest.raises(DataError, match=r"dB off the exact one; wanted at most -100 dB"):
         accuracy.run(count=1, say=lambda _: None, directions="2d:9")
 

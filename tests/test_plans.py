@@ -6,11 +6,10 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import exact
 from ertis_bench.plans import PLANS, in_words, plans
 from ertis_cli.main import cli
 
-from ertis_numba import kernels
+from ertis_numba import kernels, verification
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import unit_vectors
@@ -115,19 +114,29 @@ def test_verifies_in_words(recording, tmp_path):
     assert told[1].startswith("  10 of the strongest 10 reflectors found, within ")
 
 
-def test_writes_nothing_that_errs_too_much(recording, tmp_path):
+def test_refuses_a_plan_that_does_not_keep_its_budget(recording, tmp_path):
     output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
-    # Nothing is left open, so that there is nothing to plan: only a measurement tells.
     wishes.write_text(
         '[accuracy]\nprecision = "float32"\noversampling = 2\ninterpolation = "nearest"\ndelay_taps = 1\n'
         "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nzones = 1\n",
         "utf-8",
     )
-    done = run(recording, "-o", output, "--verify", "--settings", wishes, code=1)
+    done = run(recording, "-o", output, "--settings", wishes, code=1)
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("ertis: error: image of sensor eRTIS-7 errs by -")
-    assert last.endswith("allowed are -35 dB; give a lower --max-error, or leave more of [accuracy] open")
+    assert last.startswith("ertis: error: accuracy.max_error_db is -35, and the best that these settings can is -")
+    assert last.endswith("or leave more of [accuracy] open")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "wishes.toml"]
+
+
+def test_writes_nothing_that_errs_too_much(recording, tmp_path, monkeypatch):
+    """Predictions for what was never heard err on the safe side, so a true error beyond them has to be made up."""
+    measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
+    monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
+    output = tmp_path / "a.h5"
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(output), "--verify"])
+    assert done.exit_code == 1
+    assert "image of sensor eRTIS-7 errs by -30.0 dB, allowed are -35 dB; give a lower --max-error" in done.stderr
+    assert not output.exists()
 
 
 def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
@@ -150,10 +159,10 @@ def test_refuses_what_has_no_plan(recording, arguments, told):
 
 
 def test_some_directions_stand_for_many(monkeypatch):
-    monkeypatch.setattr(exact, "_MOST_BEAMS", 4)
+    monkeypatch.setattr(verification, "_MOST_BEAMS", 4)
     (measurement,) = noise(count=1)
     image = Pipeline(SMALL, threads=1).process(measurement)
-    some = exact.measure(image, measurement, **THREADS)
+    some = verification.measure(image, measurement, **THREADS)
     assert (some.n_directions, some.peaks) == (4, None)
     vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)[[0, 2, 4, 6]]
     wanted = reference.exact(measurement.words, SMALL, vectors, image.range_m)
@@ -161,9 +170,9 @@ def test_some_directions_stand_for_many(monkeypatch):
 
 
 def test_exact_plan_has_more_samples_where_ranges_lie_far_apart():
-    assert exact.exact_plan(SMALL, **THREADS).oversampling == 6
+    assert verification.exact_plan(SMALL, **THREADS).oversampling == 6
     coarse = SMALL.replace(processing=SMALL.processing.replace(range_decimation=200))
-    plan = exact.exact_plan(coarse, **THREADS)
+    plan = verification.exact_plan(coarse, **THREADS)
     assert plan.oversampling > 6
     (measurement,) = noise(coarse, count=1)
     image = Pipeline(coarse.replace(accuracy=plan), threads=1).process(measurement)
@@ -173,11 +182,11 @@ def test_exact_plan_has_more_samples_where_ranges_lie_far_apart():
 
 def test_silence_has_no_error():
     with pytest.raises(DataError, match="the exact image is silent"):
-        exact.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
+        verification.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
 
 
 def test_no_number_is_the_largest_error():
-    assert exact.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
+    assert verification.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
 
 
 def test_peaks_are_compared_with_the_nearest(monkeypatch):
@@ -185,13 +194,13 @@ def test_peaks_are_compared_with_the_nearest(monkeypatch):
         return Peak(azimuth_deg=azimuth_deg, elevation_deg=0.0, range_m=range_m, level_db=level_db)
 
     found = [peak(0.5, 1.001, 0.0), peak(3.0, 1.0, -1.0), peak(40.0, 2.05, -3.0)]
-    monkeypatch.setattr(exact, "find_peaks", lambda *_, **__: found)
-    errors = exact.peak_errors(None, [peak(0.0, 1.0, 0.0), peak(40.0, 2.0, -2.0), peak(4.0, 1.0, -3.0)])
+    monkeypatch.setattr(verification, "find_peaks", lambda *_, **__: found)
+    errors = verification.peak_errors(None, [peak(0.0, 1.0, 0.0), peak(40.0, 2.0, -2.0), peak(4.0, 1.0, -3.0)])
     assert (errors.wanted, errors.lost) == (3, 1)  # five centimetres off is another reflector
     assert errors.level_db == pytest.approx(2.0)
     assert errors.range_mm == pytest.approx(1.0)
     assert errors.angle_deg == pytest.approx(1.0)
-    none = exact.peak_errors(None, [peak(-80.0, 1.0, 0.0)])
+    none = verification.peak_errors(None, [peak(-80.0, 1.0, 0.0)])
     assert (none.lost, none.level_db) == (1, None)
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import checks, exact, machine, subject, timing
+from ertis_bench import checks, machine, subject, timing
 from ertis_bench.plans import in_words, plans
-from ertis_numba import figures, kernels
+from ertis_numba import figures, kernels, verification
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.kernels import KernelSet
 from ertis_numba.pipeline import Pipeline
@@ -118,11 +118,11 @@ class _Subject:
         self._name, self._measurement, self._settings = name, measurement, settings
         self._kernels, self._threads, self._say = kernel_set, kernel_set.max_threads, say
         say(f"{name}: checking the exact image")
-        plan = exact.exact_plan(settings, kernel_set, threads=self._threads)
+        plan = verification.exact_plan(settings, kernel_set, threads=self._threads)
         image = Pipeline(settings.replace(accuracy=plan)).process(measurement)
         self.exact_db = checks.require_exact(image, measurement, max_error_db=_EXACT_DB)
         self._exact = image.energy
-        self._wanted: Sequence[Peak] = find_peaks(image, top=exact.PEAKS)
+        self._wanted: Sequence[Peak] = find_peaks(image, top=verification.PEAKS)
         self._texture = texture_of(measurement, settings, kernel_set, threads=self._threads)
 
     def rows(self, count: int) -> list[dict[str, Any]]:
@@ -154,17 +154,17 @@ class _Subject:
             chosen[in_words(pipeline.settings.accuracy)] = preset, pipeline
         for plan in plans(self._kernels):
             if in_words(plan) not in chosen:
-                yield in_words(plan), Pipeline(settings.replace(accuracy=plan))
+                yield in_words(plan), Pipeline(settings.replace(accuracy=plan.replace(max_error_db=0.0)))
         for words, (preset, pipeline) in chosen.items():
             yield f"{preset}: {words}", pipeline
 
     def _row(self, name: str, pipeline: Pipeline) -> dict[str, Any]:
         image = pipeline.process(self._measurement)
-        peaks = exact.peak_errors(image, self._wanted)
+        peaks = verification.peak_errors(image, self._wanted)
         return {
             "subject": self._name,
             "plan": name,
-            "error_db": round(exact.error_db(image.energy, self._exact), 1),
+            "error_db": round(verification.error_db(image.energy, self._exact), 1),
             "predicted_db": None if name == PAPER else round(self._predicted_db(pipeline.settings), 1),
             "time_ms": 0.0,
             "on_front": False,

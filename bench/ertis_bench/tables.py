@@ -7,10 +7,10 @@ from typing import Any
 
 from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
-from ertis_bench.exact import PEAKS
 from ertis_bench.machine import sentence
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_numba.errors import ArgumentError
+from ertis_numba.verification import PEAKS
 
 __all__ = [
     "FORMS",

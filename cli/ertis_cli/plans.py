@@ -174,7 +174,7 @@ def _verified(
     pipeline: "Pipeline", first: "Measurement", planners: dict[str, Any], kernel_set: "KernelSet", threads: int
 ) -> dict[str, Any]:
     """Return the true error of a measurement beside the predicted ones, as ``--json`` has it."""
-    from ertis_bench.exact import measure
+    from ertis_numba.verification import measure
 
     accuracy = pipeline.settings.accuracy
     measured = measure(pipeline.process(first), first, kernels=kernel_set, threads=threads)

@@ -280,7 +280,8 @@ def _pairs(kernels: KernelSet, random: np.random.Generator, n_directions: int) -
         if times_s:
             few_s, many_s = (time_s / points for time_s in times_s)
             pair = found[f"pair_{precision}"] = max((many_s - few_s) / (_MANY_PAIRS - _FEW_PAIRS), 1e-3 * many_s)
-            found["image"] = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
+            image = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
+            found["image"] = min(image, found.get("image", math.inf))
     return found
 
 

@@ -31,6 +31,7 @@ _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0),
 _STOP_BANDS_DB = (40.0, 60.0, 80.0, 100.0, 120.0, 140.0)
 _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
+_ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
@@ -108,8 +109,14 @@ def is_complete(accuracy: Accuracy) -> bool:
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int) -> Settings:
-    """Return settings whose accuracy leaves nothing open; see `Planner.choose`."""
-    if settings.processing.method == "paper" or is_complete(settings.accuracy):
+    """Return settings whose accuracy leaves nothing open; see `Planner.choose`.
+
+    Raises
+    ------
+    ArgumentError
+        No plan keeps the budget, or the one that is given does not.
+    """
+    if settings.processing.method == "paper":
         return settings
     return Planner(settings, kernels, threads=threads).choose().settings
 
@@ -160,7 +167,7 @@ class Planner:
             None does; the message has the best there is.
         """
         wanted_db = self._settings.accuracy.max_error_db
-        budget = 10 ** (wanted_db / 10)
+        budget = 10 ** (wanted_db / 10) * _ROUNDED
         with one_thread():
             rated = [(plan, *self._rate(plan)) for plan in self._open_plans(budget)]
         if not rated:

@@ -1,7 +1,7 @@
 """The exact image in seconds rather than hours, and by how much another one differs from it.
 
 Single precision, weights fitted over six samples, every direction's own beam: some 120 dB below the image, this is
-what the float64 referee of `checks` finds, at a thousandth of its time.
+what the float64 referee of the tests and benchmarks finds, at a thousandth of its time.
 """
 
 import math
