@@ -14,7 +14,15 @@ from ertis_cli.main import COMMANDS
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SIMULATION = (ROOT / "docs" / "simulation.md").read_text()
-PAGES = ("README.md", "docs/gallery.md", "docs/simulation.md", "docs/formats.md")
+PAGES = (
+    "README.md",
+    "docs/accuracy.md",
+    "docs/beamformers.md",
+    "docs/formats.md",
+    "docs/gallery.md",
+    "docs/health.md",
+    "docs/simulation.md",
+)
 
 
 @pytest.fixture
