@@ -144,11 +144,18 @@ def test_costs_decide(monkeypatch):
 def test_complete_plans_are_left_alone():
     settings = SMALL.replace(accuracy=error_cases.BEST)
     assert is_complete(settings.accuracy)
-    assert complete(settings, CPU, threads=1) is settings
+    assert complete(settings, CPU, threads=1) == settings
     done = complete(SMALL, CPU, threads=1)
     assert is_complete(done.accuracy)
     assert done.replace(accuracy=SMALL.accuracy) == SMALL
-    assert complete(done, CPU, threads=1) is done
+    assert complete(done, CPU, threads=1) == done
+
+
+def test_complete_plans_that_err_too_much_are_refused():
+    plan = error_cases.PLANS["delays 4 1"]
+    assert complete(SMALL.replace(accuracy=plan.replace(max_error_db=-20.0)), CPU, threads=1)
+    with pytest.raises(ArgumentError, match=r"max_error_db is -60, and the best that these settings can is -2\d"):
+        complete(SMALL.replace(accuracy=plan.replace(max_error_db=-60.0)), CPU, threads=1)
 
 
 def test_the_papers_method_has_no_plan():
