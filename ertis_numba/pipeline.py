@@ -30,7 +30,7 @@ class Pipeline:
         ``numpy`` runs the same algorithm without compiled kernels, for comparison. The paper's method
         has no compiled kernels.
     threads : int, optional
-        Threads of one `process`; all cores by default. The result does not depend on it.
+        Threads of one `process`; all cores by default. Neither the plan nor the result depends on it.
     max_error_db : float, optional
         Error that the images may have; that of ``settings.accuracy`` by default.
 
@@ -62,6 +62,11 @@ class Pipeline:
         threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(threads):  # refuses a number that cannot be had
             pass
+        if max_error_db is not None and settings.processing.method == "paper":
+            raise ArgumentError(
+                f"max_error_db is {max_error_db:g}, and processing.method 'paper' has no plans; leave it out or give "
+                "method 'fast'"
+            )
         if max_error_db is not None:
             settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
         settings = planner.complete(settings, kernel_set, threads=threads)

@@ -25,6 +25,7 @@ from ertis_numba.errors import ArgumentError
 __all__ = [
     "ERROR_PRESETS_DB",
     "INTERPOLATIONS",
+    "MOST_ZONES",
     "PRESETS",
     "Accuracy",
     "Air",
@@ -49,6 +50,9 @@ INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubi
 
 ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
 """Error budgets by name."""
+
+MOST_ZONES = 1_000_000
+"""More steps of curvature than an image has ranges, even near the array."""
 
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
@@ -305,7 +309,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
     stop_band_db : float, optional
         Damping of what the decimation would alias into the call's band, 40 to 140.
     zones : int, optional
-        Parts of the range axis with delays of their own, from 1 on, where wavefronts are spherical.
+        Steps of their curvature, from 1 on, where wavefronts are spherical: ranges within one share their delays.
     """
 
     max_error_db: float = -35.0
@@ -322,7 +326,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
         checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, 100_000)):
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, MOST_ZONES)):
             if getattr(self, name) is not None:
                 checks.whole(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:

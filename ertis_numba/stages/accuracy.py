@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
-from ertis_numba.stages.fitting import DelayFit
+from ertis_numba.stages.fitting import WAVES, DelayFit
+from ertis_numba.stages.zones import NEAREST_M
 from ertis_numba.waveform import matched_band_hz, matched_spectrum
 
 __all__ = ["PARTS", "ErrorModel", "Texture", "decibels"]
@@ -39,12 +40,12 @@ PARTS: Final = {
 }
 """Name of each part of the error, and what it is due to."""
 
-_WAVES = 40
 _ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
 _SAFE_LEVEL = 10 ** (-24 / 10)  # as quiet as a room that eRTIS was tried in
+_UNLIKE = 1.3  # for what differs between images: 1 dB, found over the scenes of tests/test_accuracy.py
 _NOISE_CORNER_HZ = 500e3  # of the shaped noise of eRTIS at 4.5 MHz
 _NOISE_RATE_HZ = 4.5e6
 
@@ -90,7 +91,7 @@ class Texture:
     @classmethod
     def unknown(cls, settings: Settings) -> "Texture":
         """Return the texture that is assumed where none was measured: on the safe side."""
-        _, shares = matched_spectrum(settings.call, n_waves=_WAVES)
+        _, shares = matched_spectrum(settings.call, n_waves=WAVES)
         frequency_hz = np.linspace(0, settings.recording.pdm_rate_hz / 2, 1025)
         corner_hz = _NOISE_CORNER_HZ * settings.recording.pdm_rate_hz / _NOISE_RATE_HZ
         noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
@@ -110,7 +111,7 @@ class ErrorModel:
     def __init__(self, settings: Settings, texture: Texture | None = None) -> None:
         self._settings = settings
         self.texture = texture or Texture.unknown(settings)
-        self.frequency_hz, _ = matched_spectrum(settings.call, n_waves=_WAVES)
+        self.frequency_hz, _ = matched_spectrum(settings.call, n_waves=WAVES)
 
     def delays(self, fit: DelayFit) -> float:
         """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
@@ -132,8 +133,8 @@ class ErrorModel:
             Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*  and so on.
         """
         covariance = self.texture.covariance
-        if covariance is None:
-            return self._of(1.2 * self.texture.colour * float(nodes.errors @ self.texture.shares))
+        if covariance is None or nodes.is_bent:
+            return self._of(_UNLIKE * self.texture.colour * float(nodes.errors @ self.texture.shares))
         heard = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.steering), optimize=True)
         missed = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.wrong), optimize=True)
         beams = np.einsum("mwu,tmwu->tu", nodes.steering, heard).real
@@ -141,26 +142,30 @@ class ErrorModel:
         errors = np.einsum("mwu,tmwu->tu", nodes.wrong, missed).real
         beams = np.maximum(beams, 1e-9 * beams.max(initial=1e-30))
         wrong = both.real**2 / beams + 0.5 * np.maximum(errors - np.abs(both) ** 2 / beams, 0.0)
-        return 1.3 * float(wrong.sum() / beams.sum())
+        return _UNLIKE * float(wrong.sum() / beams.sum())
 
-    def zones(self, aperture: Aperture, range_m: NDArray[np.float64], count: int, *, sound_speed_m_s: float) -> float:
-        """Return the part of zones in which delays are those of their middle.
+    def zones(self, aperture: Aperture, bend_2: float, *, sound_speed_m_s: float) -> float:
+        """Return the part of delays that hold for a zone of ranges.
 
-        A microphone at p is late by ``b (p² − (u·p)²) / 2c`` where wavefronts have the curvature b = 1/r. Zones
-        are steps of b, over which its variance is that of a uniform number; what all microphones are late by turns the
-        phase of the beam only.
+        Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
+        microphones are late by turns the phase of the beam only.
+
+        Parameters
+        ----------
+        aperture : Aperture
+        bend_2 : float
+            Mean square of what curvatures differ by from those of their zones, in 1/m²: see `zones.squared_bend`.
+        sound_speed_m_s : float
         """
         along_m = aperture.directions @ aperture.positions_m.T
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
-        spread_m2 = float(np.mean(np.var(across_m2, axis=1)))
-        nearest, farthest = 1 / max(range_m[0], 1e-3), 1 / max(range_m[-1], 1e-3)
-        turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m2
-        return self._of(float(turn_2 @ self.texture.shares) * ((nearest - farthest) / count) ** 2 / 12)
+        spread_m4 = float(np.mean(np.var(across_m2, axis=1)))
+        turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
+        return self._of(float(turn_2 @ self.texture.shares) * bend_2)
 
     def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
         """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
-        half = np.array([2 * range_m, range_m])  # one zone from here to infinity, whose middle is a plane wave
-        return min(1.0, 12 * self.zones(aperture, half, 1, sound_speed_m_s=sound_speed_m_s) * 4)
+        return min(1.0, self.zones(aperture, max(range_m, NEAREST_M) ** -2, sound_speed_m_s=sound_speed_m_s))
 
     def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
         """Return the part of 16-bit numbers.
@@ -216,7 +221,7 @@ class ErrorModel:
         distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
         outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
         passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
-        power = 1.25 * passed / self.texture.level / self.texture.gain  # a quarter more for what differs between images
+        power = _UNLIKE * passed / self.texture.level / self.texture.gain
         dark = np.exp(-4 * np.sqrt(self.texture.places / max(power, 1e-30)))  # near the mean of Rice's distribution
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 

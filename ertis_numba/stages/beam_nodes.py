@@ -128,6 +128,8 @@ class BeamNodes:
 
     Attributes
     ----------
+    is_bent : bool
+        Whether errors are those of a spherical wave where they are larger.
     steering, wrong : (mic, wave, direction) complex128
         Of an estimate: plane waves of some directions at some microphones, and by how much they are missed.
     squares : float
@@ -155,8 +157,11 @@ class BeamNodes:
         high_hz: float,
         sound_speed_m_s: float,
         estimate: bool = False,
+        nearest_m: float = math.inf,
     ) -> None:
+        self.errors: NDArray[np.float64]
         self._aperture = aperture
+        self.is_bent = not math.isinf(nearest_m)
         self._sound_speed_m_s = sound_speed_m_s
         spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=sound_speed_m_s)
         lowest = aperture.lowest_nodes(spacing, n_taps)
@@ -171,7 +176,14 @@ class BeamNodes:
         gain, weights = fit(taps, wanted, power, real=True, least_power=_LEAST_POWER)
         self.squares = float(np.mean(np.sum(np.abs(weights) ** 2, axis=0)))
         if estimate:
-            self._estimate(lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum)
+            gain = self._estimate(
+                lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum
+            )
+            if self.is_bent:
+                bent = self._bent_errors(
+                    lowest[directions] * spacing, patch, directions, mics, gain, weights, nearest_m
+                )
+                self.errors = np.maximum(self.errors, bent)
             return
         self._patch, self._fitted_weights = patch, weights
         self._fitted_directions = directions
@@ -198,8 +210,8 @@ class BeamNodes:
         mics: NDArray[np.intp],
         weights: NDArray[np.complex128],
         spectrum: Spectrum,
-    ) -> None:
-        """Evaluate what is missed at all frequencies of the spectrum."""
+    ) -> NDArray[np.complex128]:
+        """Evaluate what is missed at all frequencies of the spectrum; return the gains there."""
         self.frequency_hz = spectrum.frequency_hz
         made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
         gain = np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
@@ -208,6 +220,27 @@ class BeamNodes:
         self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))
         there = self._waves(moved, mics)  # from the lowest node of each patch to the centre of the array
         self.steering, self.wrong = (there * wanted).reshape(shape), (there * wrong).reshape(shape)
+        return np.asarray(gain.reshape(shape[:2]))
+
+    def _bent_errors(
+        self,
+        moved: NDArray[np.float64],
+        patch: NDArray[np.float64],
+        directions: NDArray[np.intp],
+        mics: NDArray[np.intp],
+        gain: NDArray[np.complex128],
+        weights: NDArray[np.complex128],
+        nearest_m: float,
+    ) -> NDArray[np.float64]:
+        """Return the errors, (wave,), of waves from a point at ``nearest_m``, made by the weights of plane waves."""
+        errors = np.zeros(len(self.frequency_hz))
+        for k, direction in enumerate(directions):
+            points = np.concatenate([moved[k] + patch, self._aperture.directions[direction][None]])
+            delays_s = self._aperture.delays_s(points, sound_speed_m_s=self._sound_speed_m_s, range_m=nearest_m)
+            waves = np.exp(2j * math.pi * delays_s.T[mics, None, :] * self.frequency_hz[:, None])
+            made = gain * (waves[:, :, :-1] @ weights[:, k])
+            errors += np.mean(np.abs(made - waves[:, :, -1]) ** 2, axis=0)
+        return errors / len(directions)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain of each microphone that goes with the weights: (mic, frequency) complex128."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet
-from ertis_numba.stages.beam_nodes import BeamNodes
+from ertis_numba.stages.beam_nodes import FEWEST_RANGES, BeamNodes
 from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
 
@@ -107,7 +107,7 @@ class BeamformFloat32:
         ]
         if nodes is not None:
             self._tap_weights = nodes.weights.astype(np.float32)
-            self._n_blocks = _blocks(threads, len(window.range_m) // 64)
+            self._threads = threads
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
@@ -133,7 +133,7 @@ class BeamformFloat32:
                     self._nodes.rows,
                     first,
                     stop,
-                    self._n_blocks,
+                    _blocks(self._threads, (stop - first) // FEWEST_RANGES),
                     out,
                 )
 
@@ -189,6 +189,9 @@ class BeamformInt16:
         for zone in zones:
             mine = range(zone.first, zone.stop, kernels.tile_ranges)
             offsets, weights = zone.table.offsets(width), _pairs(zone.table.weights / self._weight_scale)
+            # Rounding may have added to them, where there are many small ones.
+            sums = np.hypot(weights[:, :, 0, 0], weights[:, :, 1, 0], dtype=np.float64).sum(axis=1)
+            self._limit = min(self._limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
             self._zones.append(_WholeZone(len(starts), len(starts) + len(mine), zone.stop, offsets, weights))
             starts += mine
         self._starts = np.array(starts, dtype=np.int32)
@@ -199,7 +202,7 @@ class BeamformInt16:
             scale = min(_SAFE * 2**_TAP_BITS / float(np.max(np.abs(nodes.weights))), _SAFE * 2**16 / sums)
             self._tap_weights = np.rint(nodes.weights * scale).astype(np.int16)
             self._weight_scale = np.float32(self._weight_scale * 2**16 / scale)
-            self._n_blocks = _blocks(threads, len(starts))
+            self._threads = threads
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
@@ -234,7 +237,7 @@ class BeamformInt16:
                     self._tap_weights,
                     self._nodes.rows,
                     self._weight_scale,
-                    self._n_blocks,
+                    _blocks(self._threads, zone.end - zone.begin),
                     out,
                 )
 

@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,6 +29,7 @@ _LOG = logging.getLogger("ertis_numba")
 _RUNS = 5  # the best of which counts
 _FLOOR_S = 2e-4  # runs shorter than this are repeated
 _MICS, _RANGES = 32, 960
+_BEYOND = 0.2  # of a tile, by which its samples reach over its ranges
 _FEW_PHASES, _MANY_PHASES = 1, 12
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
 _UNITS = (
@@ -59,6 +61,8 @@ class Work:
     n_fft, n_bins, n_phases, n_outputs : int
         Of the matched filter.
     n_directions, n_ranges : int
+    n_computed : int
+        Ranges of all tiles, which zones and the end of the range axis do not fill.
     n_beams, n_terms, n_pairs : int
         Beams that are summed, terms of each, and pairs of nodes that make a direction's beam, 0 without nodes.
     precision : {"float32", "int16"}
@@ -75,6 +79,7 @@ class Work:
     n_outputs: int
     n_directions: int
     n_ranges: int
+    n_computed: int
     n_beams: int
     n_terms: int
     n_pairs: int
@@ -96,15 +101,15 @@ class Costs:
         few, lots = (unit[f"sum_{work.precision}_{name}"] for name in ("few", "many"))
         term = few + min(many, 1.5) * max(lots - few, 0.0)
         points = work.n_directions * work.n_ranges
-        quantised = rows * (work.n_ranges + 20 * work.n_ranges / 96) if work.precision == "int16" else 0.0
+        quantised = rows * (1 + _BEYOND) * work.n_computed if work.precision == "int16" else 0.0
         seconds = {
             "demodulate": unit[f"demodulate_{work.tap_bits}"] * work.n_samples * work.n_taps * work.n_words,
             "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
             + unit["fold"] * rows * work.n_bins
             + unit["inverse"] * rows * _transform(work.n_outputs),
             "16 bits": unit["quantise"] * quantised,
-            "sums": term * work.n_beams * work.n_terms * work.n_ranges,
-            "interpolation": unit[f"pair_{work.precision}"] * points * work.n_pairs,
+            "sums": term * work.n_beams * work.n_terms * work.n_computed,
+            "interpolation": unit[f"pair_{work.precision}"] * work.n_directions * work.n_computed * work.n_pairs,
             "image": unit["image"] * points,
             "calls": 6 * unit["call"],
         }
@@ -118,12 +123,14 @@ def _transform(n: int) -> float:
 def costs_of(kernels: KernelSet, threads: int) -> Costs:
     """Return the costs of a device on this machine; measured at the first time and kept in `cache_file`."""
     key = (kernels.device, threads)
-    if key not in _KNOWN:
-        path = cache_file(*key)
-        _KNOWN[key] = _kept(path) or _measured(kernels, threads, path)
-    return _KNOWN[key]
+    with _ONE_AT_A_TIME:  # two that measured at once would measure each other
+        if key not in _KNOWN:
+            path = cache_file(*key)
+            _KNOWN[key] = _kept(path) or _measured(kernels, threads, path)
+        return _KNOWN[key]
 
 
+_ONE_AT_A_TIME = threading.Lock()
 _KNOWN: dict[tuple[str, int], Costs] = {}
 
 

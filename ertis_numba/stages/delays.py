@@ -67,6 +67,8 @@ class DelayTable:
         ArgumentError
             The array has too many samples to index.
         """
+        if self.samples.min() < 0:
+            raise ArgumentError("delays reach before the first sample; give a later processing.range_m")
         last = int(self.rows.max() + 1) * width
         if last > np.iinfo(np.int32).max:
             raise ArgumentError(

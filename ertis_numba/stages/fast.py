@@ -18,16 +18,15 @@ from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import Buffers, beamform
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import Demodulate
-from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
+from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.window import TimeWindow, time_window
+from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import zone_edges
 from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
 
-__all__ = ["FastChain", "chain_taps", "ringing_db", "spectrum_of"]
+__all__ = ["FastChain", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
 
 _SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
-_WAVES = 40
 
 
 def spectrum_of(settings: Settings) -> Spectrum:
@@ -38,7 +37,7 @@ def spectrum_of(settings: Settings) -> Spectrum:
 @functools.lru_cache(maxsize=8)
 def _spectrum_of(call: Call) -> Spectrum:
     """Return the same spectrum for the same call, so that what is fitted to it can be kept as well."""
-    return Spectrum(*matched_spectrum(call, n_waves=_WAVES))
+    return Spectrum(*matched_spectrum(call, n_waves=WAVES))
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
@@ -107,11 +106,10 @@ class FastChain:
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
         ahead_s = _dither(len(own_s)) * step_s if plan.interpolation == "fitted" else np.zeros(1)
-        first_m = settings.processing.range_m[0]
-        spherical = settings.processing.wavefront == "spherical"
+        edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
-            for range_m in ((max(first_m, 1e-3), math.inf) if spherical else (math.inf,))
+            for _, _, range_m in edges
         )
         taps = chain_taps(settings)
         window = time_window(
@@ -153,7 +151,7 @@ class FastChain:
                     lead=window.lead,
                 ),
             )
-            for first, stop, range_m in _zones(window, plan.zones if spherical else None)
+            for first, stop, range_m in edges
         ]
         self._adaptive = None
         self._beamform = beamform(plan.precision, kernels, window, zones, nodes, n_phases=n_phases, threads=threads)
@@ -178,8 +176,10 @@ class FastChain:
         buffers = self._take_buffers()
         with self._kernels.threads(self._threads):
             self._demodulate(words, buffers.signals)
-            self._finish(buffers, out)
-        return buffers.analytic.copy(), self._lead
+            self._image(buffers, out)
+        heard = buffers.analytic.copy()
+        self._spare.put(buffers)
+        return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
@@ -189,12 +189,15 @@ class FastChain:
             self._finish(buffers, out)
 
     def _finish(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
+        self._image(buffers, out)
+        self._spare.put(buffers)
+
+    def _image(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
         self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
         if self._adaptive is None:
             self._beamform(buffers.analytic, buffers.beamform, out)
         else:
             self._adaptive(buffers.analytic, out)
-        self._spare.put(buffers)
 
     def _take_buffers(self) -> _Buffers:
         """Return buffers that no other thread uses; there are as many as ever ran at once."""
@@ -217,8 +220,9 @@ def _dither(n_mics: int) -> NDArray[np.float64]:
     return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0
 
 
-def _zones(window: TimeWindow, count: int | None) -> list[tuple[int, int, float]]:
-    """Return first range, the one after the last, and the distance whose delays hold, of each zone."""
-    if count is None:
-        return [(0, len(window.range_m), math.inf)]
-    return zone_edges(window.range_m, count)
+def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
+    """Return first range, the one after the last, and the distance whose delays hold, of each zone of a plan."""
+    range_m = time_window(settings, largest_delay_s=0.0, n_taps=1).range_m
+    if settings.processing.wavefront == "plane":
+        return [(0, len(range_m), math.inf)]
+    return zone_edges(range_m, settings.accuracy.zones or 1)

@@ -17,6 +17,7 @@ transforms using min-max interpolation, IEEE Trans. Signal Process. 51, 2003.)
 """
 
 import math
+import threading
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -27,10 +28,14 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import INTERPOLATIONS
 
-__all__ = ["DelayFit", "Spectrum", "fit", "one_thread", "weights_of"]
+__all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "one_thread", "weights_of"]
+
+WAVES = 40
+"""Frequencies of the spectra that fits and errors are weighted by."""
 
 _TURNS = 12  # the error falls by less than 0.1 dB after that
 _LEAST_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
+_AT_A_TIME = 2**15  # weights
 _TARGETS = 65  # over one step of the samples that are kept
 
 
@@ -54,10 +59,33 @@ class Spectrum:
         return float(self.frequency_hz @ self.power)
 
 
-def one_thread() -> AbstractContextManager[object]:
+class _OneThread:
+    """Holds BLAS to one thread while anybody is inside, whichever Python thread that is."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._limits: threadpoolctl.threadpool_limits | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._limits = threadpoolctl.threadpool_limits(1, user_api="blas")
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0 and self._limits is not None:
+                self._limits.restore_original_limits()
+
+
+_ONE_THREAD = _OneThread()
+
+
+def one_thread() -> AbstractContextManager[None]:
     """Keep BLAS to one thread inside: matrices here are small, and on busy cores its threads wait for each other."""
-    limits: AbstractContextManager[object] = threadpoolctl.threadpool_limits(1, user_api="blas")
-    return limits
+    return _ONE_THREAD
 
 
 def fit(
@@ -157,12 +185,16 @@ class DelayFit:
     def weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them."""
         flat = np.ravel(fractions)
-        if self._interpolation == "fitted":
-            frequency_hz = self._spectrum.frequency_hz
-            found = weights_of(self._gain, self._taps(frequency_hz), self._wanted(flat), self._spectrum.power)
-        else:
-            found = self._simple_weights(flat)
-        return np.ascontiguousarray(found.T).reshape(*np.shape(fractions), self.n_taps)
+        # In parts, since each weight takes a wave at every frequency of the spectrum.
+        parts = np.array_split(flat, max(1, -(-len(flat) // _AT_A_TIME)))
+        found = np.concatenate([self._weights(part).T for part in parts])
+        return np.ascontiguousarray(found).reshape(*np.shape(fractions), self.n_taps)
+
+    def _weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
+        if self._interpolation != "fitted":
+            return self._simple_weights(fractions)
+        taps = self._taps(self._spectrum.frequency_hz)
+        return weights_of(self._gain, taps, self._wanted(fractions), self._spectrum.power)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain that goes with the weights: (frequency,) complex128."""

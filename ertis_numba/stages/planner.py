@@ -13,14 +13,15 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
-from ertis_numba.settings import INTERPOLATIONS, Accuracy, Settings
+from ertis_numba.settings import INTERPOLATIONS, MOST_ZONES, Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import require_int16, whole_limits
 from ertis_numba.stages.costs import Costs, Work, costs_of
-from ertis_numba.stages.fast import chain_taps, spectrum_of
+from ertis_numba.stages.fast import chain_taps, spectrum_of, zones_of
 from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
 from ertis_numba.stages.window import time_window
+from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
 
 __all__ = ["Chosen", "Planner", "complete", "is_complete"]
@@ -31,6 +32,7 @@ _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0),
 _STOP_BANDS_DB = (40.0, 60.0, 80.0, 100.0, 120.0, 140.0)
 _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
+_TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
@@ -143,18 +145,21 @@ class Planner:
         self._settings, self._kernels = settings, kernels
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
-        self._costs: Costs = costs_of(kernels, threads)
+        self._threads = threads
         self.model = ErrorModel(settings, texture)
         self._spectrum = spectrum_of(settings)
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self._n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+        amplitudes = 1 / layout.gain[layout.enabled]
+        self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
         self._n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
         self._window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
         if settings.accuracy.beam_taps:
             require_nodes(self._aperture, len(self._window.range_m))
         self._delays = functools.cache(self._made_delays)
+        self._zones = functools.cache(self._made_zones)
         self._nodes = functools.cache(self._made_nodes)
         self._filter = functools.cache(self._made_filter)
 
@@ -169,20 +174,26 @@ class Planner:
         wanted_db = self._settings.accuracy.max_error_db
         budget = 10 ** (wanted_db / 10) * _ROUNDED
         with one_thread():
-            rated = [(plan, *self._rate(plan)) for plan in self._open_plans(budget)]
+            plans = self._open_plans(budget)
+            rated = [(plan, self._parts(plan)) for plan in plans if self._fits(plan)]
         if not rated:
             raise ArgumentError(
-                "no plan fits into memory; give a shorter processing.range_m, fewer microphones or less oversampling"
+                "no plan fits into memory; give a later or shorter processing.range_m, fewer directions or "
+                "microphones, or less of accuracy.oversampling or accuracy.zones"
             )
-        within = [entry for entry in rated if sum(entry[1].values()) <= budget]
+        within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
         if within:
-            plan, _, _ = min(within, key=lambda entry: sum(entry[2].values()))
-            return self.chosen(self._accuracy(plan))
-        plan, _, _ = min(rated, key=lambda entry: sum(entry[1].values()))
+            # By the costs of all threads whatever their number now, so that it does not decide about the plan.
+            costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
+            cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
+            return self.chosen(self._accuracy(cheapest))
+        plan, _ = min(rated, key=lambda entry: sum(entry[1].values()))
         best = self.chosen(self._accuracy(plan))
+        memory = ", others do not fit into memory" if len(rated) < len(plans) else ""
+        wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
         raise ArgumentError(
             f"accuracy.max_error_db is {wanted_db:g}, and the best that these settings can is {best.error_db:.1f} "
-            f"({_worst(best)}); give {math.ceil(best.error_db)} or more, or leave more of [accuracy] open"
+            f"({_worst(best)}{memory}); {wider}leave more of [accuracy] open"
         )
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
@@ -197,7 +208,10 @@ class Planner:
             accuracy.stop_band_db or 60.0,
             accuracy.zones or 1,
         )
-        return Chosen(self._settings.replace(accuracy=accuracy), *self._rate(plan))
+        with one_thread():
+            parts = self._parts(plan)
+        costs = costs_of(self._kernels, self._threads)
+        return Chosen(self._settings.replace(accuracy=accuracy), parts, costs.stages_ms(self._work(plan)))
 
     def _accuracy(self, plan: _Plan) -> Accuracy:
         return self._settings.accuracy.replace(
@@ -210,11 +224,11 @@ class Planner:
             zones=plan.zones,
         )
 
-    def _rate(self, plan: _Plan) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the parts of a plan's error and what its stages take, in milliseconds."""
+    def _parts(self, plan: _Plan) -> dict[str, float]:
+        """Return the parts of a plan's error."""
         delays = self._delays(plan.n_phases, plan.interpolation, plan.delay_taps)
         nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
-        taps, filter_error = self._filter(plan.stop_band_db)
+        _, filter_error = self._filter(plan.stop_band_db)
         parts = dict.fromkeys(PARTS, 0.0)
         parts["delays"], parts["filter"] = delays.error, filter_error
         parts["arithmetic"] = self.model.arithmetic()
@@ -222,10 +236,19 @@ class Planner:
             parts["beams"] = nodes.error
             parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
         if self._settings.processing.wavefront == "spherical":
-            parts["zones"] = 0.0 if plan.zones >= len(self._window.range_m) else self._one_zone / plan.zones**2
+            parts["zones"] = self._zone_error(plan.zones)
         if plan.precision == "int16":
             parts["samples"] = self._whole_numbers(delays, nodes)
-        work = Work(
+        return parts
+
+    def _time(self, plan: _Plan, costs: Costs) -> float:
+        return sum(costs.stages_ms(self._work(plan)).values())
+
+    def _work(self, plan: _Plan) -> Work:
+        nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        taps, _ = self._filter(plan.stop_band_db)
+        tile = self._kernels.tile_ranges if plan.precision == "int16" else FEWEST_RANGES
+        return Work(
             n_mics=self._n_mics,
             n_words=self._n_words,
             n_samples=self._window.n_samples,
@@ -237,12 +260,19 @@ class Planner:
             n_outputs=self._window.n_outputs,
             n_directions=self._n_directions,
             n_ranges=len(self._window.range_m),
+            n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.zones)),
             n_beams=self._n_directions if nodes is None else nodes.count,
             n_terms=self._n_mics * plan.delay_taps,
             n_pairs=0 if nodes is None else nodes.n_pairs,
             precision=plan.precision,
         )
-        return parts, self._costs.stages_ms(work)
+
+    def _fits(self, plan: _Plan) -> bool:
+        """Whether signals, tiles and delays fit into memory."""
+        nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        n_beams = self._n_directions if nodes is None else nodes.count
+        table = _TABLE_BYTES * n_beams * self._n_mics * plan.delay_taps * len(self._zones(plan.zones))
+        return table + 16 * self._n_mics * plan.n_phases * self._window.n_outputs <= _MOST_BYTES
 
     def _open_plans(self, budget: float) -> list[_Plan]:
         """Return the plans that the settings leave open and that fit into memory."""
@@ -255,7 +285,7 @@ class Planner:
         taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
         if INTERPOLATIONS[given.interpolation] or adaptive:
             taps = (INTERPOLATIONS[given.interpolation] or 1,)
-        bytes_per_phase = 8 * self._n_mics * self._window.n_outputs
+        zones = self._zone_count(budget)
         return [
             _Plan(
                 precision,
@@ -265,19 +295,12 @@ class Planner:
                 beam_taps,
                 density,
                 stop_band_db,
-                self._zone_count(budget),
+                zones,
             )
             for precision, n_phases, n_taps, (beam_taps, density), stop_band_db in itertools.product(
                 precisions, phases, taps, self._open_nodes(budget, adaptive=adaptive), self._stop_bands_db(budget)
             )
-            if n_phases * bytes_per_phase <= _MOST_BYTES
-            and self._table_bytes(n_taps, beam_taps, density) * self._zone_count(budget) <= _MOST_BYTES
         ]
-
-    def _table_bytes(self, n_taps: int, beam_taps: int, density: float) -> int:
-        """Return the size of a zone's delays and weights."""
-        nodes = self._nodes(beam_taps, density) if beam_taps else None
-        return 12 * (self._n_directions if nodes is None else nodes.count) * self._n_mics * n_taps
 
     def _open_nodes(self, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
         """Return which nodes are worth a try, and that every direction's own beam is."""
@@ -311,12 +334,21 @@ class Planner:
             return self._settings.accuracy.zones
         if self._settings.processing.wavefront == "plane":
             return 1
-        wanted = math.ceil(math.sqrt(self._one_zone / (_SMALL * budget)))
-        return min(len(self._window.range_m), max(1, wanted))
+        count = 1
+        while self._zone_error(count) > _SMALL * budget and count < MOST_ZONES:
+            count = min(MOST_ZONES, max(count + 1, math.ceil(1.2 * count)))
+        return count
+
+    def _made_zones(self, count: int) -> list[tuple[int, int, float]]:
+        return zones_of(self._settings.replace(accuracy=self._settings.accuracy.replace(zones=count)))
+
+    def _zone_error(self, count: int) -> float:
+        bend_2 = squared_bend(self._window.range_m, self._zones(count))
+        return self._zone_scale * bend_2
 
     @functools.cached_property
-    def _one_zone(self) -> float:
-        return self.model.zones(self._aperture, self._window.range_m, 1, sound_speed_m_s=self._speed_m_s)
+    def _zone_scale(self) -> float:
+        return self.model.zones(self._aperture, 1.0, sound_speed_m_s=self._speed_m_s)
 
     def _made_delays(self, n_phases: int, interpolation: str, n_taps: int) -> _Delays:
         step_s = 1 / (self._settings.output_rate_hz * n_phases)
@@ -343,6 +375,7 @@ class Planner:
             high_hz=self._settings.call.high_frequency_hz,
             sound_speed_m_s=self._speed_m_s,
             estimate=True,
+            nearest_m=self._nearest_m,
         )
         n_pairs = n_taps**self._aperture.n_axes // 2
         return _Nodes(self._count_nodes(n_taps, density), n_pairs, self.model.beams(nodes), nodes.squares)
@@ -367,7 +400,13 @@ class Planner:
             error += self.model.nodes(
                 n_mics=self._n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
             )
-        return error
+        return error * self._spread
+
+    @property
+    def _nearest_m(self) -> float:
+        if self._settings.processing.wavefront == "plane":
+            return math.inf
+        return max(float(self._window.range_m[0]), NEAREST_M)
 
     @functools.cached_property
     def _n_bins(self) -> int:

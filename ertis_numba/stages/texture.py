@@ -14,14 +14,14 @@ from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import Texture
 from ertis_numba.stages.beam_nodes import estimated_mics
 from ertis_numba.stages.fast import FastChain
-from ertis_numba.waveform import matched_filter, matched_spectrum
+from ertis_numba.stages.fitting import WAVES
+from ertis_numba.waveform import matched_band_hz, matched_filter, matched_spectrum
 
 __all__ = ["texture_of"]
 
 _TILE = 96  # ranges
 _MOST_MICS = 8  # whose bits are looked at
 _SEGMENT = 4096
-_WAVES = 40
 _TAPERED = 0.5  # of the ranges, at each end
 _QUANTILES = (np.arange(16) + 0.5) / 16
 
@@ -31,10 +31,11 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
 
     A rough image is enough, since what is wanted are its mean power, and that of what it is summed from.
     """
+    low_hz, high_hz = matched_band_hz(settings.call)
     rough = settings.replace(
         accuracy=Accuracy(
             precision="float32",
-            oversampling=2,
+            oversampling=min(64, max(2, math.ceil(2 * (high_hz - low_hz) / settings.output_rate_hz))),
             interpolation="linear",
             delay_taps=2,
             beam_taps=0,
@@ -50,7 +51,10 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     heard, lead = chain.analytic(words, image)
     analytic = heard[:, :, lead:]
     n_mics, n_phases, _ = analytic.shape
+    gain = microphones(settings.array).gain[microphones(settings.array).enabled, None]
     series = np.moveaxis(analytic, 1, 2)[:, : len(chain.range_m)].reshape(n_mics, -1)
+    undivided = float(np.mean(np.abs(series) ** 2)) or 1e-30  # as tiles have it
+    series = (series / gain).astype(np.complex64)
     power = float(np.mean(np.abs(series) ** 2)) or 1e-30
     image_power = float(np.mean(np.square(image, dtype=np.float64)))
     # A tile reaches as far over its ranges as delays do.
@@ -60,9 +64,9 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     return Texture(
         shares=_shares(series, settings, n_phases * settings.output_rate_hz),
         gain=max(image_power / (power / n_mics), 1e-3),
-        crest=float(np.mean(largest)) / power,
+        crest=float(np.mean(largest)) / undivided,
         noise=_noise(words, settings, kernels),
-        level=max(power / _white_power(settings), 1e-12),
+        level=max(undivided / _white_power(settings), 1e-12),
         covariance=covariance,
         places=np.quantile(np.square(image, dtype=np.float64), _QUANTILES) / (image_power or 1.0),
     )
@@ -74,7 +78,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
     edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
     taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
     found = np.sum(np.abs(scipy.fft.fft(series * taper, axis=1)) ** 2, axis=0)
-    centres_hz, nominal = matched_spectrum(settings.call, n_waves=_WAVES)
+    centres_hz, nominal = matched_spectrum(settings.call, n_waves=WAVES)
     # Sampling at this rate has moved the band by a multiple of it.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
     half = max(1, int(np.min(np.diff(bins)) // 2)) if len(bins) > 1 else 1
@@ -87,7 +91,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
 def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.complex128]:
     """Return what microphones have in common, tile by tile: (tile, wave, mic, mic) complex128."""
     layout = microphones(settings.array)
-    centres_hz, _ = matched_spectrum(settings.call, n_waves=_WAVES)
+    centres_hz, _ = matched_spectrum(settings.call, n_waves=WAVES)
     mics = estimated_mics(len(series))
     length = max(8, round(_TILE * rate_hz / settings.output_rate_hz))
     half = length // 2
@@ -98,8 +102,8 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
     # Sampling has moved the band by multiples of the rate: a bin stands for the frequency that lies in the band.
     bins_hz = np.arange(length) * rate_hz / length
     frequency_hz = bins_hz + rate_hz * np.rint(((centres_hz[0] + centres_hz[-1]) / 2 - bins_hz) / rate_hz)
-    late_s, gain = (values[layout.enabled][mics, None, None] for values in (layout.delay_s, layout.gain))
-    spectra = spectra * np.exp(2j * np.pi * late_s * frequency_hz) / gain
+    late_s = layout.delay_s[layout.enabled][mics, None, None]
+    spectra = spectra * np.exp(2j * np.pi * late_s * frequency_hz)
     nearest = np.argmin(np.abs(frequency_hz[:, None] - centres_hz), axis=1)
     inside = (frequency_hz > centres_hz[0]) & (frequency_hz < centres_hz[-1])
     found = [spectra[:, :, (nearest == wave) & inside] for wave in range(len(centres_hz))]

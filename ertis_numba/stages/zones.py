@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["zone_edges"]
+__all__ = ["NEAREST_M", "squared_bend", "zone_edges"]
 
-_NEAREST_M = 1e-3  # what stands for range 0, where a wavefront has no curvature to speak of
+NEAREST_M = 1e-3
+"""What stands for range 0, where a wavefront has no curvature to speak of."""
 
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
@@ -21,17 +22,21 @@ def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int,
     range_m : (range,) float64
         Ascending.
     count : int
-        Zones; there are fewer where some would hold no range, and one for each where there are not fewer ranges.
+        Steps of the curvature between the ends. Those that hold no range make no zone.
 
     Returns
     -------
     list of (first, stop, distance)
         Ranges ``first … stop - 1`` of each zone and the distance in metres whose delays it has.
     """
-    if count >= len(range_m):
-        return [(k, k + 1, max(float(distance_m), _NEAREST_M)) for k, distance_m in enumerate(range_m)]
-    bends = 1 / np.maximum(range_m, _NEAREST_M)
+    bends = 1 / np.maximum(range_m, NEAREST_M)
     span = bends[0] - bends[-1]
     zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)
     edges = [0, *(np.flatnonzero(np.diff(np.minimum(zone, count - 1))) + 1).tolist(), len(bends)]
     return [(first, stop, float(2 / (bends[first] + bends[stop - 1]))) for first, stop in itertools.pairwise(edges)]
+
+
+def squared_bend(range_m: NDArray[np.float64], edges: list[tuple[int, int, float]]) -> float:
+    """Return by how much curvatures differ from those of their zones: the mean square over ranges, in 1/m²."""
+    middle = np.concatenate([np.full(stop - first, 1 / distance_m) for first, stop, distance_m in edges])
+    return float(np.mean((1 / np.maximum(range_m, NEAREST_M) - middle) ** 2))

@@ -19,9 +19,9 @@ _BLOCK = 256  # directions whose delays and weights (98 kB at 32 microphones) sh
 
 
 @intrinsic
-def _beam_tile(typing_context, signals, offsets, weights, direction, first, out):
-    """Fill ``out[direction, first : first + TILE]``; all arrays as in `DelayAndSumEnvelope`."""
-    signature = types.void(signals, offsets, weights, types.intp, types.intp, out)
+def _beam_tile(typing_context, signals, offsets, weights, direction, first, out, place):
+    """Fill ``out.flat[place : place + TILE]`` with the ranges from ``first`` on; arrays as in `DelayAndSumEnvelope`."""
+    signature = types.void(signals, offsets, weights, types.intp, types.intp, out, types.intp)
 
     def codegen(context, builder, signature, arguments):
         def array(k):
@@ -30,8 +30,7 @@ def _beam_tile(typing_context, signals, offsets, weights, direction, first, out)
         direction, first = arguments[3:5]
         dot = Dot32(builder)
         dot.complex_terms(array(0), array(1), array(2), direction, first)
-        n_ranges = builder.extract_value(array(5).shape, 1)
-        dot.store_levels(builder.gep(array(5).data, [builder.add(builder.mul(direction, n_ranges), first)]))
+        dot.store_levels(builder.gep(array(5).data, [arguments[6]]))
         return context.get_dummy_value()
 
     return signature, codegen
@@ -39,7 +38,7 @@ def _beam_tile(typing_context, signals, offsets, weights, direction, first, out)
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
 def _beam_short(signals, offsets, weights, direction, first, stop, out):
-    """One direction of fewer ranges than a tile."""
+    """One direction of an image with fewer ranges than a tile."""
     flat = signals.reshape(-1)
     for r in range(first, stop):
         x, y = np.float32(0), np.float32(0)
@@ -59,12 +58,18 @@ def delay_and_sum_envelope(signals, offsets, weights, first, stop, out):
     block = min(_BLOCK, max(1, n_directions // 16))
     for part in prange((n_directions + block - 1) // block):
         begin, end = part * block, min((part + 1) * block, n_directions)
-        if stop - first < TILE:
+        if out.shape[1] < TILE:
             for direction in range(begin, end):
                 _beam_short(signals, offsets, weights, direction, first, stop, out)
+        elif stop - first < TILE:
+            at = max(0, stop - TILE)
+            short = np.empty((1, TILE), np.float32)
+            for direction in range(begin, end):
+                _beam_tile(signals, offsets, weights, direction, at, short, 0)
+                out[direction, first:stop] = short[0, first - at : stop - at]
         else:
             for tile in range(n_tiles):
                 # The last tile overlaps the one before and writes the same numbers again.
                 at = min(first + tile * TILE, stop - TILE)
                 for direction in range(begin, end):
-                    _beam_tile(signals, offsets, weights, direction, at, out)
+                    _beam_tile(signals, offsets, weights, direction, at, out, direction * out.shape[1] + at)

@@ -71,7 +71,7 @@ def _pair_rows(typing_context, rows, lower, pairs, node):
                 parts.append(builder.zext(loaded, SUMS))
             both = builder.or_(parts[0], builder.shl(parts[1], ir.Constant(SUMS, [16] * LANES)))
             place = builder.gep(array(2).data, [builder.add(begin, step)])
-            builder.store(both, builder.bitcast(place, SUMS.as_pointer())).align = _LINE
+            builder.store(both, builder.bitcast(place, SUMS.as_pointer())).align = 4 * LANES
         return context.get_dummy_value()
 
     return signature, codegen
@@ -104,7 +104,7 @@ def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction
             for vector in range(VECTORS):
                 for part in (0, 1):
                     at = builder.add(begin, ir.Constant(size, part * RANGES))
-                    dot.add(part, vector, dot.load(array(0).data, at, vector, align=_LINE), weight)
+                    dot.add(part, vector, dot.load(array(0).data, at, vector, align=4 * LANES), weight)
         dot.store_levels(arguments[5], builder.gep(array(6).data, [arguments[7]]))
         return context.get_dummy_value()
 
