@@ -30,6 +30,7 @@ _LEAST_POWER = 1e-8  # large weights that cancel each other would let 16 bits be
 _MOST_FITTED = 96  # directions and microphones from which gain and error are found
 _WAVES = 17  # frequencies, over which the gain of a microphone is smooth
 _MOST_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # for an error within some tenths of a decibel
+_REACHES = (0.0, 0.3, 0.6, 1.0)  # of the array's, at which near waves are tried
 _FEWEST_EQUATIONS = 120  # microphones by frequencies: weights would suit fewer better than what lies between them
 
 
@@ -179,9 +180,11 @@ class BeamNodes:
             gain = self._estimate(
                 lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum
             )
-            if self.is_bent:
+            # Of near waves those from about as far as the array is wide are bent most in its plane.
+            reach_m = math.sqrt(float(aperture.square_m2.max()))
+            for distance_m in {max(nearest_m, share * reach_m) for share in _REACHES} if self.is_bent else ():
                 bent = self._bent_errors(
-                    lowest[directions] * spacing, patch, directions, mics, gain, weights, nearest_m
+                    lowest[directions] * spacing, patch, directions, mics, gain, weights, distance_m
                 )
                 self.errors = np.maximum(self.errors, bent)
             return

@@ -10,6 +10,8 @@ __all__ = ["NEAREST_M", "squared_bend", "zone_edges"]
 NEAREST_M = 1e-3
 """What stands for range 0, where a wavefront has no curvature to speak of."""
 
+_LEAST_M = 1e-9  # a distance, so that it can be divided by
+
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
     """Return zones over which the curvature changes by the same amount.
@@ -33,10 +35,16 @@ def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int,
     span = bends[0] - bends[-1]
     zone = np.zeros(len(bends), dtype=int) if not span else np.floor((bends[0] - bends) / span * count).astype(int)
     edges = [0, *(np.flatnonzero(np.diff(np.minimum(zone, count - 1))) + 1).tolist(), len(bends)]
-    return [(first, stop, float(2 / (bends[first] + bends[stop - 1]))) for first, stop in itertools.pairwise(edges)]
+    found = []
+    for first, stop in itertools.pairwise(edges):
+        distance_m = float(2 / (bends[first] + bends[stop - 1])) if stop - first > 1 else float(range_m[first])
+        found.append((first, stop, max(distance_m, _LEAST_M)))
+    return found
 
 
 def squared_bend(range_m: NDArray[np.float64], edges: list[tuple[int, int, float]]) -> float:
     """Return by how much curvatures differ from those of their zones: the mean square over ranges, in 1/m²."""
-    middle = np.concatenate([np.full(stop - first, 1 / distance_m) for first, stop, distance_m in edges])
+    middle = np.concatenate(
+        [np.full(stop - first, 1 / max(distance_m, NEAREST_M)) for first, stop, distance_m in edges]
+    )
     return float(np.mean((1 / np.maximum(range_m, NEAREST_M) - middle) ** 2))
