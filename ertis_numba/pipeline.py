@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import kernels
+from ertis_numba import checks, kernels
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
-from ertis_numba.settings import Array, Settings
+from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
@@ -31,7 +31,7 @@ class Pipeline:
         has no compiled kernels.
     threads : int, optional
         Threads of one `process`; all cores by default. Neither the plan nor the result depends on it.
-    max_error_db : float, optional
+    max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
         Error that the images may have; that of ``settings.accuracy`` by default.
 
     Attributes
@@ -56,8 +56,11 @@ class Pipeline:
         device: str = "auto",
         threads: int | None = None,
         *,
-        max_error_db: float | None = None,
+        max_error_db: float | str | None = None,
     ) -> None:
+        if isinstance(max_error_db, str):
+            checks.choice("max_error_db", max_error_db, ERROR_PRESETS_DB)
+            max_error_db = ERROR_PRESETS_DB[max_error_db]
         kernel_set = kernels.load(_device_for(settings, device))
         threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(threads):  # refuses a number that cannot be had
@@ -68,7 +71,7 @@ class Pipeline:
                 "method 'fast'"
             )
         if max_error_db is not None:
-            settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
+            settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=float(max_error_db)))
         settings = planner.complete(settings, kernel_set, threads=threads)
         self.settings = settings
         self.device = kernel_set.device

@@ -43,9 +43,7 @@ def test_predictions_for_the_real_measurement(real, name):
 
 def test_predictions_for_random_scenes():
     """Of all plans in all 50 scenes 98 % are within 1 dB and 3 dB: few strong echoes at the window's edge are not."""
-    pairs = [
-        (seed, name) for seed in range(SCENES) for place, name in enumerate(PLANS) if (place + seed) % EVERY == 0
-    ]
+    pairs = [(seed, name) for seed in range(SCENES) for place, name in enumerate(PLANS) if (place + seed) % EVERY == 0]
     outside = [pair for pair in pairs if wrong(rated(pair[0]), PLANS[pair[1]])]
     assert len(outside) <= 0.03 * len(pairs), outside
     assert not [pair for pair in outside if wrong(rated(pair[0]), PLANS[pair[1]], 2.0, 6.0)]

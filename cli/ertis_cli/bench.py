@@ -71,6 +71,8 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
     """Error of the image against time, for some forty plans and the paper's method."""
     from ertis_bench import accuracy as benchmark
 
+    if picture and not picture.absolute().parent.is_dir():  # refused now rather than after minutes
+        raise click.BadParameter(f"{picture.parent} is no folder; make it first", param_hint="--plot")
     report = _run("accuracy", benchmark, **given)
     if picture:
         benchmark.plot(report, picture)

@@ -111,6 +111,7 @@ def _plan(planners: dict[str, Any], settings: "Settings") -> dict[str, Any]:
         "predicted_db": round(texture.error_db, 1),
         "stages_ms": {name: round(time_ms, 3) for name, time_ms in safe.stages_ms.items()},
         "time_ms": round(safe.time_ms, 3),
+        "costs": str(planners["safe"].costs_file),
         "plane_waves": _plane_waves(planners["texture"].model, settings),
     }
 
@@ -161,13 +162,18 @@ def _explained(sensor: str, plan: dict[str, Any], settings: "Settings") -> Itera
     else:
         ends = " and ".join(f"{end['error_db']:.1f} dB at {end['range_m']:g} m" for end in plan["plane_waves"])
         yield f"  plane wavefronts, which are wrong by {ends} against spherical ones, on top of the rest"
-    yield _PART.format(name="predicted error", safe="at most", texture="this recording")
+    yield _PART.format(name="predicted error", safe="planned", texture="this recording")
     total = {"due_to": "in total", **plan}
     for part in (*plan["parts"], total):
         cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("texture", "predicted"))}
         yield _PART.format(name=f"  {part['due_to']}", **cells)
     stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _LEAST_MS)
-    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}"
+    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; by the costs in {plan['costs']}"
+    if plan["predicted_db"] > settings.accuracy.max_error_db:
+        yield (
+            f"  beware: this recording is quieter than was planned for, and its images may err by more than "
+            f"{settings.accuracy.max_error_db:g} dB; give a lower --max-error"
+        )
 
 
 def _verified(
@@ -194,7 +200,7 @@ def _checked(sensor: str, verified: dict[str, Any], settings: "Settings") -> Ite
     yield (
         f"measurement {verified['sequence']} of {sensor}: error {verified['error_db']:.1f} dB in "
         f"{options.counted(verified['directions'], 'direction')}; predicted {verified['predicted_db']:.1f} dB for this "
-        f"recording, {verified['safe_db']:.1f} dB at most; allowed {settings.accuracy.max_error_db:g} dB"
+        f"recording, {verified['safe_db']:.1f} dB planned; allowed {settings.accuracy.max_error_db:g} dB"
     )
     peaks = verified["peaks"]
     if peaks is None:

@@ -3,8 +3,8 @@
 The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ranges, in decibels. The exact image is that of
 `tests/reference.py`: float64, nothing decimated, delays as exact phase shifts.
 
-All parts are errors of complex beams that add up like noise: between microphones, because `fitting` leaves no error
-that they share, and between parts. A part whose power is ε of that of a microphone's signal after the matched
+Most parts are errors of complex beams that add up like noise: between microphones, because `fitting` leaves hardly any
+error that they share, and between parts. A part whose power is ε of that of a microphone's signal after the matched
 filter therefore adds, to an image whose mean power is ``gain`` times that of uncorrelated microphones,
 
     s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.

@@ -29,6 +29,7 @@ _LOG = logging.getLogger("ertis_numba")
 _RUNS = 5  # the best of which counts
 _FLOOR_S = 2e-4  # runs shorter than this are repeated
 _MICS, _RANGES = 32, 960
+_MOST_S = 1.0  # of a unit of work: more is no measurement
 _BEYOND = 0.2  # of a tile, by which its samples reach over its ranges
 _FEW_PHASES, _MANY_PHASES = 1, 12
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
@@ -151,7 +152,7 @@ def _kept(path: Path) -> Costs | None:
         seconds = {name: float(found[name]) for name in _UNITS}
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return Costs(seconds) if all(value > 0 and math.isfinite(value) for value in seconds.values()) else None
+    return Costs(seconds) if all(0 < value <= _MOST_S for value in seconds.values()) else None
 
 
 def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:

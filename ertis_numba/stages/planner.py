@@ -4,6 +4,7 @@ import functools
 import itertools
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from ertis_numba.settings import INTERPOLATIONS, MOST_ZONES, Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import require_int16, whole_limits
-from ertis_numba.stages.costs import Costs, Work, costs_of
+from ertis_numba.stages.costs import Costs, Work, cache_file, costs_of
 from ertis_numba.stages.fast import chain_taps, spectrum_of, zones_of
 from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
 from ertis_numba.stages.window import time_window
@@ -401,6 +402,11 @@ class Planner:
                 n_mics=self._n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
             )
         return error * self._spread
+
+    @property
+    def costs_file(self) -> Path:
+        """Where the costs are kept that predict times; taken away, they are measured again."""
+        return cache_file(self._kernels.device, self._threads)
 
     @property
     def _nearest_m(self) -> float:
