@@ -16,7 +16,7 @@ from tests.test_real import RAW
 OPTIMISTIC_DB, PESSIMISTIC_DB = 1.0, 3.0
 FLOOR_DB = -105.0  # what stands for the exact image errs by little less, and rounds as all plans do
 SCENES = 50
-EVERY = 6  # plans of a scene are tried, others of each
+EVERY = 11  # plans of a scene are tried, others of each
 
 
 @pytest.fixture(scope="module")

@@ -97,7 +97,7 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
         pipeline = Pipeline(SHORT, device="cpu", threads=1)
     assert "costs cannot be kept (" in caplog.text
     assert pipeline.process(noise(SHORT)).energy.any()
-    assert measured == [("cpu", 1)]
+    assert ("cpu", CPU.max_threads) in measured
 
 
 @pytest.mark.usefixtures("measured")
@@ -111,8 +111,8 @@ def test_more_work_takes_longer():
     found = costs.costs_of(CPU, 1)
     work = {
         "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,
-        "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_beams": 300, "n_terms": 64,
-        "n_pairs": 8, "precision": "float32",
+        "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_computed": 1248, "n_beams": 300,
+        "n_terms": 64, "n_pairs": 8, "precision": "float32",
     }  # fmt: skip
     usual_ms = sum(found.stages_ms(costs.Work(**work)).values())
     assert usual_ms > 0

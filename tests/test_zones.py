@@ -36,7 +36,8 @@ def test_zones_hold_every_range_once(first_m, step_m, n_ranges, count):
     assert 1 <= len(zones) <= min(count, n_ranges)
     assert [place for first, stop, _ in zones for place in range(first, stop)] == list(range(n_ranges))
     for first, stop, distance_m in zones:
-        assert max(range_m[first], 1e-3) * (1 - 1e-9) <= distance_m <= max(range_m[stop - 1], 1e-3) * (1 + 1e-9)
+        nearest_m = range_m[first] if stop - first == 1 else max(range_m[first], 1e-3)
+        assert nearest_m * (1 - 1e-9) <= distance_m <= max(range_m[stop - 1], 1e-3) * (1 + 1e-9)
 
 
 def test_curvature_changes_alike_over_all_zones():

@@ -35,6 +35,7 @@ _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
 _TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
+_NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
@@ -282,10 +283,6 @@ class Planner:
         precisions = ["float32"] if given.precision == "auto" else [given.precision]
         if given.precision == "auto" and self._kernels.tile_ranges and not adaptive:
             precisions.append("int16")
-        phases = _PHASES if given.oversampling is None else (given.oversampling,)
-        taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
-        if INTERPOLATIONS[given.interpolation] or adaptive:
-            taps = (INTERPOLATIONS[given.interpolation] or 1,)
         zones = self._zone_count(budget)
         return [
             _Plan(
@@ -298,10 +295,30 @@ class Planner:
                 stop_band_db,
                 zones,
             )
-            for precision, n_phases, n_taps, (beam_taps, density), stop_band_db in itertools.product(
-                precisions, phases, taps, self._open_nodes(budget, adaptive=adaptive), self._stop_bands_db(budget)
+            for precision, (n_phases, n_taps), (beam_taps, density), stop_band_db in itertools.product(
+                precisions,
+                self._open_delays(budget, adaptive=adaptive),
+                self._open_nodes(budget, adaptive=adaptive),
+                self._stop_bands_db(budget),
             )
         ]
+
+    def _open_delays(self, budget: float, *, adaptive: bool) -> list[tuple[int, int]]:
+        """Return which samples and taps are worth a try: those that keep the budget and are not needlessly exact."""
+        given = self._settings.accuracy
+        phases = _PHASES if given.oversampling is None else (given.oversampling,)
+        taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
+        if INTERPOLATIONS[given.interpolation] or adaptive:
+            taps = (INTERPOLATIONS[given.interpolation] or 1,)
+        found = []
+        for n_taps in taps:
+            for n_phases in phases:
+                error = self._delays(n_phases, given.interpolation, n_taps).error
+                if error <= budget:
+                    found.append((n_phases, n_taps))
+                if error <= _NEEDLESS * budget:
+                    break
+        return found or [(phases[-1], n_taps) for n_taps in taps]
 
     def _open_nodes(self, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
         """Return which nodes are worth a try, and that every direction's own beam is."""
