@@ -33,7 +33,8 @@ def processed(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     recording, image = folder / "recording.h5", folder / "image.h5"
     run("import", RAW, "-o", recording, "--layout", request.param, "--preset", "default_25_50")
-    run("process", recording, "-o", image, "--directions", "2d:181", "--range", "0.8:5")
+    # One of the ten is a maximum by a hair, which errors of -35 dB may level.
+    run("process", recording, "-o", image, "--directions", "2d:181", "--range", "0.8:5", "--max-error", "fine")
     with ertis.open_energyscapes(image) as images:
         return request.param, image, images[0]
 
@@ -79,7 +80,7 @@ def test_image_is_the_exact_one(processed, exact_image):
     error_db = reference.error_db(image.energy, exact_image.energy.astype(float))
     brightest_db = 20 * np.log10(image.energy.max() / exact_image.energy.max())
     if layout == "eRTIS_v3D1":
-        assert error_db < -35
+        assert error_db < -60
         assert abs(brightest_db) < 0.1
     else:  # the same positions in another channel order smear everything
         assert error_db > -3
