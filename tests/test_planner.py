@@ -8,13 +8,25 @@ from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, INTERPOLATIONS, Accuracy, Array, Call, Processing
 from ertis_numba.stages import planner
-from ertis_numba.stages.planner import Planner, complete, is_complete
+from ertis_numba.stages.planner import Planner, complete
 from tests import error_cases, reference
 from tests.cases import CASES, LINE_8, SHORT, noise
 from tests.hard_cases.tuned import tuned
 
 CPU = kernels.load("cpu")
 SMALL = SHORT.replace(processing=SHORT.processing.replace(directions="3d:300"), accuracy=Accuracy())
+
+
+def is_complete(accuracy):
+    """Whether a plan leaves nothing open."""
+    return accuracy.precision != "auto" and None not in (
+        accuracy.oversampling,
+        accuracy.delay_taps,
+        accuracy.beam_taps,
+        accuracy.beam_density,
+        accuracy.stop_band_db,
+        accuracy.zones,
+    )
 
 
 def chosen_for(settings, **pinned):

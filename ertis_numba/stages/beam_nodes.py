@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.stages.fitting import Spectrum, fit, weights_of
+from ertis_numba.stages.fitting import Spectrum, fit, gain_of, weights_of
 
 __all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "estimated_mics", "require_nodes"]
 
@@ -217,7 +217,7 @@ class BeamNodes:
         """Evaluate what is missed at all frequencies of the spectrum; return the gains there."""
         self.frequency_hz = spectrum.frequency_hz
         made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
-        gain = np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+        gain = gain_of(made, wanted)
         wrong = gain[:, None] * made - wanted
         shape = (len(mics), len(self.frequency_hz), len(inside))
         self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))
@@ -250,7 +250,7 @@ class BeamNodes:
         mics = np.arange(len(self._aperture.positions_m))
         made = self._waves(self._patch, mics) @ self._fitted_weights
         wanted = self._waves(self._inside[self._fitted_directions], mics)
-        gain = np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+        gain = gain_of(made, wanted)
         rows = gain.reshape(len(mics), len(self.frequency_hz))
         return np.stack(
             [

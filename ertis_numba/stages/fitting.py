@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import INTERPOLATIONS
 
-__all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "one_thread", "weights_of"]
+__all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "gain_of", "one_thread", "weights_of"]
 
 WAVES = 40
 """Frequencies of the spectra that fits and errors are weighted by."""
@@ -117,8 +117,13 @@ def fit(
     for _ in range(_TURNS):
         weights = weights_of(gain, taps, targets, power, real=real, least_power=least_power)
         made = taps @ weights
-        gain = np.sum(np.conj(made) * targets, axis=1) / np.sum(np.abs(made) ** 2, axis=1)
+        gain = gain_of(made, targets)
     return gain, weights_of(gain, taps, targets, power, real=real, least_power=least_power)
+
+
+def gain_of(made: NDArray[np.complex128], targets: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the gain, (wave,), that brings what was made nearest to the targets; both (wave, target)."""
+    return np.asarray(np.sum(np.conj(made) * targets, axis=1) / np.sum(np.abs(made) ** 2, axis=1))
 
 
 def weights_of(
@@ -202,7 +207,7 @@ class DelayFit:
             return np.ones(len(frequency_hz), dtype=np.complex128)
         made = self._taps(frequency_hz) @ self.weights(self.fractions).T
         wanted = self._wave(frequency_hz, self.fractions)
-        return np.asarray(np.sum(np.conj(made) * wanted, axis=1) / np.sum(np.abs(made) ** 2, axis=1))
+        return gain_of(made, wanted)
 
     def _simple_weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the weights, (tap, target), of the ways of interpolation that know no band."""

@@ -25,7 +25,7 @@ from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
 
-__all__ = ["Chosen", "Planner", "complete", "is_complete"]
+__all__ = ["Chosen", "Planner", "complete"]
 
 _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
@@ -98,18 +98,6 @@ class _Delays:
     error: float
     sum_of_weights: float
     squares: float
-
-
-def is_complete(accuracy: Accuracy) -> bool:
-    """Whether a plan leaves nothing open."""
-    return accuracy.precision != "auto" and None not in (
-        accuracy.oversampling,
-        accuracy.delay_taps,
-        accuracy.beam_taps,
-        accuracy.beam_density,
-        accuracy.stop_band_db,
-        accuracy.zones,
-    )
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int) -> Settings:
