@@ -1,6 +1,7 @@
 """From measurements to energyscapes."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,15 @@ class Pipeline:
     Parameters
     ----------
     settings : Settings
-    device : {"auto", "cpu", "numpy"}
-        ``numpy`` runs the same algorithm without compiled kernels, for comparison. The paper's method
-        has no compiled kernels.
+    device : {"auto", "cpu", "cuda", "numpy"}
+        ``auto`` is an NVIDIA GPU, ``cuda``, where there is one and what it needs is installed, else ``cpu``. ``numpy``
+        runs the same algorithm without compiled kernels, for comparison. The paper's method has no compiled kernels.
     threads : int, optional
         Threads of one `process`; all cores by default. Neither the plan nor the result depends on it.
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
         Error that the images may have; that of ``settings.accuracy`` by default.
+    graphs : bool
+        Whether a GPU records the chain as a CUDA graph, which saves the processor the launches. Of no effect elsewhere.
 
     Attributes
     ----------
@@ -40,6 +43,10 @@ class Pipeline:
         With the plan that was chosen: their accuracy leaves nothing open.
     device : str
         The device that was chosen.
+    grid : Grid
+        The direction axis of the images.
+    range_m : (range,) float64
+        The range axis of the images.
 
     Raises
     ------
@@ -47,7 +54,14 @@ class Pipeline:
         The settings name a layout, grid or range that cannot be used, no plan keeps the error, or the device is
         unknown.
     DeviceError
-        The device cannot be used here.
+        The device cannot be used here, or has too little memory.
+
+    Examples
+    --------
+    A pipeline holds a GPU's memory until it is closed::
+
+        with Pipeline(recording.settings, device="cuda") as pipeline:
+            images = pipeline.process_batch(recording)
     """
 
     def __init__(
@@ -57,6 +71,7 @@ class Pipeline:
         threads: int | None = None,
         *,
         max_error_db: float | str | None = None,
+        graphs: bool = False,
     ) -> None:
         if isinstance(max_error_db, str):
             checks.choice("max_error_db", max_error_db, ERROR_PRESETS_DB)
@@ -79,10 +94,12 @@ class Pipeline:
         self._accepted = settings
         self._words_shape = (settings.recording.n_samples, layout.n_words)
         self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
-        self._chain = _chain(settings, kernel_set, threads)
-        if settings.processing.method == "fast":
-            # Kernels are loaded, or compiled where they never were, now rather than amid a stream.
-            self._chain.process(np.zeros(self._words_shape, self._words_dtype), self._new_energy())
+        self._closed = False
+        self._chain = _chain(settings, kernel_set, threads, graphs=graphs)
+        self.grid: Grid = self._chain.grid
+        self.range_m: NDArray[np.float64] = self._chain.range_m
+        if not kernel_set.simulated:
+            self._chain.warm_up(np.zeros(self._words_shape, self._words_dtype))
 
     def process(self, measurement: Measurement, out: NDArray[np.float32] | None = None) -> Energyscape:
         """Return the energyscape of one measurement.
@@ -101,10 +118,46 @@ class Pipeline:
         ArgumentError
             ``out`` has another shape or type.
         """
-        self._require_same_sensor(measurement.settings)
-        words = self._checked_words(measurement.words)
-        energy = self._new_energy() if out is None else self._checked_out(out)
+        words = self._words_of(measurement)
+        energy = self._chain.new_image() if out is None else self._checked_out(out)
         self._chain.process(words, energy)
+        return self._energyscape(energy, measurement)
+
+    def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
+        """Return the energyscapes of several measurements, in their order, bit by bit as `process` gives them.
+
+        This is faster than one at a time: a GPU takes one measurement in, works on another and gives back a third at
+        the same time, and the cores of a processor each take a measurement of their own.
+
+        Parameters
+        ----------
+        measurements : iterable of Measurement
+            All are read before the first one is processed, and all images are held in memory.
+
+        Raises
+        ------
+        DataError
+            As for `process`; then nothing is processed.
+        """
+        batch = list(measurements)
+        words = [self._words_of(measurement) for measurement in batch]
+        energies = [self._chain.new_image() for _ in batch]
+        self._chain.process_batch(words, energies)
+        return [self._energyscape(energy, measurement) for energy, measurement in zip(energies, batch, strict=True)]
+
+    def close(self) -> None:
+        """Give back the memory of the device now; `process` is over. Images that were made stay."""
+        if not self._closed:
+            self._closed = True
+            self._chain.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _energyscape(self, energy: NDArray[np.float32], measurement: Measurement) -> Energyscape:
         return Energyscape(
             energy=energy,
             azimuth_rad=self.grid.azimuth_rad,
@@ -114,18 +167,11 @@ class Pipeline:
             stamp=measurement.stamp,
         )
 
-    @property
-    def grid(self) -> Grid:
-        """The direction axis of the images."""
-        return self._chain.grid
-
-    @property
-    def range_m(self) -> NDArray[np.float64]:
-        """The range axis of the images: (range,) float64."""
-        return self._chain.range_m
-
-    def _new_energy(self) -> NDArray[np.float32]:
-        return np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
+    def _words_of(self, measurement: Measurement) -> NDArray[np.unsignedinteger[Any]]:
+        if self._closed:
+            raise ArgumentError("the pipeline is closed; make another one")
+        self._require_same_sensor(measurement.settings)
+        return self._checked_words(measurement.words)
 
     def _require_same_sensor(self, settings: Settings) -> None:
         """Refuse what the tables were not made for: only how to process may differ."""
@@ -186,9 +232,9 @@ def _same_layout(array: Array, other: Array) -> bool:
     )
 
 
-def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int) -> Chain:
+def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
     if settings.processing.method == "fast":
-        return FastChain(settings, kernel_set, threads=threads)
+        return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
     # Imported here because scipy.signal takes longer to import than the fast chain takes to start.
     from ertis_numba.stages.paper import PaperChain  # noqa: PLC0415
 

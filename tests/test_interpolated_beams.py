@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ertis_numba import kernels
 from tests import reference
+from tests.on_device import KERNELS, SIMULATED, sized
 
-KERNELS = {name: kernels.load(name) for name in kernels.DEVICES}
 FLOAT32 = 1e-5  # relative to the largest beam
 GARBAGE = 12_345.0
 SHAPES = {
@@ -14,12 +13,18 @@ SHAPES = {
     "least": (1, 1, 1, 64, 2, 1, 1),
     "one over a tile": (2, 3, 4, 65, 9, 5, 2),
     "one short of two tiles": (2, 3, 2, 191, 9, 7, 2),
+    "few directions": (5, 2, 3, 151, 7, 5, 3),
     "prime": (7, 5, 11, 151, 31, 59, 8),
     "line array": (8, 2, 16, 300, 40, 90, 3),
     "eRTIS": (32, 2, 64, 257, 60, 90, 8),
     "six by six": (5, 1, 5, 97, 50, 11, 18),
 }
-WINDOWS = [(0, 151), (3, 151), (0, 64), (40, 104), (17, 18), (5, 60), (130, 151), (150, 151)]
+SHAPE_NAMES = sized(
+    ["least", "one over a tile", "few directions"],
+    ["one short of two tiles", "prime", "line array", "eRTIS", "six by six"],
+)
+SOME = "few directions" if SIMULATED else "prime"
+WINDOWS = sized([(0, 151), (3, 151), (17, 18), (5, 60)], [(0, 64), (40, 104), (130, 151), (150, 151)])
 MOST_BLOCKS = 4
 
 
@@ -68,7 +73,7 @@ def image_of(kernel_set, beams, window, n_ranges, n_blocks=1):
     return out
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", SHAPE_NAMES)
 def test_beams_of_nodes_are_the_referees(kernel_set, name):
     beams, n_ranges = beam_input(name), SHAPES[name][3]
     expected = np.abs(reference.interpolated_beams(*beams, n_ranges))
@@ -78,7 +83,7 @@ def test_beams_of_nodes_are_the_referees(kernel_set, name):
 
 @pytest.mark.parametrize("window", WINDOWS)
 def test_beams_of_nodes_fill_their_window_and_nothing_else(kernel_set, window):
-    beams, n_ranges = beam_input("prime"), SHAPES["prime"][3]
+    beams, n_ranges = beam_input(SOME), SHAPES[SOME][3]
     expected = np.abs(reference.interpolated_beams(*beams, n_ranges))
     out = image_of(kernel_set, beams, window, n_ranges)
     inside = slice(*window)
@@ -87,7 +92,7 @@ def test_beams_of_nodes_fill_their_window_and_nothing_else(kernel_set, window):
     assert (out == GARBAGE).all()
 
 
-@pytest.mark.parametrize("name", ["least", "prime", "six by six"])
+@pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
 def test_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(kernel_set, name):
     beams, n_ranges = beam_input(name), SHAPES[name][3]
     counts = (*range(1, MOST_BLOCKS + 1), SHAPES[name][5] + 3)  # blocks without a direction as well
@@ -96,7 +101,7 @@ def test_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(kernel_set, n
 
 
 def test_bad_numbers_of_nodes_stay_at_their_range(kernel_set):
-    beams, n_ranges = beam_input("line array"), SHAPES["line array"][3]
+    beams, n_ranges = beam_input(SOME), SHAPES[SOME][3]
     beams[0][3, :, 100] = np.nan
     with np.errstate(invalid="ignore"):  # NumPy also says so
         out = image_of(kernel_set, beams, (0, n_ranges), n_ranges)
@@ -148,7 +153,7 @@ def expected_levels(tiles, beams, stop, n_ranges):
 
 
 @pytest.mark.parametrize("full_scale", [False, True])
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", SHAPE_NAMES)
 def test_whole_beams_of_nodes_are_the_referees(whole_kernel_set, name, full_scale):
     n_ranges = SHAPES[name][3]
     tiles, beams = whole_input(name, whole_kernel_set.tile_ranges, full_scale=full_scale)
@@ -159,14 +164,14 @@ def test_whole_beams_of_nodes_are_the_referees(whole_kernel_set, name, full_scal
 
 @pytest.mark.parametrize("stop", [1, 50, 95, 96, 97, 150])
 def test_whole_beams_of_nodes_end_where_they_should(whole_kernel_set, stop):
-    (tiles, scales, starts), beams = whole_input("prime", whole_kernel_set.tile_ranges)
+    (tiles, scales, starts), beams = whole_input(SOME, whole_kernel_set.tile_ranges)
     mine = starts < stop
     tiles = (tiles[mine], scales[mine], starts[mine])
     out = whole_image(whole_kernel_set, tiles, beams, stop, 151)
     assert out == pytest.approx(expected_levels(tiles, beams, stop, 151), rel=4e-7)
 
 
-@pytest.mark.parametrize("name", ["least", "prime", "six by six"])
+@pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
 def test_whole_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(whole_kernel_set, name):
     n_ranges, counts = SHAPES[name][3], (*range(1, MOST_BLOCKS + 1), SHAPES[name][5] + 3)
     tiles, beams = whole_input(name, whole_kernel_set.tile_ranges)

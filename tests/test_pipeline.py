@@ -6,6 +6,9 @@ directions at once, and needs no renderer.
 
 import concurrent.futures
 import multiprocessing
+import os
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -127,7 +130,6 @@ def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
     ("settings", "device", "threads", "error", "match"),
     [
         (SHORT, "gpu", None, ArgumentError, "device 'gpu' is unknown"),
-        (SHORT, "cuda", None, DeviceError, "device 'cuda' has no kernels in this version"),
         (SHORT, "cpu", 0, ArgumentError, "threads is 0; give a whole number from 1"),
         (SHORT, "cpu", 4096, ArgumentError, "threads is 4096; give a whole number from 1"),
         (
@@ -150,6 +152,48 @@ def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
 def test_refuses(settings, device, threads, error, match):
     with pytest.raises(error, match=match):
         Pipeline(settings, device=device, threads=threads)
+
+
+def test_cuda_without_a_gpu_is_refused_with_a_remedy():
+    """In a process of its own that sees no GPU, on machines that have one too."""
+    code = "from ertis_numba import kernels; print(kernels.usable()); kernels.load('cuda')"
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "-1", "NUMBA_ENABLE_CUDASIM": "0"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "('cpu', 'numpy')\n"
+    error = done.stderr.strip().splitlines()[-1]
+    assert "DeviceError: device 'cuda' finds no NVIDIA GPU" in error
+    assert "use device 'cpu', or install ertis-numba[cu12] or [cu13]" in error
+
+
+def test_batch_is_bit_by_bit_what_one_at_a_time_gives():
+    pipeline, measurements = Pipeline(SHORT), [noise(SHORT, seed) for seed in range(5)]
+    single = [pipeline.process(measurement) for measurement in measurements]
+    batch = pipeline.process_batch(iter(measurements))
+    assert [image.energy.tobytes() for image in batch] == [image.energy.tobytes() for image in single]
+    assert [image.stamp for image in batch] == [measurement.stamp for measurement in measurements]
+    assert len({image.energy.tobytes() for image in batch}) == len(batch)
+
+
+def test_batch_with_a_wrong_measurement_processes_none():
+    wrong = Measurement(np.zeros(10, np.uint32), SHORT)
+    with pytest.raises(DataError, match="uint32 words of shape"):
+        Pipeline(SHORT).process_batch([noise(SHORT), wrong])
+
+
+def test_empty_batch_gives_no_images():
+    assert Pipeline(SHORT).process_batch([]) == []
+
+
+@pytest.mark.parametrize("method", ["fast", "paper"])
+def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
+    settings = SHORT.replace(processing=SHORT.processing.replace(method=method))
+    with Pipeline(settings) as pipeline:
+        image = pipeline.process(noise(settings))
+    pipeline.close()
+    assert (len(pipeline.grid), len(pipeline.range_m)) == image.energy.shape
+    for refused in (lambda: pipeline.process(noise(settings)), lambda: pipeline.process_batch([noise(settings)])):
+        with pytest.raises(ArgumentError, match="the pipeline is closed; make another one"):
+            refused()
 
 
 @pytest.mark.parametrize(

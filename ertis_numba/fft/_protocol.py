@@ -9,12 +9,15 @@ __all__ = ["Transforms"]
 
 
 class Transforms(Protocol):
-    """The two transforms of the signal chain, along the last axis, single precision."""
+    """The two transforms of the signal chain, along the last axis, single precision, of arrays that stay the same.
 
-    def forward(self, signals: NDArray[np.float32], *, threads: int) -> NDArray[np.complex64]:
-        """Return the one-sided spectra of real signals: (mic, n) to (mic, n // 2 + 1)."""
+    Both are sums without a factor in front: a signal that goes there and back is larger by the length.
+    """
+
+    def forward(self, *, threads: int) -> NDArray[np.complex64]:
+        """Return the one-sided spectra of the real signals: (mic, n) to (mic, n // 2 + 1)."""
         ...
 
-    def inverse(self, spectra: NDArray[np.complex64], *, threads: int) -> None:
-        """Replace spectra by their signals, divided by their length."""
+    def inverse(self, *, threads: int) -> None:
+        """Replace the spectra in the array of analytic signals, (mic, phase, n), by their signals."""
         ...

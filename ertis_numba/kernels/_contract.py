@@ -5,14 +5,17 @@ is checked: shapes and bounds are the business of the stages, which know them wh
 Arrays are C-contiguous. Axes are named in this order: mic, phase, sample; direction, range.
 """
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["KernelSet"]
+__all__ = ["KernelSet", "Lane", "Memory"]
+
+Array = TypeVar("Array", bound=NDArray[Any])
 
 Words = NDArray[np.unsignedinteger[Any]]
 Real = NDArray[np.float32]
@@ -471,23 +474,102 @@ class Threads(Protocol):
     def __call__(self, count: int) -> AbstractContextManager[None]: ...
 
 
+class Lane(Protocol):
+    """The way of one measurement after the other through the device: words in, kernels, image out.
+
+    What is begun on one lane runs in order. Lanes run beside each other where the device can.
+    """
+
+    stream: Any
+    """What libraries call a lane: a stream of the GPU; None on the host."""
+
+    def entered(self) -> AbstractContextManager[None]:
+        """Run the enclosed kernels of this Python thread on this lane."""
+        ...
+
+    def send(self, array: Array) -> Array:
+        """Begin to bring an array of the host to where kernels read it; a later one of its kind takes its place."""
+        ...
+
+    def target(self, out: Array) -> Array:
+        """Return where kernels write what `fetch` brings to ``out``; another of its kind gets the same place."""
+        ...
+
+    def run(self, steps: Callable[[], None]) -> None:
+        """Begin ``steps``, which use the same arrays each time: a lane may record them once and play them again."""
+        ...
+
+    def fetch(self, array: Array, out: Array) -> None:
+        """Begin to bring what `target` returned, or any array of the device, to ``out``."""
+        ...
+
+    def wait(self) -> None:
+        """Return when all that was begun is done."""
+        ...
+
+
+class Memory(Protocol):
+    """What one pipeline keeps where its kernels run.
+
+    Raises
+    ------
+    DeviceError
+        From any of its methods: the device has too little memory.
+    """
+
+    n_lanes: int
+    """Lanes that keep the device busy; 1 where more would not."""
+
+    def table(self, array: Array) -> Array:
+        """Return ``array`` where kernels read it. It is not to be changed from now on."""
+        ...
+
+    def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """Return a new array where kernels read and write it."""
+        ...
+
+    def image(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """Return a new array of the host into which `Lane.fetch` is fast; it holds anything."""
+        ...
+
+    def lane(self) -> Lane:
+        """Return a new lane."""
+        ...
+
+    def close(self) -> None:
+        """Give back at once what nothing refers to any more."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class KernelSet:
-    """The kernels of one device, and how many threads they may use.
+    """The kernels of one device, and what else there is to know of it.
 
     Attributes
     ----------
     device : str
+    hardware : str
+        Name of the GPU; empty for the processor.
+    transforms : {"scipy", "cufft"}
+        What goes with the kernels: see `fft`.
     max_threads : int
     tile_ranges : int
         Ranges in a tile of the 16-bit kernels; 0 where the device cannot run them.
     fastest_precision : {"float32", "int16"}
+    simulated : bool
+        Whether the device is only played by the processor, far too slowly for anything but tests.
+    memory : callable
+        Returns a `Memory`; ``graphs`` asks for lanes that record what they run.
     """
 
     device: str
+    hardware: str
+    transforms: str
     max_threads: int
     tile_ranges: int
     fastest_precision: str
+    simulated: bool
+    memory: "NewMemory"
     threads: Threads
     unpack_bits: UnpackBits
     decimate: Decimate
@@ -507,3 +589,9 @@ class KernelSet:
     combine_capon: CombineCapon
     add_paths: AddPaths
     modulate_pdm: ModulatePdm
+
+
+class NewMemory(Protocol):
+    """Makes the memory of a pipeline."""
+
+    def __call__(self, *, graphs: bool = False) -> Memory: ...

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short, Taps, Words
+from ertis_numba.kernels._host import HostMemory
 
 __all__ = ["KERNELS"]
 
@@ -335,6 +336,10 @@ def _noise_and_dither(
 
 KERNELS = KernelSet(
     device="numpy",
+    hardware="",
+    transforms="scipy",
+    simulated=False,
+    memory=HostMemory,
     max_threads=1,
     tile_ranges=_TILE_RANGES,
     fastest_precision="float32",

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Processing
 
 __all__ = ["AdaptiveBeamform"]
@@ -26,6 +26,7 @@ class AdaptiveBeamform:
     processing : Processing
         Its ``beamformer`` is not ``delay_and_sum``.
     kernels : KernelSet
+    memory : Memory
     offsets : (direction, mic) int32
         Where a microphone's first sample lies in a flat array of (mic, phase, sample).
     weights : (direction, mic) complex64
@@ -41,14 +42,18 @@ class AdaptiveBeamform:
         self,
         processing: Processing,
         kernels: KernelSet,
+        memory: Memory,
         offsets: NDArray[np.int32],
         weights: NDArray[np.complex64],
     ) -> None:
         n_mics = offsets.shape[1]
+        places = memory.table(offsets)
         combine: dict[str, Callable[[], _Combine]] = {
-            "coherence_factor": lambda: _coherence_factor(kernels, offsets, weights),
-            "dmas": lambda: _dmas(kernels, offsets, n_mics * weights, processing.dmas_order),
-            "capon": lambda: _capon(kernels, offsets, n_mics * weights, processing),
+            "coherence_factor": lambda: _coherence_factor(kernels, places, memory.table(weights)),
+            "dmas": lambda: _dmas(
+                kernels, places, memory.table(_roots(n_mics * weights, processing.dmas_order)), processing.dmas_order
+            ),
+            "capon": lambda: _capon(kernels, places, memory.table(n_mics * weights), processing),
         }
         self._combine = combine[processing.beamformer]()
 
@@ -61,9 +66,13 @@ def _coherence_factor(kernels: KernelSet, offsets: NDArray[np.int32], weights: N
     return lambda analytic, out: kernels.combine_coherence(analytic, offsets, weights, out)
 
 
-def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64], order: int) -> _Combine:
-    """Return DMAS whose weights are roots, too, and divide by the number of products in the sum."""
-    n_mics = offsets.shape[1]
+def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], roots: NDArray[np.complex64], order: int) -> _Combine:
+    return lambda analytic, out: kernels.combine_dmas(analytic, offsets, roots, order, out)
+
+
+def _roots(weights: NDArray[np.complex64], order: int) -> NDArray[np.complex64]:
+    """Return weights of DMAS: roots, too, and divided by the number of products in the sum."""
+    n_mics = weights.shape[1]
     if n_mics < order:
         raise ArgumentError(
             f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
@@ -73,8 +82,8 @@ def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.co
     level = np.abs(exact)
     shrunk = np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
     # Every product has ``order`` of them, so each takes that root of the whole: no sum leaves single precision.
-    roots = (exact * shrunk * math.comb(n_mics, order) ** (-1 / order)).astype(np.complex64)
-    return lambda analytic, out: kernels.combine_dmas(analytic, offsets, roots, order, out)
+    roots = exact * shrunk * math.comb(n_mics, order) ** (-1 / order)
+    return np.asarray(roots, dtype=np.complex64)
 
 
 def _capon(

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, BeamNodes
 from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
@@ -20,8 +20,8 @@ _WEIGHT_BITS = 12  # leave the samples 13 bits with 32 microphones: both err by 
 _TAP_BITS = 15  # of the weights of nodes, less what their sum needs
 _SAFE = 0.98  # of the largest whole number: rounding must not go beyond it
 
-Buffers = tuple[NDArray[np.int16], NDArray[np.float32]]
-"""What a call writes to on its way: tiles and their scales, empty where samples stay in float32."""
+Buffers = tuple[NDArray[Any], ...]
+"""What a call writes to on its way: tiles and their scales, nothing where samples stay in float32."""
 
 
 class Beamform(Protocol):
@@ -53,6 +53,7 @@ def require_int16(kernels: KernelSet) -> None:
 def beamform(
     precision: str,
     kernels: KernelSet,
+    memory: Memory,
     window: TimeWindow,
     zones: Sequence[Zone],
     nodes: BeamNodes | None,
@@ -68,9 +69,17 @@ def beamform(
         The device has no 16-bit dot product.
     """
     if precision == "float32":
-        return BeamformFloat32(kernels, window, zones, nodes, threads=threads)
+        return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
     require_int16(kernels)
-    return BeamformInt16(kernels, zones, nodes, n_phases=n_phases, threads=threads)
+    return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads)
+
+
+class _NodeTables:
+    """The nodes of directions where kernels read them; ``weights`` are those of the precision."""
+
+    def __init__(self, memory: Memory, nodes: BeamNodes, weights: NDArray[Any]) -> None:
+        self.places, self.rows = memory.table(nodes.places), memory.table(nodes.rows)
+        self.weights = memory.table(weights)
 
 
 class BeamformFloat32:
@@ -78,7 +87,7 @@ class BeamformFloat32:
 
     Parameters
     ----------
-    kernels, window
+    kernels, memory, window
     zones : sequence of Zone
         Together the whole range axis; of the beams of all directions, or of the nodes.
     nodes : BeamNodes, optional
@@ -89,29 +98,28 @@ class BeamformFloat32:
     def __init__(
         self,
         kernels: KernelSet,
+        memory: Memory,
         window: TimeWindow,
         zones: Sequence[Zone],
         nodes: BeamNodes | None,
         *,
         threads: int,
     ) -> None:
-        self._kernels, self._nodes = kernels, nodes
+        self._kernels, self._threads = kernels, threads
         self._zones = [
             (
                 zone.first,
                 zone.stop,
-                zone.table.offsets(window.n_outputs),
-                np.ascontiguousarray(zone.table.weights, np.complex64),
+                memory.table(zone.table.offsets(window.n_outputs)),
+                memory.table(np.ascontiguousarray(zone.table.weights, np.complex64)),
             )
             for zone in zones
         ]
-        if nodes is not None:
-            self._tap_weights = nodes.weights.astype(np.float32)
-            self._threads = threads
+        self._nodes = None if nodes is None else _NodeTables(memory, nodes, nodes.weights.astype(np.float32))
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
-        return np.empty(0, dtype=np.int16), np.empty(0, dtype=np.float32)
+        return ()
 
     def __call__(
         self,
@@ -129,7 +137,7 @@ class BeamformFloat32:
                     offsets,
                     weights,
                     self._nodes.places,
-                    self._tap_weights,
+                    self._nodes.weights,
                     self._nodes.rows,
                     first,
                     stop,
@@ -149,10 +157,10 @@ def whole_limits(sum_of_weights: float) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _WholeZone:
-    """A zone in whole numbers; its tiles are those from ``begin`` to ``end``."""
+    """A zone in whole numbers, and which of all tiles are its own."""
 
-    begin: int
-    end: int
+    tiles: slice
+    starts: NDArray[np.int32]
     stop: int
     offsets: NDArray[np.int32]
     weights: NDArray[np.int16]
@@ -169,6 +177,7 @@ class BeamformInt16:
     def __init__(
         self,
         kernels: KernelSet,
+        memory: Memory,
         zones: Sequence[Zone],
         nodes: BeamNodes | None,
         *,
@@ -182,7 +191,7 @@ class BeamformInt16:
         )
         self._limit = np.float32(limit)
         self._weight_scale = np.float32(largest / weight_limit)
-        self._kernels, self._nodes = kernels, nodes
+        self._kernels, self._memory, self._threads = kernels, memory, threads
         width = kernels.tile_ranges + max(int(table.samples.max()) for table in tables) + 1
         starts: list[int] = []
         self._zones: list[_WholeZone] = []
@@ -192,33 +201,40 @@ class BeamformInt16:
             # Rounding may have added to them, where there are many small ones.
             sums = np.hypot(weights[:, :, 0, 0], weights[:, :, 1, 0], dtype=np.float64).sum(axis=1)
             self._limit = min(self._limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
-            self._zones.append(_WholeZone(len(starts), len(starts) + len(mine), zone.stop, offsets, weights))
+            self._zones.append(
+                _WholeZone(
+                    slice(len(starts), len(starts) + len(mine)),
+                    memory.table(np.array(mine, dtype=np.int32)),
+                    zone.stop,
+                    memory.table(offsets),
+                    memory.table(weights),
+                )
+            )
             starts += mine
-        self._starts = np.array(starts, dtype=np.int32)
+        self._starts = memory.table(np.array(starts, dtype=np.int32))
         n_mics = 1 + int(tables[0].rows.max()) // n_phases
         self._shape = (len(starts), n_mics, n_phases, width, 2)
+        self._nodes = None
         if nodes is not None:
             sums = float(np.max(np.abs(nodes.weights).sum(axis=(1, 2))))
             scale = min(_SAFE * 2**_TAP_BITS / float(np.max(np.abs(nodes.weights))), _SAFE * 2**16 / sums)
-            self._tap_weights = np.rint(nodes.weights * scale).astype(np.int16)
+            self._nodes = _NodeTables(memory, nodes, np.rint(nodes.weights * scale).astype(np.int16))
             self._weight_scale = np.float32(self._weight_scale * 2**16 / scale)
-            self._threads = threads
 
     def new_buffers(self) -> Buffers:
         """See `Beamform`."""
-        return np.zeros(self._shape, dtype=np.int16), np.zeros(self._shape[0], dtype=np.float32)
+        return self._memory.zeros(self._shape, np.int16), self._memory.zeros(self._shape[:1], np.float32)
 
     def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
         """See `Beamform`."""
         tiles, scales = buffers
         self._kernels.quantise_tiles(analytic, self._starts, self._limit, tiles, scales)
         for zone in self._zones:
-            mine = slice(zone.begin, zone.end)
             if self._nodes is None:
                 self._kernels.delay_and_sum_envelope_int16(
-                    tiles[mine],
-                    scales[mine],
-                    self._starts[mine],
+                    tiles[zone.tiles],
+                    scales[zone.tiles],
+                    zone.starts,
                     zone.stop,
                     zone.offsets,
                     zone.weights,
@@ -227,17 +243,17 @@ class BeamformInt16:
                 )
             else:
                 self._kernels.interpolated_beams_envelope_int16(
-                    tiles[mine],
-                    scales[mine],
-                    self._starts[mine],
+                    tiles[zone.tiles],
+                    scales[zone.tiles],
+                    zone.starts,
                     zone.stop,
                     zone.offsets,
                     zone.weights,
                     self._nodes.places,
-                    self._tap_weights,
+                    self._nodes.weights,
                     self._nodes.rows,
                     self._weight_scale,
-                    _blocks(self._threads, zone.end - zone.begin),
+                    _blocks(self._threads, len(zone.starts)),
                     out,
                 )
 

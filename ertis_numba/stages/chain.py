@@ -1,5 +1,6 @@
 """What every method of making an image offers to the pipeline."""
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,4 +26,22 @@ class Chain(Protocol):
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
+        ...
+
+    def process_batch(
+        self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32]]
+    ) -> None:
+        """Do as `process` for several measurements, at the same time where that is faster."""
+        ...
+
+    def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
+        """Compile or load kernels and make buffers now rather than amid a stream; ``words`` are of silence."""
+        ...
+
+    def new_image(self) -> NDArray[np.float32]:
+        """Return an array for an image, (direction, range), that holds anything."""
+        ...
+
+    def close(self) -> None:
+        """Give back what the chain keeps on its device."""
         ...

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.geometry import Layout
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 
@@ -32,27 +32,30 @@ class Demodulate:
         layout: Layout,
         window: TimeWindow,
         kernels: KernelSet,
+        memory: Memory,
         *,
         taps: NDArray[np.int16] | NDArray[np.int32],
     ) -> None:
-        self._kernel, self._decimate = kernels.demodulate_words, kernels.decimate
-        self._taps = taps
+        self._kernels, self._memory = kernels, memory
+        self._taps = memory.table(taps)
         self._scale = np.float32(1 / taps.sum(dtype=np.int64))
-        self._channels = np.flatnonzero(layout.enabled).astype(np.int32)
+        self._plain_taps = memory.table((taps * np.float64(self._scale)).astype(np.float32))
+        channels = np.flatnonzero(layout.enabled).astype(np.int32)
+        self._channels = memory.table(channels)
         self._factor = settings.decimation
         self._window = window
-        self.shape = (len(self._channels), window.n_fft)
+        self.shape = (len(channels), window.n_fft)
 
     def __call__(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word)."""
         window = self._window
-        self._kernel(
+        self._kernels.demodulate_words(
             words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
         )
 
     def filtered(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from signals that were never modulated, (mic, sample) at the PDM rate, full scale 1."""
-        half, ahead = len(self._taps) // 2, -(-len(self._taps) // self._factor)
+        half, ahead = len(self._plain_taps) // 2, -(-len(self._plain_taps) // self._factor)
         count = self._window.n_samples
         first = (self._window.first_sample - ahead) * self._factor + half
         here = np.arange(first, first + (count + ahead) * self._factor)
@@ -60,7 +63,6 @@ class Demodulate:
         heard = np.zeros((len(signals), len(here)), dtype=np.float32)
         heard[:, inside] = signals[:, here[inside]]
         heard[np.abs(heard) < _SILENCE] = 0.0
-        decimated = np.empty((len(signals), count + ahead), dtype=np.float32)
-        self._decimate(heard, (self._taps * np.float64(self._scale)).astype(np.float32), self._factor, decimated)
-        out[:, :count] = decimated[:, ahead:]
-        out[:, count:] = 0.0
+        decimated = self._memory.zeros((len(signals), count + ahead), np.float32)
+        self._kernels.decimate(self._memory.table(heard), self._plain_taps, self._factor, decimated)
+        self._kernels.remove_group_delay(decimated, ahead, out)

@@ -2,6 +2,10 @@
 
 import functools
 import math
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from queue import Empty, LifoQueue
 from typing import Any, NamedTuple
 
@@ -11,7 +15,7 @@ from numpy.typing import NDArray
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, Lane
 from ertis_numba.settings import Call, Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
@@ -58,8 +62,12 @@ def ringing_db(stop_band_db: float) -> float:
 
 
 class _Buffers(NamedTuple):
+    """What one measurement at a time is written to on its way."""
+
+    lane: Lane
     signals: NDArray[np.float32]
     analytic: NDArray[np.complex64]
+    transforms: fft.Transforms
     beamform: Buffers
 
 
@@ -72,18 +80,27 @@ class FastChain:
         Their plan leaves nothing open: see `planner`.
     kernels : KernelSet
     threads : int
+    graphs : bool
+        Whether a GPU records the chain and plays it again.
 
     Attributes
     ----------
     grid : Grid
     range_m : (range,) float64
+
+    Raises
+    ------
+    DeviceError
+        The device has too little memory.
     """
 
-    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int) -> None:
+    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
+        self._memory = kernels.memory(graphs=graphs)
         with one_thread():
             self._make(settings, kernels, threads)
 
     def _make(self, settings: Settings, kernels: KernelSet, threads: int) -> None:
+        memory = self._memory
         plan = settings.accuracy
         layout = microphones(settings.array)
         self.grid: Grid = direction_grid(settings.processing)
@@ -124,12 +141,12 @@ class FastChain:
         self._lead = window.lead
         self._kernels = kernels
         self._threads = threads
-        self._demodulate = Demodulate(settings, layout, window, kernels, taps=taps)
+        self._demodulate = Demodulate(settings, layout, window, kernels, memory, taps=taps)
         self._matched_filter = MatchedFilter(
             settings,
             window,
             kernels,
-            fft.load(kernels.device),
+            memory,
             taps=taps,
             n_mics=len(own_s),
             gain=lambda frequency_hz: (
@@ -154,61 +171,138 @@ class FastChain:
             for first, stop, range_m in edges
         ]
         self._adaptive = None
-        self._beamform = beamform(plan.precision, kernels, window, zones, nodes, n_phases=n_phases, threads=threads)
+        self._beamform = beamform(
+            plan.precision, kernels, memory, window, zones, nodes, n_phases=n_phases, threads=threads
+        )
         if settings.processing.beamformer != "delay_and_sum":
             table = zones[0].table
             self._adaptive = AdaptiveBeamform(
-                settings.processing, kernels, table.offsets(window.n_outputs), table.weights.astype(np.complex64)
+                settings.processing,
+                kernels,
+                memory,
+                table.offsets(window.n_outputs),
+                table.weights.astype(np.complex64),
             )
         self._spare: LifoQueue[_Buffers] = LifoQueue()
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
-        buffers = self._take_buffers()
-        with self._kernels.threads(self._threads):
-            self._demodulate(words, buffers.signals)
-            self._finish(buffers, out)
+        self._finish(self._begin(words, out, self._threads))
+
+    def process_batch(
+        self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
+    ) -> None:
+        """Do as `process` for several measurements: on a GPU in lanes, on the host side by side with a thread each.
+
+        Without an array in ``outs`` to fill, an image stays on the GPU.
+        """
+        if self._memory.n_lanes == 1:
+            with ThreadPoolExecutor(self._threads) as pool:
+                # Threads of one kernel wait for each other after every stage; those of different measurements never.
+                deque(pool.map(lambda each, out: self._finish(self._begin(each, out, 1)), words, outs), maxlen=0)
+            return
+        under_way: deque[_Buffers] = deque()
+        try:
+            for each, out in zip(words, outs, strict=True):
+                if len(under_way) == self._memory.n_lanes:
+                    self._finish(under_way.popleft())
+                under_way.append(self._begin(each, out, self._threads))
+        finally:
+            while under_way:
+                self._finish(under_way.popleft())
 
     def analytic(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]
     ) -> tuple[NDArray[np.complex64], int]:
         """Do as `process`; return the analytic signals too, (mic, phase, sample), and the sample of the first range."""
-        buffers = self._take_buffers()
-        with self._kernels.threads(self._threads):
-            self._demodulate(words, buffers.signals)
-            self._image(buffers, out)
-        heard = buffers.analytic.copy()
-        self._spare.put(buffers)
+        buffers = self._begin(words, out, self._threads)
+        heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
+        buffers.lane.fetch(buffers.analytic, heard)
+        self._finish(buffers)
         return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
         buffers = self._take_buffers()
-        with self._kernels.threads(self._threads):
+        with self._entered(buffers.lane, self._threads):
+            image = buffers.lane.target(out)
             self._demodulate.filtered(signals, buffers.signals)
-            self._finish(buffers, out)
+            self._image(buffers, image, self._threads)
+            buffers.lane.fetch(image, out)
+        self._finish(buffers)
 
-    def _finish(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
-        self._image(buffers, out)
+    def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
+        """See `Chain.warm_up`."""
+        images = [self.new_image() for _ in range(self._memory.n_lanes)]
+        if len(images) == 1:
+            self.process(words, images[0])
+        else:
+            self.process_batch([words] * len(images), images)
+
+    def new_image(self) -> NDArray[np.float32]:
+        """Return an array for an image, (direction, range), that holds anything."""
+        return self._memory.image((len(self.grid), len(self.range_m)))
+
+    def close(self) -> None:
+        """Give back the memory of the device now rather than when nothing refers to the chain any more."""
+        with suppress(Empty):
+            while True:
+                self._spare.get_nowait()
+        del self._demodulate, self._matched_filter, self._beamform, self._adaptive
+        self._memory.close()
+
+    def _begin(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
+    ) -> _Buffers:
+        """Begin one measurement; its image is in ``out`` when the lane is done."""
+        buffers = self._take_buffers()
+        with self._entered(buffers.lane, threads):
+            here = buffers.lane.send(words)
+            image = buffers.lane.target(self._no_image if out is None else out)
+
+            def steps() -> None:
+                self._demodulate(here, buffers.signals)
+                self._image(buffers, image, threads)
+
+            buffers.lane.run(steps)
+            if out is not None:
+                buffers.lane.fetch(image, out)
+        return buffers
+
+    def _finish(self, buffers: _Buffers) -> None:
+        buffers.lane.wait()
         self._spare.put(buffers)
 
-    def _image(self, buffers: _Buffers, out: NDArray[np.float32]) -> None:
-        self._matched_filter(buffers.signals, buffers.analytic, threads=self._threads)
+    def _image(self, buffers: _Buffers, out: NDArray[np.float32], threads: int) -> None:
+        self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
         if self._adaptive is None:
             self._beamform(buffers.analytic, buffers.beamform, out)
         else:
             self._adaptive(buffers.analytic, out)
+
+    @contextmanager
+    def _entered(self, lane: Lane, threads: int) -> Iterator[None]:
+        with self._kernels.threads(threads), lane.entered():
+            yield
+
+    @functools.cached_property
+    def _no_image(self) -> NDArray[np.float32]:
+        """An array of an image's shape and of no size, for images that nobody fetches from a GPU."""
+        return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
 
     def _take_buffers(self) -> _Buffers:
         """Return buffers that no other thread uses; there are as many as ever ran at once."""
         try:
             return self._spare.get_nowait()
         except Empty:
-            return _Buffers(
-                np.zeros(self._demodulate.shape, dtype=np.float32),
-                np.zeros(self._matched_filter.shape, dtype=np.complex64),
-                self._beamform.new_buffers(),
-            )
+            return self._new_buffers()
+
+    def _new_buffers(self) -> _Buffers:
+        memory, lane = self._memory, self._memory.lane()
+        signals = memory.zeros(self._demodulate.shape, np.float32)
+        analytic = memory.zeros(self._matched_filter.shape, np.complex64)
+        transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
+        return _Buffers(lane, signals, analytic, transforms, self._beamform.new_buffers())
 
 
 def _dither(n_mics: int) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.fft import Transforms
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 from ertis_numba.waveform import filter_response, matched_filter
@@ -29,7 +29,7 @@ class MatchedFilter:
 
     Parameters
     ----------
-    settings, window, kernels, transforms
+    settings, window, kernels, memory
     taps : (tap,) int16 or int32
         Of the decimation filter.
     n_mics : int
@@ -47,7 +47,7 @@ class MatchedFilter:
         settings: Settings,
         window: TimeWindow,
         kernels: KernelSet,
-        transforms: Transforms,
+        memory: Memory,
         *,
         taps: NDArray[np.int16] | NDArray[np.int32],
         n_mics: int,
@@ -62,17 +62,15 @@ class MatchedFilter:
         )
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
-        # The inverse transform divides by its own length instead of the forward one's.
-        scale = window.n_outputs / window.n_fft
-        shifted = scale * flat * np.exp(2j * math.pi * frequency_hz * lag_s)
-        self._responses = (gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64)
+        # Neither transform divides by its length; the forward one's is what the sum of the inverse one lacks.
+        shifted = flat / window.n_fft * np.exp(2j * math.pi * frequency_hz * lag_s)
+        self._responses = memory.table((gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64))
         self._first_bin = matched.first_bin
         self._kernel = kernels.multiply_and_fold
-        self._transforms = transforms
         self.shape = (n_mics, n_phases, window.n_outputs)
 
-    def __call__(self, signals: NDArray[np.float32], out: NDArray[np.complex64], *, threads: int) -> None:
-        """Fill ``out``, (mic, phase, sample) complex64, from ``signals``, (mic, sample) float32."""
-        spectra = self._transforms.forward(signals, threads=threads)
+    def __call__(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, sample) complex64, by ``transforms``, which were made for it."""
+        spectra = transforms.forward(threads=threads)
         self._kernel(spectra, self._responses, self._first_bin, out)
-        self._transforms.inverse(out, threads=threads)
+        transforms.inverse(threads=threads)

@@ -7,6 +7,7 @@ NumPy would write it: float32 throughout, one call per filter, slices added in p
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,23 @@ class PaperChain:
         pulse = scipy.fft.irfft(np.abs(spectrum) ** 2, self._n_fft)
         peak = self._low_pass.at_peak(pulse)
         self._template = (weights[:, None] * (np.conj(spectrum) * delay / peak)).astype(np.complex64)
+
+    def process_batch(
+        self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32]]
+    ) -> None:
+        """Do as `process` for several measurements, one after the other."""
+        for each, out in zip(words, outs, strict=True):
+            self.process(each, out)
+
+    def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
+        """See `Chain.warm_up`; there is nothing to compile."""
+
+    def new_image(self) -> NDArray[np.float32]:
+        """Return an array for an image, (direction, range), that holds anything."""
+        return np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
+
+    def close(self) -> None:
+        """See `Chain.close`; there is nothing to give back."""
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""

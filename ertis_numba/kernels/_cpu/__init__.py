@@ -35,6 +35,7 @@ from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
 from ertis_numba.kernels._cpu.quantise_tiles import quantise_tiles
 from ertis_numba.kernels._cpu.remove_group_delay import remove_group_delay
 from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
+from ertis_numba.kernels._host import HostMemory
 
 __all__ = ["KERNELS"]
 
@@ -74,6 +75,10 @@ def threads(count: int) -> Iterator[None]:
 
 KERNELS = KernelSet(
     device="cpu",
+    hardware="",
+    transforms="scipy",
+    simulated=False,
+    memory=HostMemory,
     max_threads=_MAX_THREADS,
     tile_ranges=RANGES if HAS_INT16_DOT else 0,
     fastest_precision="int16" if HAS_INT16_DOT else "float32",

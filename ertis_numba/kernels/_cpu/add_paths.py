@@ -9,6 +9,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ertis_numba.kernels._scalar import between
+
 __all__ = ["add_paths"]
 
 _LANES = 8
@@ -36,8 +38,8 @@ def add_paths(call, turns, amplitude, first_bin, nodes_per_bin, out):
                     k = begin + lane
                     place = (first_bin + k) * nodes_per_bin
                     node = min(int(place), n_nodes - 1)
-                    low = amplitude[path, mic, node]
-                    gain = low + (amplitude[path, mic, min(node + 1, n_nodes - 1)] - low) * (place - node)
+                    low, high = amplitude[path, mic, node], amplitude[path, mic, min(node + 1, n_nodes - 1)]
+                    gain = between(low, high, place - node)
                     out[mic, k] += complex(gain * re[lane], gain * im[lane]) * call[row, k]
                 for lane in range(_LANES):
                     turned = re[lane] * jump_re - im[lane] * jump_im

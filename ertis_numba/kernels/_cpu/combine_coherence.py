@@ -1,9 +1,9 @@
 """Sum the microphones and weigh the sum by how well they agree."""
 
-import math
-
 import numpy as np
 from numba import njit, prange
+
+from ertis_numba.kernels._scalar import coherent_level, power
 
 __all__ = ["combine_coherence"]
 
@@ -17,10 +17,10 @@ def combine_coherence(signals, offsets, weights, out):
     n_directions, n_mics = offsets.shape
     n_ranges = out.shape[1]
     for direction in prange(n_directions):
-        real, imag, power = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+        real, imag, total = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
         for first in range(0, n_ranges, _TILE):
             count = min(_TILE, n_ranges - first)
-            real[:count], imag[:count], power[:count] = 0, 0, 0
+            real[:count], imag[:count], total[:count] = 0, 0, 0
             for mic in range(n_mics):
                 begin = offsets[direction, mic] + first
                 delayed = flat[begin : begin + count]
@@ -31,10 +31,6 @@ def combine_coherence(signals, offsets, weights, out):
                     y_imag = x.real * weight.imag + x.imag * weight.real
                     real[r] += y_real
                     imag[r] += y_imag
-                    power[r] += y_real * y_real + y_imag * y_imag
+                    total[r] += power(y_real, y_imag)
             for r in range(count):
-                coherent = real[r] * real[r] + imag[r] * imag[r]
-                total = np.float32(n_mics) * power[r]
-                # Rounding must not raise a beam; where there is nothing, nothing agrees. NaN passes both.
-                factor = min(coherent / total, np.float32(1)) if total != 0 else np.float32(0)
-                out[direction, first + r] = factor * np.float32(math.sqrt(coherent))
+                out[direction, first + r] = coherent_level(real[r], imag[r], total[r], np.float32(n_mics))

@@ -9,6 +9,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ertis_numba.kernels._scalar import magnitude
+
 __all__ = ["combine_dmas"]
 
 _TILE = 64  # ranges: the sums of order 8 take 4.6 kB
@@ -70,5 +72,4 @@ def combine_dmas(signals, offsets, weights, order, out):
                 for k in range(order, 0, -1):
                     _add_products(z, sums[k - 1], sums[k], count)
             for r in range(count):
-                x, y = sums[order, 0, r], sums[order, 1, r]
-                out[direction, first + r] = np.float32(math.sqrt(x * x + y * y))
+                out[direction, first + r] = np.float32(magnitude(sums[order, 0, r], sums[order, 1, r]))

@@ -5,13 +5,12 @@ and nothing else. Ranges are the outer loop: the signals of one tile (32 microph
 aperture: 215 kB) stay in the second cache level while all directions of the block read them.
 """
 
-import math
-
 import numpy as np
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.dot32 import TILE, Dot32
+from ertis_numba.kernels._scalar import magnitude
 
 __all__ = ["delay_and_sum_envelope"]
 
@@ -46,7 +45,7 @@ def _beam_short(signals, offsets, weights, direction, first, stop, out):
             sample, weight = flat[offsets[direction, term] + r], weights[direction, term]
             x += sample.real * weight.real - sample.imag * weight.imag
             y += sample.real * weight.imag + sample.imag * weight.real
-        out[direction, r] = np.float32(math.sqrt(x * x + y * y))
+        out[direction, r] = np.float32(magnitude(x, y))
 
 
 @njit(parallel=True, nogil=True, cache=True)

@@ -1,9 +1,9 @@
 """Take the magnitude of analytic beams."""
 
-import math
-
 import numpy as np
 from numba import njit, prange
+
+from ertis_numba.kernels._scalar import magnitude
 
 __all__ = ["envelope"]
 
@@ -14,6 +14,4 @@ def envelope(beams, out):
     n_directions, n_ranges = beams.shape
     for direction in prange(n_directions):
         for r in range(n_ranges):
-            beam = beams[direction, r]
-            # abs() of a complex number guards against overflow and is ten times slower.
-            out[direction, r] = np.float32(math.sqrt(beam.real * beam.real + beam.imag * beam.imag))
+            out[direction, r] = np.float32(magnitude(beams[direction, r].real, beams[direction, r].imag))

@@ -6,12 +6,11 @@ sample, not a stream: neither the number of threads nor the cut into blocks chan
 the same reason. Ten times faster than a loop over one microphone at a time.
 """
 
-import math
-
 import numpy as np
 from numba import njit, prange
 
 from ertis_numba.kernels._cpu.lanes import LANES, as_float64, bits, clamp, load, sign, splat, store, turn_octet
+from ertis_numba.kernels._scalar import MIX_1, MIX_2, NOISE_UNIT, STEP, TO_GRID
 
 __all__ = ["modulate_pdm"]
 
@@ -19,11 +18,6 @@ _OCTETS = LANES // 8
 _INTEGRATORS = 4
 _TILE = 256  # samples between two writes of octets: threads that write beside each other wait for each other's lines
 
-# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators,
-# 2014; the constants are variant 13 of D. Stafford's, as in the generators of S. Vigna)
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX_2 = np.uint64(0x94D049BB133111EB)
 _12, _24, _27, _30, _31 = np.uint64(12), np.uint64(24), np.uint64(27), np.uint64(30), np.uint64(31)
 
 # The upper 16 bits of a hash are its dither, four fields of 12 bits its noise.
@@ -33,16 +27,13 @@ _LOW_24 = np.uint64(0xFF_FFFF)
 _ONE, _TWO_52 = np.uint64(0x3FF0_0000_0000_0000), np.uint64(0x4330_0000_0000_0000)  # 1 and 2⁵² as float64
 _DITHER_MEAN = 1.5 - 2.0**-17
 _NOISE_MEAN = 2.0**52 + 4 * 4095 / 2
-_NOISE_UNIT = 1 / math.sqrt((4096.0**2 - 1) / 3)  # 1 / rms of a sum of four numbers from 0 to 4095
-
-_TO_GRID = 1.5 * 2.0**32  # float64 of this size lie 2⁻²⁰ apart: adding it rounds, on every processor
 
 
 @njit(inline="always")
 def _hashed(counter):
     """Return SplitMix64 of the counters."""
-    z = (counter ^ (counter >> splat(_30))) * splat(_MIX_1)
-    z = (z ^ (z >> splat(_27))) * splat(_MIX_2)
+    z = (counter ^ (counter >> splat(_30))) * splat(MIX_1)
+    z = (z ^ (z >> splat(_27))) * splat(MIX_2)
     return z ^ (z >> splat(_31))
 
 
@@ -89,11 +80,11 @@ def _run(signals, rows, counters, scales, states, loop, octets, masks, out):
         _fill_tile(signals, rows, begin, count, tile)
         for n in range(count):
             z = _hashed(counter)
-            counter = counter + splat(_STEP)
+            counter = counter + splat(STEP)
             u = load(tile, n)
             if noisy:
                 u = u + scale * _noise(z)
-            u = (u + splat(_TO_GRID)) - splat(_TO_GRID)
+            u = (u + splat(TO_GRID)) - splat(TO_GRID)
             quantised = (u + dither * _dither(z)) + ((s1 + s2) + (s3 + s4))
             words[n] = bits(quantised)
             d = u - sign(quantised)
@@ -122,8 +113,8 @@ def _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out):
             masks[lane // 8] |= 1 << lane % 8
         mic = max(mic, 0)  # a lane without microphone runs along with the first one, and its bits are masked
         rows[lane] = mic
-        counters[0, lane] = keys[mic] + np.uint64(first) * _STEP
-        scales[0, lane] = noise_rms[mic] * _NOISE_UNIT
+        counters[0, lane] = keys[mic] + np.uint64(first) * STEP
+        scales[0, lane] = noise_rms[mic] * NOISE_UNIT
         for integrator in range(_INTEGRATORS):
             kept[integrator, lane] = states[mic, integrator]
     _run(signals, rows, counters, scales, kept, loop, octets, masks, out)

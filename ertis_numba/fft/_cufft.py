@@ -1,0 +1,67 @@
+"""Transforms on an NVIDIA GPU, by cuFFT through CuPy, on arrays that are Numba's."""
+
+from collections.abc import Callable
+from typing import Any
+
+import cupy
+import numpy as np
+from cupy.cuda import cufft
+from numpy.typing import DTypeLike, NDArray
+
+from ertis_numba.errors import DeviceError
+
+__all__ = ["CufftTransforms"]
+
+
+class CufftTransforms:
+    """See `Transforms`. Plans, their work areas and views of the arrays are made here, once; nothing is copied.
+
+    Parameters
+    ----------
+    signals : (mic, n) float32
+    analytic : (mic, phase, n_out) complex64
+    zeros : callable
+        Shape and type to a new array of the device.
+    stream : numba.cuda.Stream
+        What transforms wait for and what waits for them.
+
+    Raises
+    ------
+    DeviceError
+        There is no room for the work areas.
+    """
+
+    def __init__(
+        self,
+        signals: NDArray[np.float32],
+        analytic: NDArray[np.complex64],
+        *,
+        zeros: Callable[[tuple[int, ...], DTypeLike], NDArray[Any]],
+        stream: Any,
+    ) -> None:
+        n_mics, n = signals.shape
+        _, n_phases, n_out = analytic.shape
+        self._spectra = zeros((n_mics, n // 2 + 1), np.complex64)
+        self._stream = cupy.cuda.Stream.from_external(stream)
+        # CuPy's views keep Numba's arrays alive, and cuFFT's plans take no others.
+        self._real, self._bins, self._both = (cupy.asarray(array) for array in (signals, self._spectra, analytic))
+        try:
+            with self._stream:
+                self._forward = cufft.Plan1d(n, cufft.CUFFT_R2C, n_mics)
+                self._inverse = cufft.Plan1d(n_out, cufft.CUFFT_C2C, n_mics * n_phases)
+        except cupy.cuda.memory.OutOfMemoryError as error:
+            raise DeviceError(
+                f"device 'cuda' has no room for transforms of {n_mics * n_phases} rows of {n_out} samples ({error}); "
+                "give a shorter processing.range_m or less accuracy.oversampling, or use device 'cpu'"
+            ) from error
+
+    def forward(self, *, threads: int) -> NDArray[np.complex64]:  # noqa: ARG002
+        """See `Transforms.forward`."""
+        with self._stream:
+            self._forward.fft(self._real, self._bins, cufft.CUFFT_FORWARD)
+        return self._spectra
+
+    def inverse(self, *, threads: int) -> None:  # noqa: ARG002
+        """See `Transforms.inverse`."""
+        with self._stream:
+            self._inverse.fft(self._both, self._both, cufft.CUFFT_INVERSE)

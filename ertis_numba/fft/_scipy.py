@@ -1,0 +1,27 @@
+"""Transforms on the host, by SciPy's pocketfft."""
+
+from typing import cast
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+__all__ = ["ScipyTransforms"]
+
+
+class ScipyTransforms:
+    """See `Transforms`. Where the GPU is simulated its arrays are NumPy's underneath, and are changed in place too."""
+
+    def __init__(self, signals: NDArray[np.float32], analytic: NDArray[np.complex64]) -> None:
+        self._signals, self._analytic = np.asarray(signals), np.asarray(analytic)
+
+    def forward(self, *, threads: int) -> NDArray[np.complex64]:
+        """See `Transforms.forward`."""
+        return cast("NDArray[np.complex64]", scipy.fft.rfft(self._signals, workers=threads))
+
+    def inverse(self, *, threads: int) -> None:
+        """See `Transforms.inverse`."""
+        spectra = self._analytic
+        result = scipy.fft.ifft(spectra, norm="forward", overwrite_x=True, workers=threads)
+        if result is not spectra and not np.shares_memory(result, spectra):
+            spectra[:] = result  # overwrite_x is a permission, not a promise

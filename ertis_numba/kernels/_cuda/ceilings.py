@@ -1,0 +1,121 @@
+"""What this GPU can do at most: device memory, arithmetic and the first cache level, by kernels that do nothing else.
+
+Only benchmarks use these; they are no part of the signal chain.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import cuda
+
+from ertis_numba.kernels._cuda.lane import SIMULATED, launch
+from ertis_numba.kernels._cuda.stopwatch import Stopwatch
+
+__all__ = ["TURN_LOADS", "TURN_MULTIPLY_ADDS", "ceilings", "load", "multiply_add", "occupy", "properties"]
+
+_BLOCK = 256
+_WARP = np.uint32(32)
+_BLOCKS_PER_MULTIPROCESSOR = 16  # twice as many as reside at a time
+_SUMS, _ROUNDS, _LOADS = 8, 16, 8
+TURN_MULTIPLY_ADDS = _SUMS * _ROUNDS
+TURN_LOADS = _LOADS
+"""Of a thread in one turn."""
+_SAMPLES = 2048  # of 8 bytes: they stay in the first cache level of any GPU
+_MASK = np.uint32(_SAMPLES - 1)
+_OCCUPY_TURNS = 40_000  # some three milliseconds: a turn is 128 instructions, of one warp
+_TURNS = 2_000
+_COPY_BYTES = 2**28
+
+
+@cuda.jit(cache=True)
+def _multiply_add(turns, factor, addend, out):
+    """Eight sums that do not wait for each other: a multiply-add takes four clocks, and four warps take turns."""
+    a = np.float32(cuda.threadIdx.x)
+    b, c, d = a + addend, a - addend, a * factor
+    e, f, g, h = b + addend, c - addend, b * factor, c * factor
+    for _ in range(turns):
+        for _ in range(_ROUNDS):
+            a, b = a * factor + addend, b * factor + addend
+            c, d = c * factor + addend, d * factor + addend
+            e, f = e * factor + addend, f * factor + addend
+            g, h = g * factor + addend, h * factor + addend
+    out[cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x] = ((a + b) + (c + d)) + ((e + f) + (g + h))
+
+
+@cuda.jit(cache=True)
+def _load(samples, turns, first, out):
+    """A warp loads 32 samples side by side, as delay-and-sum does: one after the other, ``first`` after a line."""
+    at = np.uint32(np.uint32(cuda.threadIdx.x) % _WARP + np.uint32(first))
+    total = np.uint64(0)
+    for _ in range(turns):
+        for k in range(_LOADS):
+            total ^= samples[np.uint64(at) + np.uint64(32 * k)]
+        at = np.uint32(np.uint32(at + _WARP) & _MASK)
+    out[cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x] = total
+
+
+def multiply_add(turns, out):
+    """Run float32 multiply-adds in registers, a thread per element of ``out``, (thread,) float32."""
+    launch(_multiply_add, (-(-len(out) // _BLOCK),), (min(_BLOCK, len(out)),), turns, np.float32(0.5), np.float32(1), out)
+
+
+def load(samples, turns, first, out):
+    """Load samples from the first cache level, a thread per element of ``out``, (thread,) uint64.
+
+    ``samples`` are 2048 + 256 of uint64; ``first`` below 16 is how many lie between a line's begin and a warp's first.
+    """
+    launch(_load, (-(-len(out) // _BLOCK),), (min(_BLOCK, len(out)),), samples, turns, first, out)
+
+
+def occupy(out):
+    """Keep a lane busy for milliseconds, so that what is launched meanwhile runs without a gap; ``out`` as above."""
+    multiply_add(1 if SIMULATED else _OCCUPY_TURNS, out)
+
+
+def properties():
+    """Return multiprocessors, compute capability and, for nvidia-smi, the identity of the GPU."""
+    device = cuda.get_current_device()
+    return {
+        "multiprocessors": 1 if SIMULATED else int(device.MULTIPROCESSOR_COUNT),
+        "compute_capability": ".".join(map(str, device.compute_capability)),
+        "uuid": "" if SIMULATED else str(device.uuid),
+    }
+
+
+def ceilings(runs, *, turns=_TURNS, copy_bytes=_COPY_BYTES, threads=None):
+    """Return the best of ``runs``: what the GPU can do is not an average.
+
+    Parameters
+    ----------
+    runs : int
+    turns, copy_bytes, threads : int
+        How much of it; as much as fills a GPU by default.
+
+    Returns
+    -------
+    dict
+        ``copy_gb_s``, bytes read and bytes written; ``float32_gop_s``, a multiply-add being two operations; ``load_gb_s``
+        from the first cache level, warps on a line's begin, and ``load_unaligned_gb_s``, on the sample after.
+    """
+    threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
+    source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))
+    sums = cuda.device_array(threads, np.float32)
+    words, samples = cuda.device_array(threads, np.uint64), cuda.to_device(np.arange(_SAMPLES + 256, dtype=np.uint64))
+    operations, loaded = 2 * TURN_MULTIPLY_ADDS * turns * threads, 8 * TURN_LOADS * turns * threads
+    return {
+        "copy_gb_s": 2 * source.nbytes / _best_s(runs, lambda: target.copy_to_device(source)) / 1e9,
+        "float32_gop_s": operations / _best_s(runs, lambda: multiply_add(turns, sums)) / 1e9,
+        "load_gb_s": loaded / _best_s(runs, lambda: load(samples, turns, 0, words)) / 1e9,
+        "load_unaligned_gb_s": loaded / _best_s(runs, lambda: load(samples, turns, 1, words)) / 1e9,
+    }
+
+
+def _best_s(runs: int, run: Callable[[], object]) -> float:
+    watch, times_ms = Stopwatch(), []
+    run()
+    for _ in range(runs):
+        watch.start()
+        run()
+        watch.mark("run")
+        times_ms.append(watch.read_ms()["run"])
+    return min(times_ms) / 1e3

@@ -1,0 +1,37 @@
+"""The kernels on the GPU of this machine. Importing this is what looks for one."""
+
+import importlib.util
+
+from numba import cuda
+
+from ertis_numba.errors import DeviceError
+from ertis_numba.kernels._cuda import kernel_set
+from ertis_numba.kernels._cuda.lane import SIMULATED
+from ertis_numba.kernels._cuda.memory import CudaMemory
+
+__all__ = ["KERNELS"]
+
+_REMEDY = "use device 'cpu', or install ertis-numba[cu12] or [cu13] on a machine with an NVIDIA GPU: see docs/cuda.md"
+
+
+def _hardware() -> str:
+    """Return the name of the GPU.
+
+    Raises
+    ------
+    DeviceError
+        There is none, or something is missing that it needs.
+    """
+    if SIMULATED:
+        return "Numba's CUDA simulator"
+    if not cuda.is_available():
+        reason = " ".join(str(cuda.cuda_error() or "none is visible").split())
+        raise DeviceError(f"device 'cuda' finds no NVIDIA GPU ({reason}); {_REMEDY}")
+    missing = [name for name in ("numba_cuda", "cupy") if importlib.util.find_spec(name) is None]
+    if missing:  # the target that Numba itself still ships crashes on newer drivers
+        raise DeviceError(f"device 'cuda' needs {' and '.join(missing)}, not installed here; {_REMEDY}")
+    name = cuda.get_current_device().name
+    return str(name.decode() if isinstance(name, bytes) else name)
+
+
+KERNELS = kernel_set(hardware=_hardware(), transforms="scipy" if SIMULATED else "cufft", memory=CudaMemory)

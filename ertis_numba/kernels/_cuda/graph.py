@@ -1,0 +1,41 @@
+"""CUDA graphs: the launches of a whole chain, recorded once and played again by one call.
+
+Numba has no graphs of its own; CuPy records whatever is launched on a stream, Numba's kernels and cuFFT's alike.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["Graph"]
+
+
+class Graph:
+    """Steps that launch the same kernels on the same arrays each time.
+
+    Parameters
+    ----------
+    stream : numba.cuda.Stream
+        Not the default one, which cannot be recorded.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        import cupy  # noqa: PLC0415 - half a second that only those wait for who use graphs
+
+        self._stream = cupy.cuda.Stream.from_external(stream)
+        self._graph: Any = None
+        self._warm = False
+
+    def run(self, steps: Callable[[], None]) -> None:
+        """Launch the steps: one by one the first time, which compiles kernels and makes arrays, then as a graph."""
+        if not self._warm:
+            steps()
+            self._warm = True
+            return
+        if self._graph is None:
+            with self._stream:
+                self._stream.begin_capture()
+                try:
+                    steps()
+                finally:
+                    self._graph = self._stream.end_capture()
+        self._graph.launch(self._stream)

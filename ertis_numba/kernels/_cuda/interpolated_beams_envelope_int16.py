@@ -1,0 +1,101 @@
+"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; on 16-bit samples."""
+
+import numpy as np
+from numba import cuda
+
+from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, sum_short_terms
+from ertis_numba.kernels._cuda.lane import launch, workspace
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, WARP
+from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of, upper_halves
+
+__all__ = ["interpolated_beams_envelope_int16"]
+
+_ONE, _1, _2 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP)
+
+
+@cuda.jit(cache=True)
+def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
+    """``nodes`` are (tile, node, range) pairs of int16 as uint32."""
+    node = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
+    if node >= np.uint64(nodes.shape[1]):
+        return
+    tile, k = np.uint64(cuda.blockIdx.y), np.uint64(cuda.threadIdx.x)
+    place = cuda.blockIdx.y * np.int64(per_tile) + cuda.threadIdx.x
+    a_real, a_imag, b_real, b_imag, c_real, c_imag = sum_short_terms(
+        samples, offsets, weights, np.uint64(n_terms), node, place
+    )
+    nodes[tile, node, k] = upper_halves(a_real, a_imag)
+    nodes[tile, node, k + _1] = upper_halves(b_real, b_imag)
+    nodes[tile, node, k + _2] = upper_halves(c_real, c_imag)
+
+
+@cuda.jit(cache=True)
+def _interpolate(nodes, n_nodes, scales, starts, stop, places, tap_weights, rows, weight_scale, out):
+    """``nodes`` are flat, ``tap_weights`` pairs of int16 as uint32."""
+    direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
+    if direction >= np.uint64(places.shape[0]):
+        return
+    tile = np.uint64(cuda.blockIdx.y)
+    first = cuda.blockIdx.y * np.int64(n_nodes) * TILE_RANGES + cuda.threadIdx.x
+    a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
+    n_pairs = np.uint64(places.shape[1])
+    pair = np.uint64(0)
+    while pair < n_pairs:
+        at = np.uint64(first + places[direction, pair] * np.int64(TILE_RANGES))
+        weights = tap_weights[direction, pair]
+        pair += _ONE
+        low, high = short_real_of(weights), short_imag_of(weights)
+        x, y = nodes[at], nodes[at + np.uint64(TILE_RANGES)]
+        a_real = np.int32(a_real + low * short_real_of(x) + high * short_real_of(y))
+        a_imag = np.int32(a_imag + low * short_imag_of(x) + high * short_imag_of(y))
+        x, y = nodes[at + _1], nodes[at + np.uint64(TILE_RANGES + WARP)]
+        b_real = np.int32(b_real + low * short_real_of(x) + high * short_real_of(y))
+        b_imag = np.int32(b_imag + low * short_imag_of(x) + high * short_imag_of(y))
+        x, y = nodes[at + _2], nodes[at + np.uint64(TILE_RANGES + 2 * WARP)]
+        c_real = np.int32(c_real + low * short_real_of(x) + high * short_real_of(y))
+        c_imag = np.int32(c_imag + low * short_imag_of(x) + high * short_imag_of(y))
+    scale, row = np.float32(scales[tile] * weight_scale), np.uint64(rows[direction])
+    r, end = np.uint64(starts[tile] + cuda.threadIdx.x), np.uint64(stop)
+    if r < end:
+        out[row, r] = magnitude(np.float32(a_real), np.float32(a_imag)) * scale
+    if r + _1 < end:
+        out[row, r + _1] = magnitude(np.float32(b_real), np.float32(b_imag)) * scale
+    if r + _2 < end:
+        out[row, r + _2] = magnitude(np.float32(c_real), np.float32(c_imag)) * scale
+
+
+def interpolated_beams_envelope_int16(
+    tiles, scales, starts, stop, offsets, weights, places, tap_weights, rows, weight_scale, n_blocks, out
+):
+    """See `InterpolatedBeamsEnvelopeInt16`."""
+    n_nodes, n_terms = offsets.shape
+    n_directions, n_pairs = places.shape
+    n_tiles = tiles.shape[0]
+    samples = tiles.reshape(-1).view(np.uint32)
+    nodes = workspace(f"nodes of {n_tiles} tiles", (n_tiles, n_nodes, TILE_RANGES), np.uint32)
+    launch(
+        _fill_nodes,
+        (-(-n_nodes // DIRECTIONS), n_tiles),
+        BLOCK,
+        samples,
+        samples.shape[0] // n_tiles,
+        offsets.reshape(-1),
+        weights.reshape(n_nodes * n_terms, 4).view(np.uint32),
+        n_terms,
+        nodes,
+    )
+    launch(
+        _interpolate,
+        (-(-n_directions // DIRECTIONS), n_tiles),
+        BLOCK,
+        nodes.reshape(-1),
+        n_nodes,
+        scales,
+        starts,
+        stop,
+        places,
+        tap_weights.reshape(n_directions, 2 * n_pairs).view(np.uint32),
+        rows,
+        weight_scale,
+        out,
+    )

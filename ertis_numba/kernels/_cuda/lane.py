@@ -1,0 +1,120 @@
+"""The way of measurements through the GPU: a stream, and arrays that are made once."""
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numba
+import numpy as np
+from numba import cuda
+from numpy.typing import DTypeLike, NDArray
+
+from ertis_numba.kernels._cuda.graph import Graph
+
+__all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
+
+SIMULATED = bool(numba.config.ENABLE_CUDASIM)
+
+Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
+
+
+class Lane:
+    """See `kernels.Lane`; also where kernels find room to work in.
+
+    A kernel that needs room for what it hands to the next launch asks `workspace` for it, under a name of its own.
+    What is launched on one stream runs in order, so the next measurement can use the room again.
+
+    Parameters
+    ----------
+    stream : numba.cuda.Stream or 0
+        0 is the stream that waits for all others.
+    allocate : callable
+        Shape and type to a new array of the device.
+    graphs : bool
+        Whether `run` records its steps as a CUDA graph. Without, launching costs the processor some ten
+        microseconds per kernel.
+    """
+
+    def __init__(self, stream: Any = 0, allocate: Allocate = cuda.device_array, *, graphs: bool = False) -> None:
+        self.stream = stream
+        self._allocate = allocate
+        self._rooms: dict[str, Any] = {}
+        self._staged: dict[tuple[tuple[int, ...], str], tuple[NDArray[Any], Any]] = {}
+        self._targets: dict[tuple[int, ...], Any] = {}
+        self._graph = Graph(stream) if graphs and not SIMULATED else None
+
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """See `kernels.Lane.entered`."""
+        before = getattr(_HERE, "lane", None)
+        _HERE.lane = self
+        try:
+            yield
+        finally:
+            _HERE.lane = before
+
+    def send(self, array: NDArray[Any]) -> Any:
+        """See `kernels.Lane.send`."""
+        kind = (array.shape, array.dtype.str)
+        if kind not in self._staged:
+            # Only from pinned memory does a copy run beside the kernels of other lanes.
+            self._staged[kind] = cuda.pinned_array(array.shape, array.dtype), self._allocate(array.shape, array.dtype)
+        staged, here = self._staged[kind]
+        np.copyto(staged, array)
+        here.copy_to_device(staged, stream=self.stream)
+        return here
+
+    def target(self, out: NDArray[np.float32]) -> Any:
+        """See `kernels.Lane.target`."""
+        if out.shape not in self._targets:
+            self._targets[out.shape] = self._allocate(out.shape, out.dtype)
+        return self._targets[out.shape]
+
+    def run(self, steps: Callable[[], None]) -> None:
+        """See `kernels.Lane.run`."""
+        if self._graph is None:
+            steps()
+        else:
+            self._graph.run(steps)
+
+    def fetch(self, array: Any, out: NDArray[Any]) -> None:
+        """See `kernels.Lane.fetch`."""
+        array.copy_to_host(out, stream=self.stream)
+
+    def wait(self) -> None:
+        """See `kernels.Lane.wait`."""
+        if self.stream:
+            self.stream.synchronize()
+        else:
+            cuda.synchronize()
+
+    def launch(self, kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
+        """Run a kernel on the lane's stream."""
+        kernel[grid, block, self.stream](*arguments)
+
+    def room(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
+        """Return the array of a name; another one if its shape or type changes."""
+        found = self._rooms.get(name)
+        if found is None or found.shape != shape or found.dtype != np.dtype(dtype):
+            found = self._rooms[name] = self._allocate(shape, dtype)
+        return found
+
+
+_HERE = threading.local()
+
+
+def current() -> Lane:
+    """Return the lane that this Python thread has entered, or a passing one on the default stream."""
+    return getattr(_HERE, "lane", None) or Lane()
+
+
+def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
+    """Run ``kernel`` with ``grid`` blocks of ``block`` threads, after what was launched on this lane before."""
+    if all(grid):  # where there is nothing to do a launch would be an error
+        current().launch(kernel, grid, block, *arguments)
+
+
+def workspace(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
+    """Return an array of the current lane that holds anything; see `Lane.room`."""
+    return current().room(name, shape, dtype)

@@ -1,0 +1,68 @@
+"""Sums over the terms of a beam.
+
+A warp has one direction and its threads `RANGES_PER_THREAD` ranges each, that lie a warp apart. So a term's offset and
+weight are one load for all of them, and samples are whole lines of the cache. Complex numbers are uint64 here: a
+complex64 would be loaded in halves. Indices are unsigned: Numba tests signed ones for negative numbers.
+"""
+
+import numpy as np
+from numba import cuda
+
+from ertis_numba.kernels._scalar import imag_of, real_of
+
+__all__ = ["BLOCK", "DIRECTIONS", "TILE", "WARP", "beam_grid", "complexes", "sum_term_tile", "sum_terms"]
+
+WARP = 32
+DIRECTIONS = 4
+BLOCK = (WARP, DIRECTIONS)
+RANGES_PER_THREAD = 4
+TILE = RANGES_PER_THREAD * WARP
+_ONE, _1, _2, _3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
+
+
+def complexes(array):
+    """Return complex64 numbers as a flat array of uint64."""
+    return array.reshape(-1).view(np.uint64)
+
+
+def beam_grid(n_directions, n_ranges):
+    """Return the number of blocks for an image: those side by side read the same tile of signals."""
+    return -(-n_directions // DIRECTIONS), -(-n_ranges // TILE)
+
+
+@cuda.jit(device=True)
+def sum_term_tile(signals, offsets, weights, n_terms, direction, place):
+    """Return real and imaginary parts of a beam at ``place`` and one, two and three warps further."""
+    a_real = a_imag = b_real = b_imag = c_real = c_imag = d_real = d_imag = np.float32(0)
+    entry = direction * n_terms
+    end = entry + n_terms
+    while entry < end:
+        weight = weights[entry]
+        at = np.uint32(place + offsets[entry])  # of 32 bits: then an address is one instruction
+        entry += _ONE
+        w_real, w_imag = real_of(weight), imag_of(weight)
+        a, b, c, d = signals[at], signals[at + _1], signals[at + _2], signals[at + _3]
+        a_real = (a_real + real_of(a) * w_real) - imag_of(a) * w_imag
+        a_imag = (a_imag + real_of(a) * w_imag) + imag_of(a) * w_real
+        b_real = (b_real + real_of(b) * w_real) - imag_of(b) * w_imag
+        b_imag = (b_imag + real_of(b) * w_imag) + imag_of(b) * w_real
+        c_real = (c_real + real_of(c) * w_real) - imag_of(c) * w_imag
+        c_imag = (c_imag + real_of(c) * w_imag) + imag_of(c) * w_real
+        d_real = (d_real + real_of(d) * w_real) - imag_of(d) * w_imag
+        d_imag = (d_imag + real_of(d) * w_imag) + imag_of(d) * w_real
+    return a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag
+
+
+@cuda.jit(device=True)
+def sum_terms(signals, offsets, weights, n_terms, direction, place):
+    """Return real and imaginary part of a beam at ``place``."""
+    real = imag = np.float32(0)
+    entry = direction * n_terms
+    end = entry + n_terms
+    while entry < end:
+        weight, sample = weights[entry], signals[np.uint32(place + offsets[entry])]
+        entry += _ONE
+        w_real, w_imag = real_of(weight), imag_of(weight)
+        real = (real + real_of(sample) * w_real) - imag_of(sample) * w_imag
+        imag = (imag + real_of(sample) * w_imag) + imag_of(sample) * w_real
+    return real, imag

@@ -1,0 +1,71 @@
+"""The memory of kernels that run on the processor: arrays of NumPy, used where they are."""
+
+import contextlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ertis_numba.kernels._contract import Array
+
+__all__ = ["HostMemory"]
+
+
+class _HostLane:
+    """See `Lane`: nothing is to be brought anywhere, and all that is begun is done at once."""
+
+    stream = None
+
+    def entered(self) -> AbstractContextManager[None]:
+        """See `Lane.entered`."""
+        return contextlib.nullcontext()
+
+    def send(self, array: Array) -> Array:
+        """See `Lane.send`."""
+        return array
+
+    def target(self, out: Array) -> Array:
+        """See `Lane.target`."""
+        return out
+
+    def run(self, steps: Callable[[], None]) -> None:
+        """See `Lane.run`."""
+        steps()
+
+    def fetch(self, array: Array, out: Array) -> None:
+        """See `Lane.fetch`."""
+        if array is not out:
+            out[...] = array
+
+    def wait(self) -> None:
+        """See `Lane.wait`."""
+
+
+class HostMemory:
+    """See `Memory`."""
+
+    n_lanes = 1
+
+    def __init__(self, *, graphs: bool = False) -> None:
+        del graphs  # there is nothing that launching would cost
+
+    def table(self, array: Array) -> Array:
+        """See `Memory.table`."""
+        return array
+
+    def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """See `Memory.zeros`."""
+        return np.zeros(shape, dtype)
+
+    def image(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """See `Memory.image`."""
+        return np.empty(shape, np.float32)
+
+    def lane(self) -> _HostLane:
+        """See `Memory.lane`."""
+        return _HostLane()
+
+    def close(self) -> None:
+        """See `Memory.close`."""

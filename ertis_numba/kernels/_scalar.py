@@ -1,0 +1,166 @@
+"""Arithmetic of one number at a time, which the kernels of the processor and those of the GPU share.
+
+No function here knows arrays or threads: what is written here is compiled into the caller, for its device.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+__all__ = [
+    "MIX_1",
+    "MIX_2",
+    "NOISE_UNIT",
+    "STEP",
+    "TO_GRID",
+    "between",
+    "coherent_level",
+    "dither_of",
+    "hash_of",
+    "imag_of",
+    "magnitude",
+    "noise_of",
+    "power",
+    "real_of",
+    "root_of",
+    "sample_of",
+    "short_imag_of",
+    "short_real_of",
+    "short_sample_of",
+    "upper_halves",
+]
+
+_LOW_32, _32 = np.uint64(0xFFFF_FFFF), np.uint64(32)
+_LOW_16, _16 = np.uint32(0xFFFF), np.uint32(16)
+_HALF, _SHIFT = np.int64(1 << 15), np.int64(16)
+_TO_WHOLE = np.float32(1.5 * 2.0**23)  # float32 of this size lie 1 apart: adding it rounds, and halves to the even one
+
+
+# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators,
+# 2014; the constants are variant 13 of D. Stafford's, as in the generators of S. Vigna)
+STEP = np.uint64(0x9E3779B97F4A7C15)
+MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
+MIX_2 = np.uint64(0x94D049BB133111EB)
+_12, _24, _27, _30, _31, _36, _48 = (np.uint64(shift) for shift in (12, 24, 27, 30, 31, 36, 48))
+_FIELD = np.uint64(0xFFF)  # the lower four of 12 bits are a hash's noise, its upper 16 bits its dither
+NOISE_UNIT = 1 / math.sqrt((4096.0**2 - 1) / 3)
+"""1 / rms of a sum of four numbers from 0 to 4095."""
+TO_GRID = 1.5 * 2.0**32
+"""float64 of this size lie 2⁻²⁰ apart: adding it rounds, on every processor."""
+
+
+@njit(inline="always")
+def real_of(sample):
+    """Return the real part of a complex64 given as a uint64, which is how it is one load."""
+    return np.uint32(sample & _LOW_32).view(np.float32)
+
+
+@njit(inline="always")
+def imag_of(sample):
+    """Return the imaginary part of a complex64 given as a uint64."""
+    return np.uint32(sample >> _32).view(np.float32)
+
+
+@njit(inline="always")
+def sample_of(real, imag):
+    """Return a complex64 as a uint64."""
+    low, high = np.float32(real).view(np.uint32), np.float32(imag).view(np.uint32)
+    return np.uint64(low) | (np.uint64(high) << _32)
+
+
+@njit(inline="always")
+def short_real_of(sample):
+    """Return the real part of a pair of int16 given as a uint32, as an int32."""
+    return np.int32(np.int16(sample & _LOW_16))
+
+
+@njit(inline="always")
+def short_imag_of(sample):
+    """Return the imaginary part of a pair of int16 given as a uint32, as an int32."""
+    return np.int32(np.int16(sample >> _16))
+
+
+@njit(inline="always")
+def short_sample_of(real, imag):
+    """Return two numbers within the range of int16, rounded, as a uint32; of two as near, the even one."""
+    low = np.uint32(np.int32((np.float32(real) + _TO_WHOLE) - _TO_WHOLE))
+    high = np.uint32(np.int32((np.float32(imag) + _TO_WHOLE) - _TO_WHOLE))
+    return np.uint32((low & _LOW_16) | (high << _16))
+
+
+@njit(inline="always")
+def upper_halves(real, imag):
+    """Return the upper 16 bits of two int32, rounded, as a uint32."""
+    low = np.uint32((np.int64(real) + _HALF) >> _SHIFT)
+    high = np.uint32((np.int64(imag) + _HALF) >> _SHIFT)
+    return np.uint32((low & _LOW_16) | (high << _16))
+
+
+@njit(inline="always")
+def power(real, imag):
+    """Return ``real² + imag²``."""
+    return real * real + imag * imag
+
+
+@njit(inline="always")
+def magnitude(real, imag):
+    """Return ``√(real² + imag²)``; `abs` guards against overflow and takes ten times as long."""
+    return math.sqrt(power(real, imag))
+
+
+@njit(inline="always")
+def between(low, high, part):
+    """Return what lies ``part`` of the way from one number to another."""
+    return low + (high - low) * part
+
+
+@njit(inline="always", error_model="numpy")
+def coherent_level(real, imag, total_power, count):
+    """Return the magnitude of the sum of ``count`` numbers times their coherence factor.
+
+    Rounding must not raise it; where there is nothing, nothing agrees. NaN passes both.
+    """
+    coherent = power(real, imag)
+    total = count * total_power
+    factor = coherent / total if total != 0 else np.float32(0)
+    return min(factor, np.float32(1)) * math.sqrt(coherent)
+
+
+@njit(inline="always", error_model="numpy")
+def root_of(real, imag, order):
+    """Return ``x / |x|^(1 − 1 / order)``, 0 for 0, in single precision and without squares of x, which may be lost."""
+    x, y = abs(real), abs(imag)
+    largest = max(x, y)
+    scale = np.float32(0)
+    if x != 0 or y != 0:
+        real, imag = real / largest, imag / largest
+        square = power(real, imag)  # from 1 to 2
+        if order == 2:  # the usual one
+            scale = math.sqrt(largest / math.sqrt(square))
+        else:
+            exponent = np.float32(1) / np.float32(order)
+            scale = largest**exponent * square ** ((exponent - np.float32(1)) * np.float32(0.5))
+    return real * scale, imag * scale
+
+
+@njit(inline="always")
+def hash_of(key, sample):
+    """Return SplitMix64 of a key and the number of a sample."""
+    z = key + np.uint64(sample) * STEP
+    z = (z ^ (z >> _30)) * MIX_1
+    z = (z ^ (z >> _27)) * MIX_2
+    return z ^ (z >> _31)
+
+
+@njit(inline="always")
+def dither_of(z):
+    """Return the upper 16 bits of a hash as a number within ±½, exactly."""
+    return (np.float64(z >> _48) - 32_767.5) * 2.0**-16
+
+
+@njit(inline="always")
+def noise_of(z):
+    """Return the sum of the four lower 12-bit fields of a hash, less its mean."""
+    total = (z & _FIELD) + ((z >> _12) & _FIELD) + ((z >> _24) & _FIELD) + ((z >> _36) & _FIELD)
+    return np.float64(total) - 8190.0

@@ -1,0 +1,45 @@
+"""An array and a scene so small that the simulator bears them, and the plans that they are processed by."""
+
+from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
+
+TINY = Settings(
+    array=Array(layout="line", positions_m=tuple((0.0, 0.004 * mic, 0.0) for mic in range(3)), word_bits=8),
+    call=Call(duration_s=3e-4),
+    recording=Recording(n_samples=12_288),
+    processing=Processing(directions="2d:9", range_m=(0.25, 0.38), range_decimation=50, decimation=10),
+)
+DIRECT = Accuracy(
+    max_error_db=-20.0,
+    precision="float32",
+    oversampling=2,
+    delay_taps=2,
+    beam_taps=0,
+    beam_density=2.0,
+    stop_band_db=40.0,
+    zones=1,
+)
+NODES = DIRECT.replace(beam_taps=2, beam_density=3.0)
+PLANS = {
+    # Settings, and how far apart the images of processor and GPU may be: single precision differs by the order of sums,
+    # 16 bits by numbers that are rounded the other way.
+    "float32": (TINY.replace(accuracy=DIRECT), -120),
+    "float32, nodes": (TINY.replace(accuracy=NODES), -120),
+    "int16": (TINY.replace(accuracy=DIRECT.replace(precision="int16")), -100),
+    "int16, nodes": (TINY.replace(accuracy=NODES.replace(precision="int16")), -90),
+    "taps of 32 bits": (TINY.replace(accuracy=DIRECT.replace(stop_band_db=80.0)), -120),
+    "two zones": (
+        TINY.replace(
+            processing=TINY.processing.replace(wavefront="spherical"),
+            accuracy=DIRECT.replace(zones=2),
+        ),
+        -120,
+    ),
+}
+for _beamformer in ("coherence_factor", "dmas", "capon"):
+    PLANS[_beamformer] = (
+        TINY.replace(
+            processing=TINY.processing.replace(beamformer=_beamformer, directions="2d:3"),
+            accuracy=DIRECT.replace(interpolation="carrier", oversampling=8, delay_taps=1),
+        ),
+        -110,
+    )

@@ -1,0 +1,85 @@
+"""The whole chain on the GPU, or on the simulator, against the processor's."""
+
+import numpy as np
+import pytest
+
+from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.stages.fast import FastChain
+from tests import reference
+from tests.cases import noise
+from tests.cuda.plans import PLANS, TINY
+
+
+@pytest.fixture(scope="module", params=PLANS)
+def pair(request):
+    """Pipelines of one plan on both devices, and how far apart their images may be."""
+    settings, bound_db = PLANS[request.param]
+    if settings.accuracy.precision == "int16" and not kernels.load("cpu").tile_ranges:
+        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
+    with Pipeline(settings, device="cuda") as cuda:
+        yield Pipeline(settings, device="cpu"), cuda, bound_db
+
+
+def test_image_is_the_processors(pair):
+    cpu, cuda, bound_db = pair
+    assert cuda.settings == cpu.settings
+    measurement = noise(cuda.settings)
+    images = [pipeline.process(measurement).energy for pipeline in (cpu, cuda)]
+    assert images[0].any()
+    assert reference.error_db(*images) < bound_db
+
+
+@pytest.fixture(scope="module")
+def cuda():
+    with Pipeline(PLANS["float32"][0], device="cuda") as pipeline:
+        yield pipeline
+
+
+def test_batch_of_more_than_there_are_lanes_is_bit_by_bit_what_one_at_a_time_gives(cuda):
+    measurements = [noise(cuda.settings, seed) for seed in range(4)]
+    single = [cuda.process(measurement).energy.copy() for measurement in (measurements[0], measurements[3])]
+    batch = [image.energy for image in cuda.process_batch(measurements)]
+    assert [batch[0].tobytes(), batch[3].tobytes()] == [energy.tobytes() for energy in single]
+    assert len({energy.tobytes() for energy in batch}) == 4
+
+
+def test_image_goes_where_it_is_wanted(cuda):
+    out = np.full((len(cuda.grid), len(cuda.range_m)), -1.0, dtype=np.float32)
+    measurement = noise(cuda.settings)
+    assert cuda.process(measurement, out).energy is out
+    assert (out == cuda.process(measurement).energy).all()
+
+
+def test_signals_and_analytic_signals_are_the_processors():
+    settings = PLANS["float32"][0]
+    words = noise(settings).words.reshape(-1, 1)
+    signals = 0.5 * np.random.default_rng(3).standard_normal((3, settings.recording.n_samples))
+    found = {}
+    for device in ("cpu", "cuda"):
+        chain = FastChain(settings, kernels.load(device), threads=1)
+        image, heard = chain.new_image(), chain.new_image()
+        analytic, lead = chain.analytic(words, image)
+        chain.process_signals(signals, heard)
+        found[device] = (analytic.view(np.float32), image, heard, lead)
+    for mine, theirs in zip(found["cuda"][:3], found["cpu"][:3], strict=True):
+        assert reference.error_db(theirs, mine) < -120
+    assert found["cuda"][3] == found["cpu"][3]
+
+
+def test_image_may_stay_on_the_device():
+    settings = PLANS["float32"][0]
+    chain = FastChain(settings, kernels.load("cuda"), threads=1)
+    words = noise(settings).words.reshape(-1, 1)
+    chain.process_batch([words, words], [None, None])
+    image = chain.new_image()
+    chain.process(words, image)
+    assert image.any()
+
+
+def test_plan_is_chosen_for_the_gpu():
+    """Without a GPU by nominal costs; what is chosen keeps its budget all the same."""
+    with Pipeline(TINY.replace(accuracy=TINY.accuracy.replace(max_error_db=-50.0)), device="cuda") as pipeline:
+        image = pipeline.process(noise(pipeline.settings)).energy
+    exact = Pipeline(pipeline.settings.replace(accuracy=TINY.accuracy.replace(max_error_db=-100.0)), device="cpu")
+    assert reference.error_db(exact.process(noise(exact.settings)).energy, image) < -50

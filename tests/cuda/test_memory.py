@@ -1,0 +1,127 @@
+"""What a pipeline keeps on the GPU: made once, given back at once, and missed with a remedy."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+from numba import cuda
+from numba.cuda.cudadrv.driver import CudaAPIError
+
+from ertis_numba import kernels
+from ertis_numba.errors import DeviceError
+from ertis_numba.pipeline import Pipeline
+from tests.cases import noise
+from tests.cuda.plans import PLANS, TINY
+
+SETTINGS = PLANS["float32, nodes"][0]
+MAKERS = ("to_device", "device_array", "pinned_array")
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Weak references to all arrays that are made from now on."""
+    found = []
+    for name in MAKERS:
+        make = getattr(cuda, name)
+
+        def watched(*arguments, make=make, **options):
+            array = make(*arguments, **options)
+            found.append(weakref.ref(array))
+            return array
+
+        monkeypatch.setattr(cuda, name, watched)
+    return found
+
+
+def test_all_is_made_before_the_second_measurement(made):
+    with Pipeline(SETTINGS, device="cuda") as pipeline:
+        images = pipeline.process_batch([noise(SETTINGS)] * 3)
+        n_made = len(made)
+        assert n_made > 10
+        del images
+        pipeline.process_batch([noise(SETTINGS)] * 2)
+        assert len(made) == n_made
+
+
+def test_close_gives_all_back_without_the_garbage_collector(made):
+    pipeline = Pipeline(SETTINGS, device="cuda")
+    image = pipeline.process(noise(SETTINGS))
+    before = image.energy.copy()
+    gc.disable()
+    try:
+        pipeline.close()
+        alive = [array for array in (reference() for reference in made) if array is not None]
+    finally:
+        gc.enable()
+    assert len(alive) == 1  # the memory of the image that is still looked at
+    assert (image.energy == before).all()
+
+
+def test_pipelines_share_a_gpu():
+    settings = [SETTINGS, PLANS["float32"][0]]
+    with Pipeline(settings[0], device="cuda") as first, Pipeline(settings[1], device="cuda") as second:
+        images = [pipeline.process(noise(TINY)).energy.copy() for pipeline in (first, second, first, second)]
+    assert (images[0] == images[2]).all()
+    assert (images[1] == images[3]).all()
+    assert not (images[0] == images[1]).all()
+
+
+@pytest.mark.parametrize("n_before", [0, 5])
+def test_too_little_memory_is_told_with_how_much_and_what_to_do(monkeypatch, n_before):
+    left = [n_before]
+
+    def full(array, *_, make=cuda.to_device):
+        if not left[0]:
+            raise CudaAPIError(2, "Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY")
+        left[0] -= 1
+        return make(array)
+
+    monkeypatch.setattr(cuda, "to_device", full)
+    with pytest.raises(DeviceError) as caught:
+        Pipeline(SETTINGS, device="cuda")
+    text = str(caught.value)
+    assert "\n" not in text
+    assert "MB free, and this pipeline needs" in text
+    assert "give fewer directions, a shorter processing.range_m or less accuracy.oversampling" in text
+
+
+def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
+    def broken(*_):
+        raise CudaAPIError(700, "CUDA_ERROR_ILLEGAL_ADDRESS")
+
+    monkeypatch.setattr(cuda, "to_device", broken)
+    with pytest.raises(CudaAPIError):
+        Pipeline(SETTINGS, device="cuda")
+
+
+def test_memory_of_an_image_is_used_again_when_nobody_looks_at_any_part_of_it():
+    memory = kernels.load("cuda").memory()
+    first = memory.image((3, 4))
+    first[:] = 1
+    row, place = first[1], first.__array_interface__["data"]
+    del first
+    second = memory.image((3, 4))
+    second[:] = 2
+    assert (row == 1).all()
+    del row
+    assert memory.image((3, 4)).__array_interface__["data"] == place
+    assert (second == 2).all()
+
+
+def test_images_without_number_are_not_all_pinned(made):
+    memory = kernels.load("cuda").memory()
+    images = [memory.image((3, 4)) for _ in range(50)]
+    assert len(made) < 10
+    for number, image in enumerate(images):
+        image[:] = number
+    assert [int(image[2, 3]) for image in images] == list(range(50))
+
+
+def test_image_outlives_its_memory():
+    memory = kernels.load("cuda").memory()
+    image = memory.image((3, 4))
+    memory.close()
+    image[:] = 7
+    del memory
+    assert np.all(image == 7)

@@ -1,0 +1,87 @@
+"""``ertis process --device cuda`` does what ``--device cpu`` does."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba import kernels
+from ertis_numba.settings import Accuracy
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests import reference
+from tests.cuda.plans import DIRECT, TINY
+from tests.files import noise
+
+COUNT = 2
+BUDGET_DB = -40.0
+TINIER = TINY.replace(processing=TINY.processing.replace(directions="2d:3", range_m=(0.3, 0.4)))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Process one recording with a plan and without, on both devices: reports and energies."""
+    folder, found = tmp_path_factory.mktemp("process"), {}
+    free = Accuracy(max_error_db=BUDGET_DB)
+    for plan, accuracy in {"explicit": DIRECT, "chosen": free, "exact": Accuracy(max_error_db=-100.0)}.items():
+        count = COUNT if plan == "explicit" else 1
+        recording = write_recording(folder / f"{plan}.h5", noise(TINIER.replace(accuracy=accuracy), count=count))
+        for device in ("cpu", "cuda") if plan != "exact" else ("cpu",):
+            found[plan, device] = run(recording, device)
+    return found
+
+
+def run(recording, device, *arguments):
+    target = recording.with_name(f"{recording.stem} {device}.h5")
+    command = ["process", recording, "-o", target, "--device", device, "--force", "--json", *arguments]
+    done = CliRunner().invoke(cli, [str(argument) for argument in command])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    with open_energyscapes(target) as images:
+        return json.loads(done.stdout), np.array([image.energy for image in images])
+
+
+def test_device_is_told_and_all_measurements_are_there(made):
+    for (plan, device), (report, energies) in made.items():
+        count = COUNT if plan == "explicit" else 1
+        assert (report["device"], report["measurements"]) == (device, count)
+        assert report["median_ms"] > 0
+        assert len({energy.tobytes() for energy in energies}) == count
+
+
+def test_images_of_one_plan_differ_by_rounding_only(made):
+    """Single precision, of which the two devices add up the terms in another order: -100 dB at most."""
+    for cpu, cuda in zip(made["explicit", "cpu"][1], made["explicit", "cuda"][1], strict=True):
+        assert reference.error_db(cpu, cuda) < -100
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_chosen_plan_keeps_its_budget(made, device):
+    for exact, image in zip(made["exact", "cpu"][1], made["chosen", device][1], strict=True):
+        assert reference.error_db(exact, image) < BUDGET_DB
+
+
+def test_images_of_plans_chosen_for_each_device_differ_by_their_errors_at_most(made):
+    for cpu, cuda in zip(made["chosen", "cpu"][1], made["chosen", "cuda"][1], strict=True):
+        assert reference.error_db(cpu, cuda) < BUDGET_DB + 6.1  # each as far off, on opposite sides
+
+
+def test_file_is_the_same_one_at_a_time(made, tmp_path):
+    recording = write_recording(tmp_path / "rec.h5", noise(TINIER.replace(accuracy=DIRECT), count=COUNT))
+    report, energies = run(recording, "cuda", "--batch", 1)
+    assert report["measurements"] == COUNT
+    assert energies.tobytes() == made["explicit", "cuda"][1].tobytes()
+
+
+def test_threads_are_refused(tmp_path):
+    recording = write_recording(tmp_path / "rec.h5", noise(TINIER, count=1))
+    done = CliRunner().invoke(cli, ["process", str(recording), "--device", "cuda", "--threads", "2"])
+    assert done.exit_code == 1
+    assert done.stderr.startswith("ertis: error: threads is 2; ")
+
+
+def test_simulator_is_never_chosen_by_itself(tmp_path):
+    if not kernels.load("cuda").simulated:
+        pytest.skip("a GPU is chosen by itself")
+    recording = write_recording(tmp_path / "rec.h5", noise(TINIER, count=1))
+    assert run(recording, "auto")[0]["device"] == "cpu"

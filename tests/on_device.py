@@ -1,0 +1,47 @@
+"""Kernels of any device called with arrays of NumPy, so that one table of cases serves all of them."""
+
+import functools
+
+import numpy as np
+
+from ertis_numba import kernels
+
+__all__ = ["KERNELS", "SIMULATED", "on_device", "sized"]
+
+
+class _OnDevice:
+    """A kernel set whose kernels take arrays of the host; all else is the kernel set's."""
+
+    def __init__(self, kernel_set):
+        self._kernel_set = kernel_set
+        self._memory = kernel_set.memory()
+
+    def __getattr__(self, name):
+        found = getattr(self._kernel_set, name)
+        is_kernel = callable(found) and name not in ("memory", "threads")
+        return functools.partial(self._run, found) if is_kernel else found
+
+    def _run(self, kernel, *arguments):
+        """Copy arrays to the device, run, and copy back what may have been written."""
+        lane = self._memory.lane()
+        here = [self._memory.table(each) if isinstance(each, np.ndarray) else each for each in arguments]
+        with lane.entered():
+            kernel(*here)
+            for there, array in zip(here, arguments, strict=True):
+                if isinstance(array, np.ndarray) and array.flags.writeable:
+                    lane.fetch(there, array)
+        lane.wait()
+
+
+def on_device(kernel_set):
+    """Return a kernel set whose kernels take arrays of NumPy."""
+    return _OnDevice(kernel_set) if kernel_set.device == "cuda" else kernel_set
+
+
+KERNELS = {name: on_device(kernels.load(name)) for name in kernels.usable()}
+SIMULATED = any(kernel_set.simulated for kernel_set in KERNELS.values())
+
+
+def sized(small, large):
+    """Return small and large cases, but in the simulator, which takes 0.2 ms per thread of the GPU, the small ones."""
+    return list(small) if SIMULATED else [*small, *large]
