@@ -2,12 +2,20 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest
+GPU ?= cu12
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
+ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test check data pictures bench clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx check data pictures bench gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable '.'
+	touch $@
+
+$(VENV)/ready-to-test: $(VENV)/ready  # what tests and checks need: CUDA's compilers are 0.7 GB of it
 	$(BIN)/python -m pip install --quiet --editable '.[test,check]'
 	touch $@
 
@@ -17,10 +25,24 @@ demo: $(VENV)/ready
 	$(BIN)/ertis compare demo.h5
 	$(BIN)/ertis plot demo.h5 --output demo.png --force
 
-test: $(VENV)/ready
-	$(BIN)/python -m pytest
+# Times are measured first, while nothing else runs. Then two legs run at a time; each says what it found when it ends.
+test: $(VENV)/ready-to-test
+	$(PYTEST) -m alone $(ELSEWHERE)
+	$(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync=target test-kernels test-ptx test-host test-simulator
 
-check: $(VENV)/ready
+test-kernels: $(VENV)/ready-to-test  # compiles all of them: processes that did so at once could spoil each other's cache
+	$(PYTEST) -m "not alone" $(KERNELS)
+
+test-host: test-kernels
+	$(PYTEST) -m "not alone" --numprocesses 2 --dist worksteal $(KERNELS:%=--ignore=%) $(ELSEWHERE)
+
+test-simulator: test-kernels
+	NUMBA_ENABLE_CUDASIM=1 $(PYTEST) tests/cuda $(KERNELS) -k cuda
+
+test-ptx: $(VENV)/ready-to-test
+	$(PYTEST) tests/ptx
+
+check: $(VENV)/ready-to-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -39,6 +61,10 @@ bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench factorisation --update docs/accuracy.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 	$(BIN)/ertis bench simulation --update bench/README.md
+
+gpu: $(VENV)/ready  ## test and measure this machine's NVIDIA GPU, in less than ten minutes; GPU=cu13 for CUDA 13
+	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'
+	$(BIN)/ertis bench gpu --results bench/results --update docs/cuda.md --update README.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info demo.h5 demo.png

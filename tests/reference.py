@@ -5,6 +5,8 @@ matched, delayed by exact phase shifts and evaluated at the asked ranges. `paper
 algorithm. The plain functions below them say what each kernel should do.
 """
 
+import functools
+import hashlib
 import itertools
 
 import numpy as np
@@ -35,20 +37,42 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
     delay_rate_hz : float
         Round the delays of plane waves to whole samples of this rate.
     """
-    layout = microphones(settings.array)
-    speed_m_s = sound_speed_m_s(settings.air)
-    rate_hz = settings.recording.pdm_rate_hz
+    given = [np.ascontiguousarray(values) for values in (words, directions, range_m)]
+    # Devices and plans share the exact image of their words: plans are about how it is approximated.
+    sensor = settings.array, settings.call, settings.recording.pdm_rate_hz, settings.air
+    return _exact(*map(_Same, given), *sensor, spherical, delay_rate_hz)
+
+
+class _Same:
+    """An array that equals others of the same bytes."""
+
+    def __init__(self, values):
+        self.values = values
+        self._key = values.shape, values.dtype.str, hashlib.sha256(values.tobytes()).digest()
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __eq__(self, other):
+        return self._key == other._key
+
+
+@functools.lru_cache(maxsize=32)
+def _exact(words, directions, range_m, array, call, rate_hz, air, spherical, delay_rate_hz):
+    words, directions, range_m = words.values, directions.values, range_m.values
+    layout = microphones(array)
+    speed_m_s = sound_speed_m_s(air)
     signals = unpack_bits(words, np.flatnonzero(layout.enabled))
-    spectra, frequency_hz = _matched_spectra(signals, settings, rate_hz)
+    spectra, frequency_hz = _matched_spectra(signals, call, rate_hz)
     spectra = spectra * np.exp(2j * np.pi * frequency_hz * layout.delay_s[layout.enabled][:, None])
     spectra /= layout.gain[layout.enabled][:, None] * len(spectra)
     positions_m = layout.enabled_positions_m
-    at_range = np.exp(2j * np.pi * frequency_hz * (2 * np.asarray(range_m) / speed_m_s)[:, None])  # (range, bin)
+    at_range = np.exp(2j * np.pi * frequency_hz * (2 * range_m / speed_m_s)[:, None])  # (range, bin)
     image = np.empty((len(directions), len(range_m)))
     for index, direction in enumerate(directions):
         if spherical:
-            points_m = np.asarray(range_m)[:, None, None] * direction - positions_m
-            delay_s = (np.linalg.norm(points_m, axis=-1) - np.asarray(range_m)[:, None]) / speed_m_s
+            points_m = range_m[:, None, None] * direction - positions_m
+            delay_s = (np.linalg.norm(points_m, axis=-1) - range_m[:, None]) / speed_m_s
             beam = sum(
                 (at_range * np.exp(2j * np.pi * frequency_hz * delay_s[:, mic, None])) @ spectra[mic]
                 for mic in range(len(spectra))
@@ -59,15 +83,15 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
                 delay_s = np.rint(delay_s * delay_rate_hz) / delay_rate_hz
             beam = at_range @ (spectra * np.exp(2j * np.pi * frequency_hz * delay_s[:, None])).sum(axis=0)
         image[index] = np.abs(beam)
+    image.flags.writeable = False
     return image
 
 
-def _matched_spectra(signals, settings, rate_hz):
+def _matched_spectra(signals, call, rate_hz):
     """One-sided spectra of the signals after the matched filter, and their frequencies.
 
     ``y(t) = Σ_f Y(f) exp(2πjft)`` is analytic, with an envelope of 1 where the signal is the call itself.
     """
-    call = settings.call
     n_fft = scipy.fft.next_fast_len(2 * signals.shape[1] + int(0.02 * rate_hz))  # nothing wraps around
     frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
     width_hz = min(5_000.0, call.low_frequency_hz / 2)

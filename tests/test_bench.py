@@ -26,6 +26,13 @@ def image():
     return Pipeline(SHORT).process(noise(SHORT))
 
 
+@pytest.fixture
+def hardly_warm(monkeypatch):
+    """One call before those that are timed: what is tested is what is timed, not how long it takes."""
+    monkeypatch.setattr(timing, "_WARM_UP", 1)
+    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
+
+
 def test_subjects_take_turns_in_bursts_after_warming_up(monkeypatch):
     monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
     calls = []
@@ -40,9 +47,8 @@ def test_summary_is_mean_deviation_and_median():
     assert timing.summary(np.array([1.0, 2.0, 6.0])) == {"mean_ms": 3.0, "std_ms": 2.16, "median_ms": 2.0}
 
 
-def test_paper_command_reports_and_updates(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_WARM_UP", 1)
-    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
+@pytest.mark.usefixtures("hardly_warm")
+def test_paper_command_reports_and_updates(tmp_path):
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("paper"), "utf-8")
     other = tmp_path / "other.md"
@@ -67,6 +73,7 @@ def test_paper_command_reports_and_updates(tmp_path, monkeypatch):
     assert "timing 1 of each" in result.stderr
 
 
+@pytest.mark.usefixtures("hardly_warm")
 def test_scaling_measures_every_series(monkeypatch):
     series = {"directions": (90, 180), "last_range_m": (1.0,), "microphones": (40,)}
     monkeypatch.setattr(scaling, "SERIES", series)
@@ -198,10 +205,8 @@ FEW = [("float32", "nearest", 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("i
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(monkeypatch, hardly_warm):  # noqa: ARG001 - it is used by what it does
     """Few plans, and calls that are hardly warmed up."""
-    monkeypatch.setattr(timing, "_WARM_UP", 1)
-    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
     monkeypatch.setattr(plans, "PLANS", FEW)
 
 
@@ -285,9 +290,9 @@ def test_front_is_joined_by_a_line_and_labelled():
         figures.front(points, title="T", theme="blue")
 
 
-def test_simulation_times_a_free_field_and_everything(monkeypatch, tmp_path):
-    monkeypatch.setattr(timing, "_WARM_UP", 1)
-    monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
+@pytest.mark.alone
+@pytest.mark.usefixtures("hardly_warm")
+def test_simulation_times_a_free_field_and_everything(tmp_path):
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("simulation"), "utf-8")
     result = CliRunner().invoke(cli, ["bench", "simulation", "--count", "1", "--json", "--update", str(target)])

@@ -78,7 +78,11 @@ CASES = {
         2,
         "directions 90 have limits of their own; give 2d:N or 3d:N with limits; see 'ertis process --help'",
     ),
-    "unknown device": ("process rec.h5 -o out.h5 --device cuda", 2, "'cuda' is not one of 'auto', 'cpu', 'numpy'"),
+    "unknown device": (
+        "process rec.h5 -o out.h5 --device tpu",
+        2,
+        "'tpu' is not one of 'auto', 'cpu', 'cuda', 'numpy'",
+    ),
     "unknown method": ("process rec.h5 -o out.h5 --method quick", 2, "'quick' is not one of 'fast', 'paper'"),
     "no threads": ("process rec.h5 -o out.h5 --threads 0", 1, "threads is 0; give a whole number from 1"),
     "unknown key": (

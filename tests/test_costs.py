@@ -34,7 +34,7 @@ def forget():
     costs._KNOWN.clear()  # noqa: SLF001 - as in a process of its own
 
 
-@pytest.mark.parametrize("device", kernels.DEVICES)
+@pytest.mark.parametrize("device", kernels.usable())
 def test_measured_costs_are_times(device):
     found = costs.measure(kernels.load(device), 1).seconds
     assert all(0 < value < math.inf for value in found.values())

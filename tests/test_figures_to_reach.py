@@ -21,13 +21,15 @@ from tests.test_real import RAW
 ERTIS = [sys.executable, "-m", "ertis_cli"]
 
 
-def seconds(command, *, times, **options):
-    """The quickest of some runs, and what the last one said."""
+def seconds(command, *, times, promised_s, **options):
+    """The quickest of some runs, the last of which keeps the promise if any does, and what that one said."""
     best = np.inf
     for _ in range(times):
         start = time.perf_counter()
         done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=True, **options)
         best = min(best, time.perf_counter() - start)
+        if best < promised_s:
+            break
     return best, done.stderr
 
 
@@ -39,19 +41,22 @@ def recording(tmp_path_factory):
     return path
 
 
+@pytest.mark.alone
 def test_help_answers_in_0_3_s():
-    assert seconds([*ERTIS, "--help"], times=5)[0] < 0.3
+    assert seconds([*ERTIS, "--help"], times=5, promised_s=0.3)[0] < 0.3
 
 
+@pytest.mark.alone
 def test_warm_process_of_one_measurement_takes_less_than_1_5_s(recording, tmp_path):
     command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--force"]
-    assert seconds(command, times=4)[0] < 1.5
+    assert seconds(command, times=4, promised_s=1.5)[0] < 1.5
 
 
+@pytest.mark.alone
 def test_first_run_takes_less_than_12_s_and_says_why(recording, tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000"]
-    taken_s, said = seconds(command, times=1, env=environment)
+    taken_s, said = seconds(command, times=1, promised_s=12, env=environment)
     assert taken_s < 12
     assert "compiling kernels" in said
 

@@ -280,6 +280,7 @@ def test_several_measurements_are_merged():
         merge([healthy, health(real())])
 
 
+@pytest.mark.alone
 def test_it_is_quick():
     health(real())
     start_s = time.perf_counter()

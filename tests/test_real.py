@@ -4,6 +4,7 @@ The file comes with the package rtisdev, whose code is never imported: its wheel
 brings top-level packages of its own.
 """
 
+import functools
 import importlib.metadata
 import json
 import subprocess
@@ -39,14 +40,19 @@ def processed(request, tmp_path_factory):
         return request.param, image, images[0]
 
 
+@functools.cache
+def exact_energy(azimuth_rad, elevation_rad, range_m):
+    """The image of the right layout on some axes, which both layouts have in common."""
+    words, settings = np.fromfile(RAW, dtype="<u4"), ertis.Settings.from_preset("default_25_50")
+    return reference.exact(words, settings, unit_vectors(np.array(azimuth_rad), np.array(elevation_rad)), range_m)
+
+
 @pytest.fixture(scope="module")
 def exact_image(processed):
     """The exact image of the right layout, on the axes of the processed one."""
     image = processed[2]
+    energy = exact_energy(*(tuple(axis.tolist()) for axis in (image.azimuth_rad, image.elevation_rad, image.range_m)))
     settings = ertis.Settings.from_preset("default_25_50")
-    words = np.fromfile(RAW, dtype="<u4")
-    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    energy = reference.exact(words, settings, directions, image.range_m)
     return image.replace(energy=energy.astype(np.float32), settings=settings)
 
 

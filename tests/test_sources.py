@@ -295,12 +295,12 @@ def test_sources_are_not_heard_where_the_effect_is_off():
 
 def test_parts_of_a_large_array_hear_parts_of_one_ambient_noise():
     """Channels are rendered 128 at a time; those of different parts are as independent as their distance makes them."""
-    sensor = LISTENS.replace(array=line_array(256, 0.01), recording=Recording(n_samples=100_000))
+    sensor = LISTENS.replace(array=line_array(256, 0.01), recording=Recording(n_samples=50_000))
     scene = scene_of(sensor=sensor, ambient=Ambient(level_dbfs=-30))
     whole = heard(scene, "ambient_noise")
     frequency_hz = np.fft.rfftfreq(whole.shape[1], 1 / RATE_HZ)
     band = (frequency_hz > 20e3) & (frequency_hz < 80e3)
-    rows = np.fft.rfft(whole)[:, band]
+    rows = {mic: np.fft.rfft(whole[mic])[band] for mic in (0, 72, 128, 200)}
     found = np.fft.rfft(bits_of(Simulator(scene, plan=only("ambient_noise")).render())[[0, 72, 200]])[:, band]
 
     def likeness(one, other):

@@ -1,14 +1,17 @@
 """Reports as Markdown, and where they go."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
+from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
+from ertis_bench.markdown import table as _table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_bench.ptx_tables import ptx
 from ertis_numba.errors import ArgumentError
 from ertis_numba.verification import PEAKS
 
@@ -18,8 +21,11 @@ __all__ = [
     "accuracy_front",
     "around",
     "factorisation",
+    "gpu",
+    "gpu_short",
     "paper",
     "place",
+    "ptx",
     "scaling",
     "simulation",
     "update",
@@ -304,16 +310,13 @@ def _or_dash(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    rule = ["---", *["---:"] * (len(head) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
-
-
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
     "scaling": {"scaling": scaling},
     "simulation": {"simulation": simulation},
     "factorisation": {"factorisation": factorisation},
+    "ptx": {"ptx": ptx},
+    "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }
 """What each command writes between which markers: a file chooses a form by the marker that it has."""

@@ -113,6 +113,39 @@ def factorisation(**given: Any) -> None:
     _run("factorisation", benchmark, **given)
 
 
+@bench.command()
+@_update
+@options.quiet
+@options.as_json
+def ptx(**given: Any) -> None:
+    """Machine code of the GPU's kernels, and what it would take on an H200; no GPU is needed, nothing is timed."""
+    from ertis_bench import ptx as benchmark
+
+    _run("ptx", benchmark, **given)
+
+
+@bench.command()
+@click.option(
+    "--results",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("bench/results"),
+    show_default=True,
+    metavar="FOLDER",
+    help="Where results go, a file for each run.",
+)
+@click.option(
+    "--newest", is_flag=True, help="Measure nothing: make the tables of the newest results; no GPU is needed."
+)
+@_update
+@options.quiet
+@options.as_json
+def gpu(*, newest: bool, **given: Any) -> None:
+    """Test and time this machine's NVIDIA GPU, beside other libraries and its ceilings, in less than ten minutes."""
+    from ertis_bench import gpu as benchmark
+
+    _run("gpu", benchmark, measure=not newest, **given)
+
+
 def _run(
     name: str, benchmark: ModuleType, *, targets: tuple[Path, ...], quiet: bool, as_json: bool, **given: Any
 ) -> dict[str, Any]:

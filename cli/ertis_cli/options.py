@@ -81,10 +81,10 @@ _FILE = click.Path(path_type=Path)
 as_json: Decorator = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 device: Decorator = click.option(
     "--device",
-    type=click.Choice(["auto", "cpu", "numpy"]),
+    type=click.Choice(["auto", "cpu", "cuda", "numpy"]),
     default="auto",
     show_default=True,
-    help="What computes; numpy runs without compiled kernels.",
+    help="What computes; auto is cuda, an NVIDIA GPU, where there is one; numpy runs without compiled kernels.",
 )
 force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
 quiet: Decorator = click.option("--quiet", "-q", is_flag=True, help="No progress, no summary; errors only.")

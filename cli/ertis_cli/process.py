@@ -1,7 +1,9 @@
 """``ertis process``: a recording to energyscapes."""
 
+import itertools
 import statistics
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +17,11 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
+    from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 
 __all__ = ["process"]
+
+_BATCH_BYTES = 256e6  # of images that wait to be written
 
 
 @click.command()
@@ -69,6 +74,14 @@ __all__ = ["process"]
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
 @options.threads
+@click.option(
+    "--batch",
+    type=click.IntRange(min=1),
+    default=8,
+    show_default=True,
+    metavar="N",
+    help="Measurements worked on at the same time, fewer where images are large; 1 is one after the other.",
+)
 @options.force
 @options.quiet
 @options.as_json
@@ -92,6 +105,7 @@ def process(
     strict: bool,
     device: str,
     threads: int | None,
+    batch: int,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -99,8 +113,8 @@ def process(
     """Turn a recording into energyscapes.
 
     Settings come from the recording, then from the settings file, then from the options. The same
-    recording gives the same energies, bit by bit, whatever the number of threads. All sensors of a
-    recording go into one file, each with its own settings.
+    recording gives the same energies, bit by bit, whatever the number of threads and the batch. All
+    sensors of a recording go into one file, each with its own settings.
 
     The fast method plans how exact to be: it takes the fastest way whose predicted error keeps --max-error.
     The error is that of the image against the exact one, over all directions and ranges.
@@ -130,20 +144,21 @@ def process(
         for given in settings:
             plans.require_plan(given, explain=explain, verify=verify, max_error_db=max_error_db)
         writer = EnergyscapeWriter(target, recording=recordings, dtype=dtype, overwrite=force)
-        runs = [_Run(options.pipeline(given, device=device, threads=threads, quiet=quiet)) for given in settings]
+        runs = [
+            _Run(stack.enter_context(options.pipeline(given, device=device, threads=threads, quiet=quiet)))
+            for given in settings
+        ]
         for run, recording in zip(runs, recordings, strict=True):
             first = replace(recording[0], settings=run.pipeline.settings)
             _tell_faults(f"{path}: sensor {recording.sensor}", first, strict=strict)
             run.told = plans.tell(run.pipeline, first, threads=threads, explain=explain, verify=verify, silent=as_json)
-        measurements = (
-            (run, measurement, recording.settings)
-            for run, recording in zip(runs, recordings, strict=True)
-            for measurement in recording
+        written = (
+            None for run, recording in zip(runs, recordings, strict=True) for _ in run.write(recording, writer, batch)
         )
         length = sum(map(len, recordings))
-        with writer, options.progress(measurements, length=length, label="processing", quiet=quiet) as shown:
-            for run, measurement, recorded in shown:
-                writer.write(run(measurement, recorded))
+        with writer, options.progress(written, length=length, label="processing", quiet=quiet) as shown:
+            for _ in shown:
+                pass
     rows = [{"sensor": name, **run.report()} for name, run in zip(names, runs, strict=True)]
     times_ms = [time_ms for run in runs for time_ms in run.times_ms]
     report = {
@@ -190,16 +205,33 @@ class _Run:
         self.times_ms: list[float] = []
         self.told: dict[str, Any] = {}
 
-    def __call__(self, measurement: "Measurement", recorded: "Settings") -> "Energyscape":
+    def write(self, recording: "RecordingReader", writer: "EnergyscapeWriter", batch: int) -> Iterator[None]:
+        """Process a recording and write its images; yield after each."""
+        image_bytes = 4 * len(self.pipeline.grid) * len(self.pipeline.range_m)
+        size = max(1, min(batch, int(_BATCH_BYTES / image_bytes)))
+        measurements = iter(recording)
+        while group := list(itertools.islice(measurements, size)):
+            images = self._processed([self._known(measurement, recording.settings) for measurement in group])
+            images.reverse()
+            while images:  # none is kept: a GPU's images lie in memory that the next ones need
+                writer.write(images.pop())
+                yield
+
+    def _known(self, measurement: "Measurement", recorded: "Settings") -> "Measurement":
+        """Return a measurement as it is now known: a settings file may know better what array, call or air it was."""
         settings = self.pipeline.settings
         if settings.air == recorded.air:
             options.require_same_air(measurement, settings)
-        # A settings file may know better than the recording what array, call or air it was.
-        known = replace(measurement, settings=settings)
+        return replace(measurement, settings=settings)
+
+    def _processed(self, measurements: "Sequence[Measurement]") -> "list[Energyscape]":
         start_s = time.perf_counter()
-        image = self.pipeline.process(known)
-        self.times_ms.append(1000 * (time.perf_counter() - start_s))
-        return image
+        if len(measurements) == 1:
+            images = [self.pipeline.process(measurements[0])]
+        else:
+            images = self.pipeline.process_batch(measurements)
+        self.times_ms += [1000 * (time.perf_counter() - start_s) / len(images)] * len(images)
+        return images
 
     def report(self) -> dict[str, Any]:
         return {

@@ -1,6 +1,10 @@
 """Arithmetic of one number at a time, which the kernels of the processor and those of the GPU share.
 
 No function here knows arrays or threads: what is written here is compiled into the caller, for its device.
+
+Compilers may fuse a product and a sum. Of ``a b + c d`` either product may be fused, with other bits, and which of them
+is decided anew each time; of ``(e + a b) + c d`` both are. Kernels are written in the second way, whose bits are the
+same whether a kernel was just compiled or comes from Numba's cache.
 """
 
 import math
@@ -100,7 +104,7 @@ def upper_halves(real, imag):
 @njit(inline="always")
 def power(real, imag):
     """Return ``real² + imag²``."""
-    return real * real + imag * imag
+    return (np.float32(0) + real * real) + imag * imag
 
 
 @njit(inline="always")

@@ -41,6 +41,7 @@ def time_ratio(usual, other, *, times=5, rounds=12):
     return best_s[1] / best_s[0]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("method", ["fast", "paper"])
 @pytest.mark.parametrize("name", ["all zero", "alternating", "noise, then alternating"])
 def test_words_of_silence_take_no_longer(name, method):
@@ -57,6 +58,7 @@ def test_words_of_silence_take_no_longer(name, method):
     assert time_ratio(usual, other) < NO_LONGER
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("name", ["0", "1e-11", "1e-30", "1e-40", "decays to 1e-41"])
 def test_signals_that_have_decayed_take_no_longer(name):
     """Signals that were never modulated may be as small as they like."""

@@ -19,7 +19,7 @@ __all__ = ["combine_capon"]
 _LANES = 32  # windows that are solved side by side
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _sum_lags(flat, offsets, weights, y, beams, lags):
     """Fill ``beams[part, r] = Σ_mic y_r`` and ``lags[lag, part, r] = Σ_mic conj(y_r) y_(r + lag)``."""
     n_snapshots, _, n_ranges = lags.shape
@@ -31,19 +31,19 @@ def _sum_lags(flat, offsets, weights, y, beams, lags):
         w_real, w_imag = np.float64(weights[mic].real), np.float64(weights[mic].imag)
         for r in range(n_ranges):
             x_real, x_imag = np.float64(delayed[r].real), np.float64(delayed[r].imag)
-            y_real[r] = x_real * w_real - x_imag * w_imag
-            y_imag[r] = x_real * w_imag + x_imag * w_real
+            y_real[r] = (0.0 + x_real * w_real) - x_imag * w_imag
+            y_imag[r] = (0.0 + x_real * w_imag) + x_imag * w_real
         for r in range(n_ranges):
             beams[0, r] += y_real[r]
             beams[1, r] += y_imag[r]
         for lag in range(n_snapshots):
             real, imag = lags[lag, 0], lags[lag, 1]
             for r in range(n_ranges - lag):
-                real[r] += y_real[r] * y_real[r + lag] + y_imag[r] * y_imag[r + lag]
-                imag[r] += y_real[r] * y_imag[r + lag] - y_imag[r] * y_real[r + lag]
+                real[r] = (real[r] + y_real[r] * y_real[r + lag]) + y_imag[r] * y_imag[r + lag]
+                imag[r] = (imag[r] + y_real[r] * y_imag[r + lag]) - y_imag[r] * y_real[r + lag]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def _factor(lags, first, count, epsilon, column):
     """Fill the lower triangle of ``column``, (K, K, part, lane), with L D of ``B = L D Lᴴ``; 1 / D on its diagonal.
 
@@ -61,13 +61,13 @@ def _factor(lags, first, count, epsilon, column):
                     inverse = column[k, k, 0, lane]
                     a_real, a_imag = column[i, k, 0, lane], column[i, k, 1, lane]
                     b_real, b_imag = column[j, k, 0, lane] * inverse, column[j, k, 1, lane] * inverse
-                    column[i, j, 0, lane] -= a_real * b_real + a_imag * b_imag
-                    column[i, j, 1, lane] -= a_imag * b_real - a_real * b_imag
+                    column[i, j, 0, lane] = (column[i, j, 0, lane] - a_real * b_real) - a_imag * b_imag
+                    column[i, j, 1, lane] = (column[i, j, 1, lane] - a_imag * b_real) + a_real * b_imag
         for lane in range(count):
             column[j, j, 0, lane] = 1 / (column[j, j, 0, lane] + epsilon[lane])
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def _solve(beams, first, count, column, t, fit):
     """Fill ``t = B⁻¹ s``, (K, part, lane), and ``fit = sᴴ t``, from what `_factor` fills."""
     n_snapshots = len(t)
@@ -81,18 +81,18 @@ def _solve(beams, first, count, column, t, fit):
                 inverse = column[k, k, 0, lane]
                 a_real, a_imag = column[i, k, 0, lane] * inverse, column[i, k, 1, lane] * inverse
                 b_real, b_imag = t[k, 0, lane], t[k, 1, lane]
-                t[i, 0, lane] -= a_real * b_real - a_imag * b_imag
-                t[i, 1, lane] -= a_real * b_imag + a_imag * b_real
+                t[i, 0, lane] = (t[i, 0, lane] - a_real * b_real) + a_imag * b_imag
+                t[i, 1, lane] = (t[i, 1, lane] - a_real * b_imag) - a_imag * b_real
         for lane in range(count):
             real, imag = t[i, 0, lane], t[i, 1, lane]
-            fit[lane] += (real * real + imag * imag) * column[i, i, 0, lane]
+            fit[lane] += ((0.0 + real * real) + imag * imag) * column[i, i, 0, lane]
     for i in range(n_snapshots - 1, -1, -1):
         for k in range(i + 1, n_snapshots):
             for lane in range(count):
                 a_real, a_imag = column[k, i, 0, lane], column[k, i, 1, lane]
                 b_real, b_imag = t[k, 0, lane], t[k, 1, lane]
-                t[i, 0, lane] -= a_real * b_real + a_imag * b_imag
-                t[i, 1, lane] -= a_real * b_imag - a_imag * b_real
+                t[i, 0, lane] = (t[i, 0, lane] - a_real * b_real) - a_imag * b_imag
+                t[i, 1, lane] = (t[i, 1, lane] - a_real * b_imag) + a_imag * b_real
         for lane in range(count):
             inverse = column[i, i, 0, lane]
             t[i, 0, lane] *= inverse

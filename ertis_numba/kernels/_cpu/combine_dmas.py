@@ -13,6 +13,7 @@ from ertis_numba.kernels._scalar import magnitude
 
 __all__ = ["combine_dmas"]
 
+_ZERO = np.float32(0)  # adding it says which product is fused
 _TILE = 64  # ranges: the sums of order 8 take 4.6 kB
 _CHUNK = 4096  # samples
 
@@ -34,20 +35,20 @@ def _take_roots(flat, order, roots):
             roots[0, k], roots[1, k] = scale * x, scale * y
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _turn(x_real, x_imag, weight, z):
     """Fill z, (part, range), with the products of x and a weight."""
     for r in range(len(x_real)):
-        z[0, r] = x_real[r] * weight.real - x_imag[r] * weight.imag
-        z[1, r] = x_real[r] * weight.imag + x_imag[r] * weight.real
+        z[0, r] = (_ZERO + x_real[r] * weight.real) - x_imag[r] * weight.imag
+        z[1, r] = (_ZERO + x_real[r] * weight.imag) + x_imag[r] * weight.real
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _add_products(z, x, total, count):
     """Add ``z · x`` to ``total``, all (part, range)."""
     for r in range(count):
-        total[0, r] += z[0, r] * x[0, r] - z[1, r] * x[1, r]
-        total[1, r] += z[0, r] * x[1, r] + z[1, r] * x[0, r]
+        total[0, r] = (total[0, r] + z[0, r] * x[0, r]) - z[1, r] * x[1, r]
+        total[1, r] = (total[1, r] + z[0, r] * x[1, r]) + z[1, r] * x[0, r]
 
 
 @njit(parallel=True, nogil=True, cache=True)

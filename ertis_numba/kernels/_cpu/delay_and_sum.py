@@ -20,6 +20,6 @@ def delay_and_sum(signals, offsets, weights, out):
             weight = weights[direction, mic]
             for r in range(n_ranges):
                 x, y = delayed[r], beam[r]
-                real = y.real + (x.real * weight.real - x.imag * weight.imag)
-                imag = y.imag + (x.real * weight.imag + x.imag * weight.real)
+                real = (y.real + x.real * weight.real) - x.imag * weight.imag
+                imag = (y.imag + x.real * weight.imag) + x.imag * weight.real
                 beam[r] = np.complex64(complex(real, imag))

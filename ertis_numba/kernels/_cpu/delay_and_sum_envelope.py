@@ -35,7 +35,7 @@ def _beam_tile(typing_context, signals, offsets, weights, direction, first, out,
     return signature, codegen
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _beam_short(signals, offsets, weights, direction, first, stop, out):
     """One direction of an image with fewer ranges than a tile."""
     flat = signals.reshape(-1)
@@ -43,8 +43,8 @@ def _beam_short(signals, offsets, weights, direction, first, stop, out):
         x, y = np.float32(0), np.float32(0)
         for term in range(offsets.shape[1]):
             sample, weight = flat[offsets[direction, term] + r], weights[direction, term]
-            x += sample.real * weight.real - sample.imag * weight.imag
-            y += sample.real * weight.imag + sample.imag * weight.real
+            x = (x + sample.real * weight.real) - sample.imag * weight.imag
+            y = (y + sample.real * weight.imag) + sample.imag * weight.real
         out[direction, r] = np.float32(magnitude(x, y))
 
 

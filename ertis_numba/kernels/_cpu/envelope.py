@@ -8,7 +8,7 @@ from ertis_numba.kernels._scalar import magnitude
 __all__ = ["envelope"]
 
 
-@njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def envelope(beams, out):
     """See `Envelope`."""
     n_directions, n_ranges = beams.shape

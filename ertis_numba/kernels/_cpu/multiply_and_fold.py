@@ -24,7 +24,7 @@ def multiply_and_fold(spectra, responses, first_bin, out):
                 h = responses[row, phase, done : done + run]
                 y = out[mic, phase, place : place + run]
                 for b in range(run):
-                    real = x[b].real * h[b].real - x[b].imag * h[b].imag
-                    imag = x[b].real * h[b].imag + x[b].imag * h[b].real
-                    y[b] = np.complex64(complex(y[b].real + real, y[b].imag + imag))
+                    real = (y[b].real + x[b].real * h[b].real) - x[b].imag * h[b].imag
+                    imag = (y[b].imag + x[b].real * h[b].imag) + x[b].imag * h[b].real
+                    y[b] = np.complex64(complex(real, imag))
                 done += run

@@ -5,8 +5,10 @@ from numba import njit, prange
 
 __all__ = ["multiply_spectra"]
 
+_ZERO = np.float32(0)  # adding it says which product is fused
 
-@njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "nsz"})
+
+@njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def multiply_spectra(spectra, response, out):
     """See `MultiplySpectra`."""
     n_mics, n_bins = spectra.shape
@@ -14,4 +16,6 @@ def multiply_spectra(spectra, response, out):
         for b in range(n_bins):
             # Written out because Numba's own complex product is never fused to multiply-adds.
             x, h = spectra[mic, b], response[b]
-            out[mic, b] = np.complex64(complex(x.real * h.real - x.imag * h.imag, x.real * h.imag + x.imag * h.real))
+            real = (_ZERO + x.real * h.real) - x.imag * h.imag
+            imag = (_ZERO + x.real * h.imag) + x.imag * h.real
+            out[mic, b] = np.complex64(complex(real, imag))

@@ -4,9 +4,11 @@ Only benchmarks use these; they are no part of the signal chain.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import cuda
+from numpy.typing import NDArray
 
 from ertis_numba.kernels._cuda.lane import SIMULATED, launch
 from ertis_numba.kernels._cuda.stopwatch import Stopwatch
@@ -44,7 +46,7 @@ def _multiply_add(turns, factor, addend, out):
 
 @cuda.jit(cache=True)
 def _load(samples, turns, first, out):
-    """A warp loads 32 samples side by side, as delay-and-sum does: one after the other, ``first`` after a line."""
+    """Load 32 samples side by side in a warp, as delay-and-sum does, ``first`` samples after the begin of a line."""
     at = np.uint32(np.uint32(cuda.threadIdx.x) % _WARP + np.uint32(first))
     total = np.uint64(0)
     for _ in range(turns):
@@ -54,25 +56,28 @@ def _load(samples, turns, first, out):
     out[cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x] = total
 
 
-def multiply_add(turns, out):
-    """Run float32 multiply-adds in registers, a thread per element of ``out``, (thread,) float32."""
-    launch(_multiply_add, (-(-len(out) // _BLOCK),), (min(_BLOCK, len(out)),), turns, np.float32(0.5), np.float32(1), out)
+def multiply_add(turns: int, out: NDArray[np.float32]) -> None:
+    """Run float32 multiply-adds in registers, a thread per element of ``out``, (thread,) float32.
+
+    There are at most 256 threads, or a multiple of 256.
+    """
+    launch(_multiply_add, *_shape(len(out)), turns, np.float32(0.5), np.float32(1), out)
 
 
-def load(samples, turns, first, out):
+def load(samples: NDArray[np.uint64], turns: int, first: int, out: NDArray[np.uint64]) -> None:
     """Load samples from the first cache level, a thread per element of ``out``, (thread,) uint64.
 
     ``samples`` are 2048 + 256 of uint64; ``first`` below 16 is how many lie between a line's begin and a warp's first.
     """
-    launch(_load, (-(-len(out) // _BLOCK),), (min(_BLOCK, len(out)),), samples, turns, first, out)
+    launch(_load, *_shape(len(out)), samples, turns, first, out)
 
 
-def occupy(out):
+def occupy(out: NDArray[np.float32]) -> None:
     """Keep a lane busy for milliseconds, so that what is launched meanwhile runs without a gap; ``out`` as above."""
     multiply_add(1 if SIMULATED else _OCCUPY_TURNS, out)
 
 
-def properties():
+def properties() -> dict[str, Any]:
     """Return multiprocessors, compute capability and, for nvidia-smi, the identity of the GPU."""
     device = cuda.get_current_device()
     return {
@@ -82,7 +87,9 @@ def properties():
     }
 
 
-def ceilings(runs, *, turns=_TURNS, copy_bytes=_COPY_BYTES, threads=None):
+def ceilings(
+    runs: int, *, turns: int = _TURNS, copy_bytes: int = _COPY_BYTES, threads: int | None = None
+) -> dict[str, float]:
     """Return the best of ``runs``: what the GPU can do is not an average.
 
     Parameters
@@ -94,8 +101,8 @@ def ceilings(runs, *, turns=_TURNS, copy_bytes=_COPY_BYTES, threads=None):
     Returns
     -------
     dict
-        ``copy_gb_s``, bytes read and bytes written; ``float32_gop_s``, a multiply-add being two operations; ``load_gb_s``
-        from the first cache level, warps on a line's begin, and ``load_unaligned_gb_s``, on the sample after.
+        ``copy_gb_s``, bytes read and bytes written; ``float32_gop_s``, a multiply-add being two operations;
+        ``load_gb_s`` from the first cache level, warps on a line's begin, and ``load_unaligned_gb_s``, a sample after.
     """
     threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
     source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))
@@ -108,6 +115,12 @@ def ceilings(runs, *, turns=_TURNS, copy_bytes=_COPY_BYTES, threads=None):
         "load_gb_s": loaded / _best_s(runs, lambda: load(samples, turns, 0, words)) / 1e9,
         "load_unaligned_gb_s": loaded / _best_s(runs, lambda: load(samples, turns, 1, words)) / 1e9,
     }
+
+
+def _shape(threads: int) -> tuple[tuple[int], tuple[int]]:
+    """Return blocks, and threads of a block."""
+    block = min(_BLOCK, threads)
+    return (threads // block,), (block,)
 
 
 def _best_s(runs: int, run: Callable[[], object]) -> float:

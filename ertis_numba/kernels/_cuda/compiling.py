@@ -34,7 +34,7 @@ from ertis_numba.kernels._host import HostMemory
 __all__ = ["Code", "Launch", "code_of", "disassembled", "recorded", "require_compilers"]
 
 _NEEDED = "compiling for GPUs needs numba-cuda, ptxas and nvdisasm"
-_REMEDY = "install them with pip install 'ertis-numba[test]'"
+_REMEDY = "install them with pip install 'ertis-numba[check]'"
 _LOCK = threading.Lock()  # around what is changed in Numba
 
 
@@ -235,7 +235,6 @@ def _sum(pattern: str, text: str) -> int:
     return sum(int(number) for number in re.findall(pattern, text))
 
 
-@functools.cache
 def _tool(name: str) -> str:
     """Return the path of a program from NVIDIA's wheels, from CUDA_HOME or from PATH."""
     from cuda import pathfinder  # noqa: PLC0415 - comes with numba-cuda

@@ -17,26 +17,29 @@ _ONE, _1, _2 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP)
 def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
     """Return real and imaginary parts of a beam at ``place`` and one and two warps further.
 
-    ``samples`` are pairs of int16 as uint32, ``weights`` those of ``((re w, −im w), (im w, re w))``.
+    ``samples`` are pairs of int16 as uint32, and so are ``weights``: ``((re w, −im w), (im w, re w))``; both are flat.
     """
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
     entry = direction * n_terms
     end = entry + n_terms
     while entry < end:
-        upper, lower = weights[entry, np.uint64(0)], weights[entry, _ONE]
+        upper, lower = weights[entry + entry], weights[entry + entry + _ONE]
         at = np.uint32(place + offsets[entry])
         entry += _ONE
         p, q, s, t = short_real_of(upper), short_imag_of(upper), short_real_of(lower), short_imag_of(lower)
         # Of 32 bits each time: Numba's own sums of 32 bits have 64.
         x = samples[at]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
-        a_real, a_imag = np.int32(a_real + p * x_real + q * x_imag), np.int32(a_imag + s * x_real + t * x_imag)
+        a_real = np.int32(np.int32(a_real + p * x_real) + q * x_imag)
+        a_imag = np.int32(np.int32(a_imag + s * x_real) + t * x_imag)
         x = samples[at + _1]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
-        b_real, b_imag = np.int32(b_real + p * x_real + q * x_imag), np.int32(b_imag + s * x_real + t * x_imag)
+        b_real = np.int32(np.int32(b_real + p * x_real) + q * x_imag)
+        b_imag = np.int32(np.int32(b_imag + s * x_real) + t * x_imag)
         x = samples[at + _2]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
-        c_real, c_imag = np.int32(c_real + p * x_real + q * x_imag), np.int32(c_imag + s * x_real + t * x_imag)
+        c_real = np.int32(np.int32(c_real + p * x_real) + q * x_imag)
+        c_imag = np.int32(np.int32(c_imag + s * x_real) + t * x_imag)
     return a_real, a_imag, b_real, b_imag, c_real, c_imag
 
 
@@ -75,7 +78,7 @@ def delay_and_sum_envelope_int16(tiles, scales, starts, stop, offsets, weights, 
         starts,
         stop,
         offsets.reshape(-1),
-        weights.reshape(n_directions * n_terms, 4).view(np.uint32),
+        weights.reshape(-1).view(np.uint32),
         n_terms,
         weight_scale,
         out,

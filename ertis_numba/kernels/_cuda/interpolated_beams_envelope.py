@@ -31,22 +31,22 @@ def _add_node(nodes, at, weight, sums):
 
 
 @cuda.jit(cache=True)
-def _interpolate(nodes, width, places, tap_weights, rows, first, stop, out):
-    """``nodes`` are (node, range) uint64, flat; their ``width`` is a whole number of tiles."""
+def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, out):
+    """``nodes``, (node, range) uint64 of which ``width`` is a whole number of tiles, and all tables are flat."""
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
-    if direction >= np.uint64(places.shape[0]):
+    if direction >= np.uint64(rows.size):
         return
-    k = np.uint32(cuda.blockIdx.y * TILE + cuda.threadIdx.x)
+    k, row_width = np.uint64(cuda.blockIdx.y * TILE + cuda.threadIdx.x), np.uint64(width)
     zero = np.float32(0)
     sums = zero, zero, zero, zero, zero, zero, zero, zero
-    n_pairs = np.uint64(places.shape[1])
-    pair = np.uint64(0)
-    while pair < n_pairs:
-        at = np.uint64(places[direction, pair]) * np.uint64(width) + k
-        weights = tap_weights[direction, pair]
-        pair += _ONE
+    entry = direction * np.uint64(n_pairs)
+    end_entry = entry + np.uint64(n_pairs)
+    while entry < end_entry:
+        at = np.uint64(np.uint32(places[entry])) * row_width + k
+        weights = tap_weights[entry]
+        entry += _ONE
         sums = _add_node(nodes, at, real_of(weights), sums)
-        sums = _add_node(nodes, at + np.uint64(width), imag_of(weights), sums)
+        sums = _add_node(nodes, at + row_width, imag_of(weights), sums)
     a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag = sums
     row = np.uint64(rows[direction])
     r = np.uint64(first) + k
@@ -63,10 +63,9 @@ def _interpolate(nodes, width, places, tap_weights, rows, first, stop, out):
 
 def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, rows, first, stop, n_blocks, out):
     """See `InterpolatedBeamsEnvelope`."""
-    n_directions, n_pairs = places.shape
-    grid = beam_grid(n_directions, stop - first)
+    grid = beam_grid(places.shape[0], stop - first)
     width = grid[1] * TILE
     nodes = workspace(f"nodes from range {first} on", (offsets.shape[0], width), np.uint64)
     beams_from(signals, offsets, weights, first, stop - first, nodes)
-    pairs = tap_weights.reshape(-1).view(np.uint64).reshape(n_directions, n_pairs)
-    launch(_interpolate, grid, BLOCK, nodes.reshape(-1), width, places, pairs, rows, first, stop, out)
+    tables = places.reshape(-1), places.shape[1], tap_weights.reshape(-1).view(np.uint64), rows
+    launch(_interpolate, grid, BLOCK, nodes.reshape(-1), width, *tables, first, stop, out)

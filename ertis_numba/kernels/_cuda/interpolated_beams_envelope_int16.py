@@ -10,6 +10,7 @@ from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of,
 
 __all__ = ["interpolated_beams_envelope_int16"]
 
+_WIDTH = np.uint64(TILE_RANGES)
 _ONE, _1, _2 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP)
 
 
@@ -30,30 +31,30 @@ def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
 
 
 @cuda.jit(cache=True)
-def _interpolate(nodes, n_nodes, scales, starts, stop, places, tap_weights, rows, weight_scale, out):
-    """``nodes`` are flat, ``tap_weights`` pairs of int16 as uint32."""
+def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weights, rows, weight_scale, out):
+    """``nodes``, ``places`` and ``tap_weights``, which are pairs of int16 as uint32, are flat."""
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
-    if direction >= np.uint64(places.shape[0]):
+    if direction >= np.uint64(rows.size):
         return
     tile = np.uint64(cuda.blockIdx.y)
-    first = cuda.blockIdx.y * np.int64(n_nodes) * TILE_RANGES + cuda.threadIdx.x
+    first = np.uint64(cuda.blockIdx.y * np.int64(n_nodes) * TILE_RANGES + cuda.threadIdx.x)
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
-    n_pairs = np.uint64(places.shape[1])
-    pair = np.uint64(0)
-    while pair < n_pairs:
-        at = np.uint64(first + places[direction, pair] * np.int64(TILE_RANGES))
-        weights = tap_weights[direction, pair]
-        pair += _ONE
+    entry = direction * np.uint64(n_pairs)
+    end_entry = entry + np.uint64(n_pairs)
+    while entry < end_entry:
+        at = first + np.uint64(np.uint32(places[entry])) * _WIDTH
+        weights = tap_weights[entry]
+        entry += _ONE
         low, high = short_real_of(weights), short_imag_of(weights)
-        x, y = nodes[at], nodes[at + np.uint64(TILE_RANGES)]
-        a_real = np.int32(a_real + low * short_real_of(x) + high * short_real_of(y))
-        a_imag = np.int32(a_imag + low * short_imag_of(x) + high * short_imag_of(y))
-        x, y = nodes[at + _1], nodes[at + np.uint64(TILE_RANGES + WARP)]
-        b_real = np.int32(b_real + low * short_real_of(x) + high * short_real_of(y))
-        b_imag = np.int32(b_imag + low * short_imag_of(x) + high * short_imag_of(y))
-        x, y = nodes[at + _2], nodes[at + np.uint64(TILE_RANGES + 2 * WARP)]
-        c_real = np.int32(c_real + low * short_real_of(x) + high * short_real_of(y))
-        c_imag = np.int32(c_imag + low * short_imag_of(x) + high * short_imag_of(y))
+        x, y = nodes[at], nodes[at + _WIDTH]
+        a_real = np.int32(np.int32(a_real + low * short_real_of(x)) + high * short_real_of(y))
+        a_imag = np.int32(np.int32(a_imag + low * short_imag_of(x)) + high * short_imag_of(y))
+        x, y = nodes[at + _1], nodes[at + (_WIDTH + _1)]
+        b_real = np.int32(np.int32(b_real + low * short_real_of(x)) + high * short_real_of(y))
+        b_imag = np.int32(np.int32(b_imag + low * short_imag_of(x)) + high * short_imag_of(y))
+        x, y = nodes[at + _2], nodes[at + (_WIDTH + _2)]
+        c_real = np.int32(np.int32(c_real + low * short_real_of(x)) + high * short_real_of(y))
+        c_imag = np.int32(np.int32(c_imag + low * short_imag_of(x)) + high * short_imag_of(y))
     scale, row = np.float32(scales[tile] * weight_scale), np.uint64(rows[direction])
     r, end = np.uint64(starts[tile] + cuda.threadIdx.x), np.uint64(stop)
     if r < end:
@@ -80,7 +81,7 @@ def interpolated_beams_envelope_int16(
         samples,
         samples.shape[0] // n_tiles,
         offsets.reshape(-1),
-        weights.reshape(n_nodes * n_terms, 4).view(np.uint32),
+        weights.reshape(-1).view(np.uint32),
         n_terms,
         nodes,
     )
@@ -93,8 +94,9 @@ def interpolated_beams_envelope_int16(
         scales,
         starts,
         stop,
-        places,
-        tap_weights.reshape(n_directions, 2 * n_pairs).view(np.uint32),
+        places.reshape(-1),
+        n_pairs,
+        tap_weights.reshape(-1).view(np.uint32),
         rows,
         weight_scale,
         out,

@@ -16,6 +16,8 @@ __all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 
+numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image is a small grid: no mistake to be told of
+
 Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
 

@@ -12,7 +12,8 @@ _BLOCK = 128
 
 
 @cuda.jit(cache=True)
-def _fold(spectra, responses, first_bin, out):
+def _fold(spectra, responses, first_bin, ahead, out):
+    """``ahead`` is what the first bin lacks to a multiple of the length of ``out``: a remainder is dear here."""
     k = np.int64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x)
     if k >= out.shape[2]:
         return
@@ -20,7 +21,9 @@ def _fold(spectra, responses, first_bin, out):
     row = mic if responses.shape[0] > 1 else np.uint64(0)
     n_out = np.int64(out.shape[2])
     real = imag = np.float32(0)
-    b = (k - first_bin) % n_out
+    b = k + ahead
+    if b >= n_out:
+        b -= n_out
     while b < responses.shape[2]:
         x, h = spectra[mic, np.uint64(first_bin + b)], responses[row, phase, np.uint64(b)]
         real = (real + real_of(x) * real_of(h)) - imag_of(x) * imag_of(h)
@@ -32,5 +35,5 @@ def _fold(spectra, responses, first_bin, out):
 def multiply_and_fold(spectra, responses, first_bin, out):
     """See `MultiplyAndFold`."""
     n_mics, n_phases, n_out = out.shape
-    numbers = spectra.view(np.uint64), responses.view(np.uint64)
-    launch(_fold, (-(-n_out // _BLOCK), n_phases, n_mics), (_BLOCK,), *numbers, first_bin, out.view(np.uint64))
+    grid, numbers = (-(-n_out // _BLOCK), n_phases, n_mics), (spectra.view(np.uint64), responses.view(np.uint64))
+    launch(_fold, grid, (_BLOCK,), *numbers, first_bin, -first_bin % n_out, out.view(np.uint64))

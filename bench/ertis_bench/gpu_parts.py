@@ -1,0 +1,294 @@
+"""What is measured on a GPU: each part runs in a process of its own, ``python -m ertis_bench.gpu_parts NAME FILE``.
+
+A part yields rows, and each is written to the file as a line of JSON at once: what was measured before a part failed
+is not lost.
+"""
+
+import functools
+import importlib.metadata
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench import checks, rivals, subject, timing
+from ertis_bench.gpu import REFUSED
+from ertis_bench.gpu_stages import stages
+from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
+from ertis_bench.plans import in_words
+from ertis_numba import kernels, verification
+from ertis_numba.errors import DataError, DeviceError
+from ertis_numba.frames import Measurement
+from ertis_numba.kernels._cuda import ceilings
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+from ertis_numba.stages.fast import FastChain
+
+__all__ = ["FULL", "PARTS", "Scale", "ceilings_of", "machine", "paper", "side_by_side"]
+
+_SAME_DB = -100.0  # between devices that add up the same terms in another order
+_SAME_16_DB = -80.0  # and where numbers are rounded to 16 bits on the way
+_PUBLISHED_MS = dict(zip(map(str, DIRECTIONS), PUBLISHED_MS["GPU GTX 1080 Ti"], strict=True))
+_OPERATIONS, _BYTES = 8, 8  # of one term at one range: a complex multiply-add, and a complex64 to load
+_IMAGES = 8  # that a stream goes to in turn: all of them pinned
+_PACKAGES = ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x", "cuda-bindings", "torch", "mach-beamform")
+_ASKED_OF_SMI = (
+    "driver_version",
+    "memory.total",
+    "clocks.max.sm",
+    "clocks.max.memory",
+    "clocks.sm",
+    "clocks.memory",
+    "power.limit",
+    "pstate",
+    "mig.mode.current",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How much is measured.
+
+    Attributes
+    ----------
+    subject : callable
+        Returns the measurement and what it is.
+    directions : tuple of str
+        As ``processing.directions``.
+    range_m : tuple of float
+    count : int
+        Measurements one at a time.
+    stream : int
+        Measurements in a stream.
+    streams : int
+    rivals : int
+        Measurements of each rival.
+    ceilings : dict
+        As for `ceilings.ceilings`.
+    """
+
+    subject: Callable[[], tuple[Measurement, str]] = subject.measurement
+    directions: tuple[str, ...] = ("90", "1850", "3000")
+    range_m: tuple[float, float] = RANGE_M
+    count: int = 200
+    stream: int = 64
+    streams: int = 7
+    rivals: int = 30
+    ceilings: tuple[tuple[str, int], ...] = ()
+
+    def settings(self, directions: str) -> tuple[Settings, Measurement]:
+        """Return settings for a grid, and the measurement."""
+        measurement, _ = self.subject()
+        processing = measurement.settings.processing.replace(
+            directions=directions, range_m=self.range_m, method="fast", wavefront="plane"
+        )
+        return measurement.settings.replace(processing=processing), measurement
+
+
+FULL = Scale()
+
+
+def machine(_: Scale) -> Iterator[dict[str, Any]]:
+    """Yield what the GPU is.
+
+    Raises
+    ------
+    DeviceError
+        There is none, or one that is only simulated.
+    """
+    kernel_set = kernels.load("cuda")
+    if kernel_set.simulated:
+        raise DeviceError("device 'cuda' is simulated here, and its times tell nothing; unset NUMBA_ENABLE_CUDASIM")
+    import cupy  # noqa: PLC0415 - there with a GPU only
+
+    properties = ceilings.properties()
+    runtime = cupy.cuda.runtime
+    yield {
+        "name": kernel_set.hardware,
+        "multiprocessors": properties["multiprocessors"],
+        "compute_capability": properties["compute_capability"],
+        "cuda_driver": _version(runtime.driverGetVersion()),
+        "cuda_runtime": _version(runtime.runtimeGetVersion()),
+        "packages": _installed(),
+        **_smi(properties["uuid"]),
+    }
+
+
+def paper(scale: Scale) -> Iterator[dict[str, Any]]:
+    """Yield a row per grid: one at a time, in stages, and streamed, after images were checked.
+
+    Raises
+    ------
+    DataError
+        A result is wrong, so it is not timed.
+    """
+    for directions in scale.directions:
+        settings, measurement = scale.settings(directions)
+        words = _words(measurement)
+        with Pipeline(settings, device="cuda") as plain, Pipeline(settings, device="cuda", graphs=True) as recorded:
+            plan = plain.settings
+            row: dict[str, Any] = {
+                "directions": directions,
+                "ranges": len(plain.range_m),
+                "plan": in_words(plan.accuracy),
+                **_checked(plain, recorded, measurement),
+            }
+            subjects = {
+                name: functools.partial(pipeline.process, measurement, out=_pinned(pipeline, measurement))
+                for name, pipeline in {"plain": plain, "graphs": recorded}.items()
+            }
+            times_ms = timing.round_robin(subjects, count=scale.count)
+            row["one_at_a_time"] = {name: timing.summary(times) for name, times in times_ms.items()}
+        row |= stages(plan, words, count=scale.count)
+        row["streamed_ms"] = _streamed(plan, words, scale)
+        if directions in _PUBLISHED_MS:
+            best_ms = min(summary["median_ms"] for summary in row["one_at_a_time"].values())
+            row["times_faster_than_published"] = round(_PUBLISHED_MS[directions][0] / best_ms, 1)
+        yield row
+
+
+def side_by_side(scale: Scale) -> Iterator[dict[str, Any]]:
+    """Yield a row per grid and library: the same sums by it and by this package, in turns, after images were compared.
+
+    What fails is said in its row, and the others go on.
+    """
+    for library, directions in itertools.product(rivals.LIBRARIES, scale.directions):
+        row = {"library": library, "directions": directions}
+        if not rivals.is_installed(library):
+            yield row | {"status": "not installed"}
+            continue
+        settings, measurement = scale.settings(directions)
+        try:
+            yield row | rivals.race(library, settings, measurement, scale.rivals)
+        except (ImportError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+            yield row | {"status": f"failed: {error}"}
+
+
+def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
+    """Yield what the GPU can do at most, and what delay-and-sum of every direction's own beam reaches of it."""
+    found = ceilings.ceilings(scale.count, **dict(scale.ceilings))
+    rounded = {name: round(value, 1) for name, value in found.items()}
+    yield {"ceilings": rounded, **_smi(ceilings.properties()["uuid"])}
+    settings, measurement = scale.settings(scale.directions[-1])
+    settings = settings.replace(accuracy=settings.accuracy.replace(precision="float32", beam_taps=0))
+    with Pipeline(settings, device="cuda") as pipeline:
+        plan, shape = pipeline.settings, (len(pipeline.grid), len(pipeline.range_m))
+    tables = rivals.tables_of(plan, measurement)
+    seconds = stages(plan, _words(measurement), count=scale.count)["stages_ms"]["delay-and-sum with envelope"] / 1e3
+    points = tables.n_terms * shape[0] * shape[1]
+    reached = {"float32_gop_s": points * _OPERATIONS / seconds / 1e9, "load_gb_s": points * _BYTES / seconds / 1e9}
+    shares = {name: rate / found[name] for name, rate in reached.items()}
+    tighter = max(shares, key=lambda name: shares[name])
+    yield {
+        "directions": scale.directions[-1],
+        "ranges": shape[1],
+        "terms": tables.n_terms,
+        "plan": in_words(plan.accuracy),
+        "delay_and_sum_ms": round(1e3 * seconds, 4),
+        **{name: round(rate, 1) for name, rate in reached.items()},
+        "shares": {name: round(share, 3) for name, share in shares.items()},
+        "tighter": tighter,
+    }
+
+
+PARTS: dict[str, Callable[[Scale], Iterator[dict[str, Any]]]] = {
+    "machine": machine,
+    "paper": paper,
+    "side by side": side_by_side,
+    "ceilings": ceilings_of,
+}
+
+
+def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> dict[str, float]:
+    """Return errors of an image, which are small: from the exact one, and from the processor's of the same plan."""
+    image = plain.process(measurement)
+    again = [recorded.process(measurement) for _ in range(3)]  # launched, recorded, played
+    if any(not np.array_equal(other.energy, image.energy) for other in again):
+        raise DataError("a recorded chain makes another image than a launched one; do not use graphs=True")
+    error_db = checks.require_exact(image, measurement)
+    same = Pipeline(plain.settings, device="cpu").process(measurement)
+    difference_db = verification.error_db(image.energy, same.energy)
+    wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
+    if not difference_db <= wanted_db:
+        raise DataError(
+            f"image of {len(image.energy)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; wanted at "
+            f"most {wanted_db:g} dB: the times would be those of a wrong result"
+        )
+    return {"error_db": round(error_db, 1), "off_cpu_db": round(difference_db, 1)}
+
+
+def _pinned(pipeline: Pipeline, measurement: Measurement) -> NDArray[np.float32]:
+    """Return the array of an image as the pipeline makes it, which is the quickest to be filled."""
+    return pipeline.process(measurement).energy
+
+
+def _streamed(plan: Settings, words: NDArray[Any], scale: Scale) -> dict[str, float]:
+    """Return medians of the time per measurement: images to the host, and images that stay on the GPU."""
+    found: dict[str, float] = {}
+    for name, graphs in {"plain": False, "graphs": True}.items():
+        chain = FastChain(plan, kernels.load("cuda"), threads=1, graphs=graphs)
+        images = [chain.new_image() for _ in range(_IMAGES)]
+        stream = [words] * scale.stream
+        to_host = [images[number % _IMAGES] for number in range(scale.stream)]
+        subjects = {
+            f"to the host, {name}": functools.partial(chain.process_batch, stream, to_host),
+            f"stay on the GPU, {name}": functools.partial(chain.process_batch, stream, [None] * scale.stream),
+        }
+        times_ms = timing.round_robin(subjects, count=scale.streams)
+        found |= {key: round(float(np.median(times)) / scale.stream, 4) for key, times in times_ms.items()}
+        chain.close()
+    return found
+
+
+def _words(measurement: Measurement) -> NDArray[Any]:
+    n_samples = measurement.settings.recording.n_samples
+    return np.require(measurement.words, requirements=["C", "A", "W"]).reshape(n_samples, -1)
+
+
+def _installed() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _version(number: int) -> str:
+    return f"{number // 1000}.{number % 1000 // 10}"
+
+
+def _smi(uuid: str) -> dict[str, str]:
+    """Return what NVIDIA's own tool says of the GPU; nothing where it is missing."""
+    command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_ASKED_OF_SMI)}"]
+    try:
+        done = subprocess.run(  # noqa: S603
+            [*command, "--format=csv,noheader"], capture_output=True, text=True, check=True, timeout=20
+        )
+    except (OSError, subprocess.SubprocessError):
+        return {}
+    values = [value.strip() for value in done.stdout.strip().splitlines()[0].split(",")]
+    return dict(zip(_ASKED_OF_SMI, values, strict=True))
+
+
+def _main(name: str, path: Path) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        try:
+            for row in PARTS[name](FULL):
+                file.write(json.dumps(row) + "\n")
+                file.flush()
+        except DeviceError as error:
+            sys.stderr.write(f"{error}\n")
+            sys.exit(REFUSED)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], Path(sys.argv[2]))

@@ -1,0 +1,167 @@
+"""The report of `gpu` as Markdown."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from ertis_bench.markdown import table
+from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+
+__all__ = ["gpu", "gpu_short"]
+
+_UNMEASURED = "not measured"
+_PUBLISHED = "GPU GTX 1080 Ti"
+_STREAMS = ("to the host, plain", "to the host, graphs", "stay on the GPU, plain", "stay on the GPU, graphs")
+_CHECKS = ("tests", "memcheck", "racecheck")
+
+
+def gpu(report: dict[str, Any]) -> str:
+    """Return all that was measured on a GPU; that nothing was, where the report is empty."""
+    if not report:
+        return f"{_times({})}\n\nNo results of a GPU are in the repository: `make gpu` measures them."
+    parts = [_times(report), _stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
+    return "\n\n".join([*(part for part in parts if part), _CONDITIONS.format(**report)])
+
+
+def gpu_short(report: dict[str, Any]) -> str:
+    """Return the times of the paper's grids."""
+    if not report:
+        return _times({})
+    return f"{_times(report)}\n\nMedians on {report['gpu']['name']}, {report['date'][:10]}; docs/cuda.md has the rest."
+
+
+def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = report.get("parts", {}).get(part, {}).get("rows", [])
+    return found
+
+
+def _times(report: dict[str, Any]) -> str:
+    """Return the times of a measurement by grid; a grid that was not measured says so."""
+    rows = {row["directions"]: row for row in _rows(report, "paper")}
+    lines: dict[str, list[str]] = {
+        "one at a time, words to image": [],
+        "the same as a CUDA graph": [],
+        "on the GPU alone, without transfers": [],
+        **{f"streamed, images {name}": [] for name in _STREAMS},
+        f"the paper's {_PUBLISHED.removeprefix('GPU ')}": [],
+        "times faster than that": [],
+    }
+    for directions, published in zip(DIRECTIONS, PUBLISHED_MS[_PUBLISHED], strict=True):
+        row = rows.get(str(directions))
+        cells = [_UNMEASURED] * 7 if row is None else list(_cells(row))
+        faster = "–" if row is None else f"{row['times_faster_than_published']:.0f}×"
+        for line, cell in zip(lines.values(), [*cells, f"{published[0]:.2f}", faster], strict=True):
+            line.append(cell)
+    head = ["ms per measurement, median", *(f"{n} directions" for n in DIRECTIONS)]
+    return table(head, [[name, *cells] for name, cells in lines.items()])
+
+
+def _cells(row: dict[str, Any]) -> Iterator[str]:
+    for name in ("plain", "graphs"):
+        yield f"{row['one_at_a_time'][name]['median_ms']:.3f}"
+    yield f"{row['without_transfers_ms']:.3f}"
+    for name in _STREAMS:
+        yield f"{row['streamed_ms'][name]:.3f}"
+
+
+def _stages(report: dict[str, Any]) -> str:
+    rows = _rows(report, "paper")
+    if not rows:
+        return ""
+    lines = [[name, *(f"{row['stages_ms'][name]:.4f}" for row in rows)] for name in rows[0]["stages_ms"]]
+    lines.append(["sum without transfers", *(f"{row['without_transfers_ms']:.4f}" for row in rows)])
+    plans = "; ".join(
+        f"{row['directions']} directions, {row['ranges']} ranges: {row['plan']}, {row['error_db']:.1f} dB off the "
+        f"exact image, {row['off_cpu_db']:.1f} dB off `cpu`"
+        + ("" if row["queued"] else ", with gaps in which the GPU waited for launches")
+        for row in rows
+    )
+    head = ["ms on the GPU's clock", *(f"{row['directions']} directions" for row in rows)]
+    return f"{table(head, lines)}\n\n{plans}."
+
+
+def _rivals(report: dict[str, Any]) -> str:
+    rows = _rows(report, "side by side")
+    if not rows:
+        return ""
+    cells = [
+        [
+            f"{row['library']}: {row.get('status') or row['what']}",
+            row["directions"],
+            *(f"{row[key]:.3f}" if key in row else "–" for key in ("theirs_ms", "ours_ms")),
+            f"{row['times_faster']:.1f}×" if "times_faster" in row else "–",
+            f"{row['off_db']:.0f}" if "off_db" in row else "–",
+        ]
+        for row in rows
+    ]
+    return table(["the same sums", "directions", "theirs, ms", "ours, ms", "times faster", "apart, dB"], cells)
+
+
+def _reached(report: dict[str, Any]) -> str:
+    rows = _rows(report, "ceilings")
+    if not rows:
+        return ""
+    found, reached = rows[0]["ceilings"], {} if len(rows) == 1 else rows[1]
+    names = {
+        "copy_gb_s": "copy in device memory, read and written, GB/s",
+        "float32_gop_s": "float32 multiply-add, Gop/s",
+        "load_gb_s": "loads from the first cache level, GB/s",
+        "load_unaligned_gb_s": "the same from the sample after a line's begin, GB/s",
+    }
+    shares = reached.get("shares", {})
+    cells = [
+        [text, f"{found[name]:,.0f}", f"{100 * shares[name]:.0f} %" if name in shares else "–"]
+        for name, text in names.items()
+    ]
+    text = table(["at most", "measured", "delay-and-sum reaches"], cells)
+    if not reached:
+        return text
+    return (
+        f"{text}\n\nDelay-and-sum with envelope of {reached['directions']} directions, {reached['ranges']} ranges and "
+        f"{reached['terms']} terms takes {reached['delay_and_sum_ms']:.3f} ms ({reached['plan']})."
+    )
+
+
+def _verdicts(report: dict[str, Any]) -> str:
+    """Return what became of each part, failures included."""
+    lines = []
+    for name, part in report["parts"].items():
+        told = [part["status"]]
+        if name == "tests" and "passed" in part:
+            told.append(
+                f"{part['passed']} passed, {part['passed_on_gpu']} of them on the GPU; {part['failed']} failed, "
+                f"{part['skipped']} skipped"
+            )
+        if "errors" in part:
+            told.append(f"{part['errors']} errors in {part['tests_passed']} tests")
+        lines.append(f"- {name}: {'; '.join(told)} ({part['wall_s']:.0f} s)")
+    return "\n".join(lines)
+
+
+def _machine(report: dict[str, Any]) -> str:
+    card, host = report["gpu"], report["machine"]
+    known = {
+        "driver": card.get("driver_version"),
+        "CUDA of the driver": card["cuda_driver"],
+        "of the runtime": card["cuda_runtime"],
+        "memory": card.get("memory.total"),
+        "highest clock": card.get("clocks.max.sm"),
+        "power limit": card.get("power.limit"),
+    }
+    under_load = next((row["clocks.sm"] for row in _rows(report, "ceilings") if "clocks.sm" in row), None)
+    told = [f"{name} {value}" for name, value in {**known, "clock just after load": under_load}.items() if value]
+    packages = ", ".join(f"{name} {value}" for name, value in card["packages"].items())
+    return (
+        f"Measured on {card['name']} ({card['multiprocessors']} multiprocessors, compute capability "
+        f"{card['compute_capability']}; {', '.join(told)}) beside {host['cpu']}, {host['cores']} cores; {packages}, "
+        f"numba {host['numba']}, python {host['python']}."
+    )
+
+
+_CONDITIONS = """\
+{date}, revision {revision}, the measurement is {source}, 0.5–5 m, the plan that settings without any wish give on this
+GPU. Images are checked before they are timed: against the exact one, the processor's of the same plan, and a rival's
+against this package's. One at a time: from the words in memory to the image in pinned memory, one after the other,
+launched or as a CUDA graph, in turns. On the GPU alone: by the GPU's own clock, all launches waiting behind a kernel
+that keeps it busy. Streamed: 64 measurements in three lanes. The same measurement is processed again and again, so the
+GPU's caches may hold more of the tables than they would beside other work. Rivals run the same algorithm with the same
+tables and every direction's own beam, in turns with this package; mach computes its delays itself."""

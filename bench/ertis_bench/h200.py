@@ -1,0 +1,179 @@
+"""What a kernel would take on an NVIDIA H200 SXM: arithmetic with published figures, to be put to the test by a GPU."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.instructions import Instruction, kinds, loops, way
+from ertis_numba.kernels._cuda.terms import DIRECTIONS, TILE
+
+__all__ = ["ASSUMED", "CC", "GPU", "LOOPS", "Loop", "main_loop", "predicted_us", "resident_warps"]
+
+CC: Final = (9, 0)
+GPU: Final[dict[str, float]] = {
+    # NVIDIA, "H200 Tensor Core GPU", data sheet, and "H100 Tensor Core GPU Architecture", white paper: the same chip
+    "multiprocessors": 132,
+    "clock_hz": 1.98e9,  # the highest; under load it may be less
+    "memory_bytes_s": 4.8e12,
+    "schedulers": 4,  # of a multiprocessor: an instruction of a warp each per clock, for 32 lanes each
+    "cache_line_bytes": 128,  # what the first cache level gives per clock
+    # NVIDIA, "CUDA C++ Programming Guide", technical specifications per compute capability: 9.0
+    "warps": 64,
+    "blocks": 32,
+    "registers": 65_536,
+    "registers_at_a_time": 256,  # in which warps are given registers
+    # Luo et al., "Benchmarking and dissecting the NVIDIA Hopper GPU architecture" (2024), measured on an H100
+    "cache_latency_clocks": 41,
+}
+ASSUMED: Final[dict[str, float]] = {
+    "second_cache_bytes_s": 5.5e12,  # to all multiprocessors together
+    "pcie_bytes_s": 55e9,  # PCIe 5 x16 gives 63 GB/s less its protocol; pinned memory
+    "copy_bytes_s": 10e9,  # of one core, words into pinned memory
+    "between_kernels_us": 2.0,  # of a graph, each waiting for the one before
+    "transform_kernels": 2,  # of cuFFT for each transform; each reads and writes its arrays once
+    "transform_kernel_us": 3.0,  # at least
+    "graph_us": 10.0,  # the processor's, for one graph
+    "host_us": 30.0,  # the processor's, for all else of a measurement, in Python
+    # numba-cuda, pull request 288: a launch, and each of its arrays
+    "launch_us": 6.6,
+    "launch_array_us": 4.0,
+    "transform_launch_us": 10.0,
+}
+
+Arguments = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """What a pass through the main loop of a kernel is for.
+
+    Attributes
+    ----------
+    of : str
+        What the passes go over.
+    passes : callable
+        How often a thread goes round, from the launch's arguments.
+    loads : int
+        Load instructions of a pass, by which it is seen how many passes the compiler made one.
+    lines : int
+        Lines of the first cache level that the loads of a warp take. A warp that loads 256 bytes takes two, and three
+        where they do not begin at a line; one that loads the same number 32 times takes one.
+    chain : int
+        Loads that wait for each other.
+    points : int
+        Results of a thread.
+    fetched : callable
+        Bytes that blocks bring from the second cache level to the first, each line once per block.
+    """
+
+    of: str
+    passes: Callable[[Arguments], int]
+    loads: int
+    lines: int
+    chain: int
+    points: int
+    fetched: Callable[[Arguments, tuple[int, ...]], float]
+
+
+def _of_terms(given: Arguments, grid: tuple[int, ...]) -> float:
+    """Blocks take groups of directions, whose terms may lie in the same lines, and tiles of ranges."""
+    offsets = given["offsets"].reshape(-1, int(given["n_terms"])).astype(np.int64)
+    return grid[1] * sum(
+        _distinct_lines(8 * offsets[first : first + DIRECTIONS], 8 * TILE)
+        for first in range(0, len(offsets), DIRECTIONS)
+    )
+
+
+def _of_nodes(given: Arguments, grid: tuple[int, ...]) -> float:
+    places = given["places"].reshape(-1, int(given["n_pairs"])).astype(np.int64)
+    row_bytes = 8 * int(given["width"])
+    return grid[1] * sum(
+        _distinct_lines(row_bytes * (places[first : first + DIRECTIONS, :, None] + np.arange(2)), 8 * TILE)
+        for first in range(0, len(places), DIRECTIONS)
+    )
+
+
+def _of_words(given: Arguments, grid: tuple[int, ...]) -> float:
+    n_taps, outputs = given["taps"].size, -(-given["out"].shape[1] // grid[0])
+    words = n_taps + (outputs - 1) * int(given["factor"])
+    return float(math.prod(grid) * (words * int(given["n_octets"]) + given["taps"].nbytes))
+
+
+def _distinct_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
+    """Return how many bytes the lines have that runs of ``n_bytes`` touch."""
+    line = int(GPU["cache_line_bytes"])
+    first, last = starts_bytes.ravel() // line, (starts_bytes.ravel() + n_bytes - 1) // line
+    return float(line * len(np.unique(np.concatenate([first + k for k in range(int((last - first).max()) + 1)]))))
+
+
+_TERMS: Final = Loop("term", lambda given: int(given["n_terms"]), 6, 2 + 4 * 3, 2, 4, _of_terms)
+LOOPS: Final = {
+    "delay_and_sum_envelope.fill": _TERMS,
+    "delay_and_sum.fill": _TERMS,
+    "interpolated_beams_envelope.interpolate": Loop(
+        "pair of nodes", lambda given: int(given["n_pairs"]), 10, 2 + 8 * 2, 2, 4, _of_nodes
+    ),
+    "demodulate_words.sum_taps": Loop("tap", lambda given: int(given["taps"].size), 2, 2, 1, 1, _of_words),
+}
+"""Kernels that spend their time in a loop, by name."""
+
+
+def main_loop(code: list[Instruction]) -> list[Instruction]:
+    """Return the loop with the most loads."""
+    parts = [[code[at] for at in loop] for loop in loops(code)]
+    return max(parts, key=lambda part: kinds(part)["loads"])
+
+
+def resident_warps(registers: int, warps_per_block: int) -> int:
+    """Return how many warps of a kernel a multiprocessor holds at a time; no kernel here uses shared memory."""
+    at_a_time = GPU["registers_at_a_time"]
+    of_warp = math.ceil(32 * registers / at_a_time) * at_a_time
+    by_registers = GPU["registers"] // (of_warp * warps_per_block)
+    return int(min(by_registers, GPU["blocks"], GPU["warps"] // warps_per_block)) * warps_per_block
+
+
+def predicted_us(
+    name: str,
+    code: list[Instruction],
+    *,
+    registers: int,
+    grid: tuple[int, ...],
+    block: tuple[int, ...],
+    arguments: Arguments,
+) -> dict[str, float]:
+    """Return how long each part of the GPU is busy with a launch, in microseconds; the longest is the prediction.
+
+    Parameters
+    ----------
+    name : str
+        In `LOOPS`, or no loop counts.
+    code : list of Instruction
+    registers : int
+    grid, block : tuple of int
+    arguments : dict
+        As in `Launch`; each array is read or written once.
+    """
+    warps_per_block = -(-math.prod(block) // 32)
+    blocks = -(-math.prod(grid) // GPU["multiprocessors"])  # of the multiprocessor that has the most
+    resident = resident_warps(registers, warps_per_block)
+    instructions, lines, waits, fetched = float(len(way(code))), 0.0, 0.0, 0.0
+    if name in LOOPS:
+        loop, part = LOOPS[name], main_loop(code)
+        passes = loop.passes(arguments)
+        rounds = passes * loop.loads / kinds(part)["loads"]
+        instructions += (rounds - 1) * len(part)
+        lines, waits, fetched = passes * loop.lines, rounds * loop.chain, loop.fetched(arguments, grid)
+    warps = blocks * warps_per_block
+    clocks = {
+        "instructions": warps * instructions / GPU["schedulers"],
+        "first cache": warps * lines,
+        "waiting": math.ceil(warps / resident) * waits * GPU["cache_latency_clocks"],
+    }
+    times_us = {each: 1e6 * count / GPU["clock_hz"] for each, count in clocks.items()}
+    n_bytes = sum(each.nbytes for each in arguments.values() if isinstance(each, np.ndarray))
+    times_us["second cache"] = 1e6 * fetched / ASSUMED["second_cache_bytes_s"]
+    return {**times_us, "memory": 1e6 * n_bytes / GPU["memory_bytes_s"]}

@@ -1,0 +1,82 @@
+"""Every kernel launched as the chain does it, or by itself where no chain does."""
+
+import functools
+
+import numpy as np
+
+from ertis_numba.kernels._cuda import compiling
+from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.stages import planner
+from ertis_numba.stages.fast import FastChain
+
+ERTIS = Settings.from_preset("default_25_50")
+PLANS = {
+    # accuracy, processing
+    "default": ({}, {}),
+    "own beams": ({"beam_taps": 0, "precision": "float32"}, {}),
+    "few directions": ({"stop_band_db": 40.0}, {"directions": "90"}),  # taps of 16 bits
+    "deep stop band": ({"stop_band_db": 100.0, "precision": "float32"}, {}),  # taps of 32 bits
+    "int16": ({"precision": "int16", "beam_taps": 0, "delay_taps": 2}, {}),
+    "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
+    "near": ({}, {"range_m": (0.3, 1.0)}),  # several zones
+    "coherence": ({}, {"beamformer": "coherence_factor"}),
+    "capon": ({}, {"beamformer": "capon", "directions": "90"}),
+    **{f"dmas {order}": ({}, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
+}
+
+
+@functools.cache
+def by_contract():
+    """Return all launches by the name of the kernel in the contract."""
+    found = {}
+    for steps in [*(functools.partial(_chain, *plan) for plan in PLANS.values()), _each]:
+        for launch in compiling.recorded(steps):
+            found.setdefault(launch.file, []).append(launch)
+    return found
+
+
+def _chain(accuracy, processing, kernels):
+    settings = ERTIS.replace(
+        processing=Processing(directions="3000", range_m=(0.5, 5.0)).replace(**processing),
+        accuracy=Accuracy(**accuracy),
+    )
+    settings = planner.complete(settings, kernels, threads=1)
+    chain = FastChain(settings, kernels, threads=1)
+    chain.process(np.zeros((settings.recording.n_samples, 1), np.uint32), chain.new_image())
+
+
+def _each(kernels):
+    """Launch what no plan uses, and every type of words and taps."""
+    channels = np.arange(8, dtype=np.int32)
+    signals, spectra = np.zeros((8, 500), np.float32), np.zeros((8, 251), np.complex64)
+    for word in (np.uint8, np.uint16, np.uint32, np.uint64):
+        words = np.zeros((500, 2), word)
+        kernels.unpack_bits(words, channels, signals)
+        for taps in (np.int16, np.int32):
+            kernels.demodulate_words(words, channels, np.zeros(61, taps), np.float32(1), 10, 0, 50, signals)
+    kernels.decimate(signals, np.zeros(61, np.float32), 10, np.zeros((8, 50), np.float32))
+    kernels.remove_group_delay(signals, 3, np.zeros((8, 400), np.float32))
+    kernels.multiply_spectra(spectra, spectra[0].copy(), spectra)
+    beams = np.zeros((90, 400), np.complex64)
+    offsets, weights = np.zeros((90, 8), np.int32), np.zeros((90, 8), np.complex64)
+    kernels.delay_and_sum(np.zeros((8, 2, 500), np.complex64), offsets, weights, beams)
+    kernels.envelope(beams, np.zeros((90, 400), np.float32))
+    double, octets = np.zeros((32, 500)), np.arange(32, dtype=np.int32).reshape(4, 8)
+    kernels.add_paths(
+        np.zeros((1, 251), np.complex128),
+        np.zeros((5, 8)),
+        np.zeros((5, 8, 9)),
+        3,
+        0.1,
+        np.zeros((8, 251), np.complex128),
+    )
+    kernels.modulate_pdm(
+        double,
+        octets,
+        np.zeros(32, np.uint64),
+        np.zeros(32),
+        np.zeros((32, 4)),
+        np.zeros(8),
+        0,
+        np.zeros((500, 4), np.uint8),
+    )

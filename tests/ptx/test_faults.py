@@ -1,0 +1,165 @@
+"""The checks of compiled kernels find what they look for, in kernels made for it."""
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+from cuda import pathfinder
+from numba import cuda
+
+from ertis_numba.errors import DeviceError
+from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda.lane import launch
+from tests.ptx.faults import contracts, faults
+
+CC = (9, 0)
+SUMS = 64
+
+
+@cuda.jit
+def good(x, out):
+    out[cuda.threadIdx.x] = x[cuda.threadIdx.x]
+
+
+@cuda.jit
+def double(x, out):
+    out[0] = x[0] * 1.1
+
+
+@cuda.jit
+def stacked(x, out):
+    local = cuda.local.array(1000, np.float32)
+    for k in range(x.size):
+        local[k] = x[k]
+    out[0] = local[int(x[0])]
+
+
+@cuda.jit
+def calling(x, out):
+    print(x[0], out[0])  # noqa: T201 - GPUs print by calling a function
+
+
+def spilling():
+    """A kernel with more sums than it may have registers."""
+    lines = ["def spilling(x, out):", "    t = cuda.threadIdx.x", *(f"    a{k} = x[t + {k}]" for k in range(SUMS))]
+    lines += ["    for i in range(x.size):"]
+    lines += [f"        a{k} = a{k} * x[i] + a{(k + 1) % SUMS}" for k in range(SUMS)]
+    lines += [f"    out[t + {k}] = a{k}" for k in range(SUMS)]
+    names = {"cuda": cuda}
+    exec("\n".join(lines), names)
+    return cuda.jit(launch_bounds=(1024, 2))(names["spilling"])
+
+
+@cuda.jit
+def contracted(x, out):
+    out[0] = x[0] * x[1] + x[2]
+
+
+def recorded(kernel, *, grid=(1,), block=(32,), dtype=np.float32):
+    (one,) = compiling.recorded(lambda _: launch(kernel, grid, block, np.zeros(100, dtype), np.zeros(100, dtype)))
+    return one
+
+
+def found(kernel, **given):
+    one = recorded(kernel, **given)
+    return faults(one, compiling.code_of(one, CC))
+
+
+def test_good_kernel_has_no_faults():
+    assert found(good) == []
+    assert found(good, grid=(2**31 - 1, 65_535, 65_535), block=(32, 32)) == []
+
+
+def test_double_precision_is_found():
+    assert found(double) == ["computes in double precision"]
+
+
+def test_stack_is_found():
+    assert found(stacked) == ["has 4000 bytes on the stack"]
+
+
+def test_calls_are_found():
+    assert "calls a function" in found(calling)
+
+
+def test_spills_are_found():
+    assert any(fault.startswith("spills ") for fault in found(spilling()))
+
+
+@pytest.mark.parametrize(
+    ("grid", "block", "fault"),
+    [
+        ((1, 65_536), (32,), "has a grid of (1, 65536)"),
+        ((1, 1, 70_000), (32,), "has a grid of (1, 1, 70000)"),
+        ((2**31,), (32,), "has a grid of (2147483648,)"),
+        ((1,), (32, 64), "has 2048 threads in a block"),
+    ],
+)
+def test_launches_beyond_bounds_are_found(grid, block, fault):
+    assert found(good, grid=grid, block=block) == [fault]
+
+
+def test_too_many_registers_and_too_much_shared_memory_are_found():
+    one = recorded(good, block=(1024,))
+    code = compiling.code_of(one, CC)
+    assert faults(one, dataclasses.replace(code, registers=64)) == []
+    assert faults(one, dataclasses.replace(code, registers=65)) == ["has 72 registers in 1024 threads"]
+    assert faults(one, dataclasses.replace(code, shared_bytes=49_153)) == ["shares 49153 bytes"]
+
+
+def test_contraction_is_found():
+    code = compiling.code_of(recorded(contracted, dtype=np.float64), CC)
+    assert contracts(code.ptx)
+    assert contracts(compiling.disassembled(code))
+    single = compiling.code_of(recorded(contracted), CC)
+    assert not contracts(single.ptx)
+    assert not contracts(compiling.disassembled(single))
+
+
+def test_shared_memory_is_told():
+    @cuda.jit
+    def sharing(x, out):
+        shared = cuda.shared.array(256, np.float32)
+        shared[cuda.threadIdx.x] = x[cuda.threadIdx.x]
+        cuda.syncthreads()
+        out[cuda.threadIdx.x] = shared[255 - cuda.threadIdx.x]
+
+    assert compiling.code_of(recorded(sharing), CC).shared_bytes == 1024
+
+
+def test_arguments_have_the_types_of_a_gpu():
+    x = np.zeros(100, np.float32)
+    x.flags.writeable = False
+    (one,) = compiling.recorded(lambda _: launch(good, (1,), (32,), x, x))
+    assert [str(kind) for kind in one.types] == ["array(float32, 1d, C)"] * 2
+    assert one.arguments["x"] is x
+
+
+def test_compiles_once(monkeypatch):
+    one, other = recorded(good), recorded(good, grid=(7,))
+    code = compiling.code_of(one, CC)
+    monkeypatch.setattr(compiling.cuda, "compile_ptx", None)
+    assert compiling.code_of(other, CC) is code
+
+
+def test_refuses_the_simulator(monkeypatch):
+    monkeypatch.setattr(compiling, "SIMULATED", True)
+    with pytest.raises(DeviceError, match=r"^kernels are not compiled where they are simulated; unset NUMBA_ENABLE_"):
+        compiling.recorded(print)
+
+
+def test_names_the_compiler_that_is_missing(monkeypatch):
+    monkeypatch.setattr(pathfinder, "find_nvidia_binary_utility", lambda _: None)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, and ptxas is missing; install them"):
+        compiling.require_compilers()
+    monkeypatch.setattr(compiling, "cuda", types.SimpleNamespace(__file__="numba/cuda/__init__.py"))
+    with pytest.raises(DeviceError, match=r"and numba-cuda is missing; install them with pip install 'ertis-numba\["):
+        compiling.require_compilers()
+
+
+def test_tells_why_a_program_refuses():
+    code = compiling.code_of(recorded(good), (6, 0))
+    with pytest.raises(DeviceError, match=r'^nvdisasm refuses \(.*"SM60" is deprecated.*\); install'):
+        compiling.disassembled(code)

@@ -1,0 +1,60 @@
+"""Every kernel compiles for every kind of GPU, with the types of the chain, into code that is as it should be."""
+
+import pytest
+
+from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels._cuda import compiling
+from tests.ptx import faults
+
+CCS = [(6, 0), (7, 5), (9, 0)]  # the oldest that CUDA 12 compiles for, the oldest of CUDA 13, and an H200
+NO_KERNELS = {
+    "device",
+    "hardware",
+    "transforms",
+    "max_threads",
+    "tile_ranges",
+    "fastest_precision",
+    "simulated",
+    "memory",
+    "threads",
+}
+CONTRACTS = sorted(set(KernelSet.__slots__) - NO_KERNELS)
+
+
+def test_every_contract_is_launched(launched):
+    assert sorted(launched) == CONTRACTS
+    assert len(CONTRACTS) == 18
+
+
+@pytest.mark.parametrize("cc", CCS, ids=lambda cc: f"sm_{cc[0]}{cc[1]}")
+@pytest.mark.parametrize("name", CONTRACTS)
+def test_compiles_without_faults(launched, name, cc):
+    found = {(launch.name, *faults.faults(launch, compiling.code_of(launch, cc))) for launch in launched[name]}
+    assert {one for one in found if len(one) > 1} == set()
+
+
+def test_exceptions_are_needed(launched):
+    for name in faults.DOUBLE:
+        assert any(".f64" in compiling.code_of(launch, (9, 0)).ptx for launch in launched[name])
+    for name in faults.LIBRARY_CALLS:
+        assert any(compiling.code_of(launch, (9, 0)).stack_bytes for launch in launched[name])
+
+
+@pytest.mark.parametrize("cc", CCS[1:], ids=lambda cc: f"sm_{cc[0]}{cc[1]}")
+def test_modulator_rounds_every_product(launched, cc):
+    (loop,) = [launch for launch in launched["modulate_pdm"] if launch.name == "modulate_pdm.modulate"]
+    code = compiling.code_of(loop, cc)
+    assert not faults.contracts(code.ptx)
+    assert "DMUL" in compiling.disassembled(code)
+    assert not faults.contracts(compiling.disassembled(code))
+
+
+def test_words_of_all_sizes_and_taps_of_both_are_launched(launched):
+    taps = {str(launch.arguments["taps"].dtype) for launch in launched["demodulate_words"]}
+    assert taps == {"int16", "int32"}
+    octets = {launch.arguments["n_octets"] for launch in launched["demodulate_words"]}
+    assert octets >= {2, 4, 8, 16}
+
+
+def test_orders_of_dmas_are_kernels_of_their_own(launched):
+    assert len({launch.kernel for launch in launched["combine_dmas"]}) == 1 + 4  # roots, and orders 2, 3, 5 and 8

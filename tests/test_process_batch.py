@@ -1,0 +1,114 @@
+"""Measurements are processed in batches; nobody sees it but by the clock."""
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli import process
+from ertis_cli.main import cli
+
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.files import SMALL, noise
+
+COUNT = 7
+FAST = ["--range", "0.5:0.8", "--directions", "2d:9"]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "rec.h5", noise(count=COUNT))
+
+
+@pytest.fixture
+def sizes(monkeypatch):
+    """How many measurements went to the pipeline each time, and how many pipelines were closed."""
+    calls = {"sizes": [], "closed": 0}
+    one, many, close = Pipeline.process, Pipeline.process_batch, Pipeline.close
+
+    def count_one(self, measurement):
+        calls["sizes"].append(1)
+        return one(self, measurement)
+
+    def count_many(self, measurements):
+        calls["sizes"].append(len(measurements))
+        return many(self, measurements)
+
+    def count_close(self):
+        calls["closed"] += 1
+        close(self)
+
+    monkeypatch.setattr(Pipeline, "process", count_one)
+    monkeypatch.setattr(Pipeline, "process_batch", count_many)
+    monkeypatch.setattr(Pipeline, "close", count_close)
+    return calls
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, ["process", *(str(argument) for argument in arguments)])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+def test_file_is_the_same_whatever_the_batch(recording, tmp_path):
+    files = []
+    for batch in (1, 3, COUNT, 100):
+        target = tmp_path / "img.h5"
+        run(recording, "-o", target, *FAST, "--batch", batch, "--force")
+        files.append(target.read_bytes())
+    assert len(set(files)) == 1
+    with open_energyscapes(target) as images:
+        assert [image.stamp.sequence for image in images] == [10 + index for index in range(COUNT)]
+        assert len({image.energy.tobytes() for image in images}) == COUNT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"), [([], [7]), (["--batch", 3], [3, 3, 1]), (["--batch", 1], [1] * 7), (["--batch", 9], [7])]
+)
+def test_batches_have_the_size_asked_for(recording, tmp_path, sizes, arguments, wanted):
+    run(recording, "-o", tmp_path / "img.h5", *FAST, *arguments)
+    assert sizes == {"sizes": wanted, "closed": 1}
+
+
+def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatch):
+    run(recording, "-o", tmp_path / "img.h5", *FAST)
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        image_bytes = images[0].energy.nbytes
+    for room, wanted in ((2.5, [2, 2, 2, 1]), (0.5, [1] * 7)):
+        sizes["sizes"].clear()
+        monkeypatch.setattr(process, "_BATCH_BYTES", room * image_bytes)
+        run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
+        assert sizes["sizes"] == wanted
+
+
+def test_time_is_that_of_one_measurement(recording, tmp_path, monkeypatch):
+    clock_s = iter(np.arange(0.0, 100.0, 0.7).tolist())  # of every batch, then
+    monkeypatch.setattr(process.time, "perf_counter", lambda: next(clock_s))
+    done = run(recording, "-o", tmp_path / "img.h5", *FAST)
+    assert "7 measurements, 9 directions" in done.stderr
+    assert "100.0 ms each (median)" in done.stderr
+
+
+@pytest.mark.parametrize("batch", [1, 3, 8])
+def test_damage_amid_a_batch_is_told_and_leaves_nothing(recording, tmp_path, batch):
+    with h5py.File(recording, "r+") as file:
+        file["sensors/eRTIS-7/pdm"][4, 777] ^= 1 << 9
+    done = run(recording, "-o", tmp_path / "img.h5", *FAST, "--batch", batch, code=1)
+    assert "rec.h5: measurement 4 has CRC-32" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_other_air_amid_a_batch_leaves_nothing(tmp_path):
+    measurements = noise(count=5)
+    warm = SMALL.replace(air=Air(temperature_c=35.0))
+    measurements[3] = noise(warm, count=5)[3]
+    recording = write_recording(tmp_path / "rec.h5", measurements)
+    done = run(recording, "-o", tmp_path / "img.h5", *FAST, "--batch", 2, code=1)
+    assert "measurement 13 was taken at 35 °C" in done.stderr
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_no_batch_is_refused(recording):
+    assert "0 is not in the range x>=1" in run(recording, "--batch", 0, code=2).stderr
