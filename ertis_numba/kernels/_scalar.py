@@ -54,38 +54,38 @@ TO_GRID = 1.5 * 2.0**32
 """float64 of this size lie 2⁻²⁰ apart: adding it rounds, on every processor."""
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def real_of(sample):
     """Return the real part of a complex64 given as a uint64, which is how it is one load."""
     return np.uint32(sample & _LOW_32).view(np.float32)
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def imag_of(sample):
     """Return the imaginary part of a complex64 given as a uint64."""
     return np.uint32(sample >> _32).view(np.float32)
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def sample_of(real, imag):
     """Return a complex64 as a uint64."""
     low, high = np.float32(real).view(np.uint32), np.float32(imag).view(np.uint32)
     return np.uint64(low) | (np.uint64(high) << _32)
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def short_real_of(sample):
     """Return the real part of a pair of int16 given as a uint32, as an int32."""
     return np.int32(np.int16(sample & _LOW_16))
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def short_imag_of(sample):
     """Return the imaginary part of a pair of int16 given as a uint32, as an int32."""
     return np.int32(np.int16(sample >> _16))
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def short_sample_of(real, imag):
     """Return two numbers within the range of int16, rounded, as a uint32; of two as near, the even one."""
     low = np.uint32(np.int32((np.float32(real) + _TO_WHOLE) - _TO_WHOLE))
@@ -93,7 +93,7 @@ def short_sample_of(real, imag):
     return np.uint32((low & _LOW_16) | (high << _16))
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def upper_halves(real, imag):
     """Return the upper 16 bits of two int32, rounded, as a uint32."""
     low = np.uint32((np.int64(real) + _HALF) >> _SHIFT)
@@ -101,25 +101,25 @@ def upper_halves(real, imag):
     return np.uint32((low & _LOW_16) | (high << _16))
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def power(real, imag):
     """Return ``real² + imag²``."""
     return (np.float32(0) + real * real) + imag * imag
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def magnitude(real, imag):
     """Return ``√(real² + imag²)``; `abs` guards against overflow and takes ten times as long."""
     return math.sqrt(power(real, imag))
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def between(low, high, part):
     """Return what lies ``part`` of the way from one number to another."""
     return low + (high - low) * part
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy", cache=True)
 def coherent_level(real, imag, total_power, count):
     """Return the magnitude of the sum of ``count`` numbers times their coherence factor.
 
@@ -131,7 +131,7 @@ def coherent_level(real, imag, total_power, count):
     return min(factor, np.float32(1)) * math.sqrt(coherent)
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy", cache=True)
 def root_of(real, imag, order):
     """Return ``x / |x|^(1 − 1 / order)``, 0 for 0, in single precision and without squares of x, which may be lost."""
     x, y = abs(real), abs(imag)
@@ -148,7 +148,7 @@ def root_of(real, imag, order):
     return real * scale, imag * scale
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def hash_of(key, sample):
     """Return SplitMix64 of a key and the number of a sample."""
     z = key + np.uint64(sample) * STEP
@@ -157,13 +157,13 @@ def hash_of(key, sample):
     return z ^ (z >> _31)
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def dither_of(z):
     """Return the upper 16 bits of a hash as a number within ±½, exactly."""
     return (np.float64(z >> _48) - 32_767.5) * 2.0**-16
 
 
-@njit(inline="always")
+@njit(inline="always", cache=True)
 def noise_of(z):
     """Return the sum of the four lower 12-bit fields of a hash, less its mean."""
     total = (z & _FIELD) + ((z >> _12) & _FIELD) + ((z >> _24) & _FIELD) + ((z >> _36) & _FIELD)

@@ -3,7 +3,7 @@
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 
 TINY = Settings(
-    array=Array(layout="line", positions_m=tuple((0.0, 0.004 * mic, 0.0) for mic in range(3)), word_bits=8),
+    array=Array(layout="line", positions_m=tuple((0.0, 0.004 * mic, 0.0) for mic in range(2)), word_bits=8),
     call=Call(duration_s=3e-4),
     recording=Recording(n_samples=12_288),
     processing=Processing(directions="2d:9", range_m=(0.25, 0.38), range_decimation=50, decimation=10),

@@ -27,7 +27,7 @@ def test_image_is_the_processors(pair):
     measurement = noise(cuda.settings)
     images = [pipeline.process(measurement).energy for pipeline in (cpu, cuda)]
     assert images[0].any()
-    assert reference.error_db(*images) < bound_db
+    assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_image_goes_where_it_is_wanted(cuda):
 def test_signals_and_analytic_signals_are_the_processors():
     settings = PLANS["float32"][0]
     words = noise(settings).words.reshape(-1, 1)
-    signals = 0.5 * np.random.default_rng(3).standard_normal((3, settings.recording.n_samples))
+    signals = 0.5 * np.random.default_rng(3).standard_normal((2, settings.recording.n_samples))
     found = {}
     for device in ("cpu", "cuda"):
         chain = FastChain(settings, kernels.load(device), threads=1)
