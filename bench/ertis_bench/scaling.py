@@ -21,8 +21,9 @@ SERIES: dict[str, tuple[float, ...]] = {
     "directions": (90, 250, 500, 1000, 1850, 3000, 6000),
     "last_range_m": (1.0, 2.0, 3.0, 4.0, 5.0),
     "microphones": (8, 16, 32, 64, 128),
+    "batch": (1, 2, 4, 8, 16),
 }
-"""What is varied; everything else stays at 1850 directions, 0.5-5 m, 32 microphones, all threads, the default plan."""
+"""What is varied; all else stays at 1850 directions, 0.5-5 m, 32 microphones, all threads, the default plan."""
 
 _FIRST_RANGE_M = 0.5
 _APERTURE_M = 0.1
@@ -74,17 +75,23 @@ def _precisions() -> list[str]:
 
 def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
     """Yield a row per value; the values take turns, so that a drift does not look like a trend."""
-    subjects, n_ranges = {}, {}
+    subjects: dict[str, Callable[[], object]] = {}
+    n_ranges: dict[str, int] = {}
     for value in _thread_counts() if series == "threads" else SERIES[series]:
         threads = int(value) if series == "threads" else None
         settings, n_words = _settings(plan, **{**_BASE, **({series: value} if series in _BASE else {})})
         pipeline, measurement = Pipeline(settings, "cpu", threads), subject.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
         checks.require_exact(image, measurement)
-        subjects[f"{value:g}"] = functools.partial(pipeline.process, measurement, out=image.energy)
+        subject_of: Callable[[], object] = functools.partial(pipeline.process, measurement, out=image.energy)
+        if series == "batch":
+            subject_of = functools.partial(pipeline.process_batch, [measurement] * int(value))
+            checks.require_exact(pipeline.process_batch([measurement] * int(value))[-1], measurement)
+        subjects[f"{value:g}"] = subject_of
         n_ranges[f"{value:g}"] = image.energy.shape[1]
     for name, times_ms in timing.round_robin(subjects, count=count).items():
-        yield {"value": float(name), "n_ranges": n_ranges[name], **timing.summary(times_ms)}
+        each_ms = times_ms / float(name) if series == "batch" else times_ms
+        yield {"value": float(name), "n_ranges": n_ranges[name], **timing.summary(each_ms)}
 
 
 def _thread_counts() -> list[int]:

@@ -528,8 +528,8 @@ class Memory(Protocol):
         """Return a new array where kernels read and write it."""
         ...
 
-    def image(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return a new array of the host into which `Lane.fetch` is fast; it holds anything."""
+    def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Return an array of the host that nobody else looks at, into which `Lane.fetch` is fast; it holds anything."""
         ...
 
     def lane(self) -> Lane:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.kernels._contract import Array
+from ertis_numba.kernels._images import Images
 
 __all__ = ["HostMemory"]
 
@@ -50,6 +51,7 @@ class HostMemory:
 
     def __init__(self, *, graphs: bool = False) -> None:
         del graphs  # there is nothing that launching would cost
+        self._images = Images(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """See `Memory.table`."""
@@ -59,9 +61,9 @@ class HostMemory:
         """See `Memory.zeros`."""
         return np.zeros(shape, dtype)
 
-    def image(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
         """See `Memory.image`."""
-        return np.empty(shape, np.float32)
+        return self._images.take(shape)
 
     def lane(self) -> _HostLane:
         """See `Memory.lane`."""
@@ -69,3 +71,4 @@ class HostMemory:
 
     def close(self) -> None:
         """See `Memory.close`."""
+        self._images.close()

@@ -1,7 +1,5 @@
 """What a pipeline keeps on the GPU, and the pinned memory of the host that its images arrive in."""
 
-import threading
-import weakref
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -13,11 +11,11 @@ from numpy.typing import DTypeLike, NDArray
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract import Array
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
+from ertis_numba.kernels._images import Images
 
 __all__ = ["CudaMemory"]
 
 _OUT_OF_MEMORY: Final = 2  # CUDA_ERROR_OUT_OF_MEMORY
-_MOST_PINNED = 8  # images: the operating system cannot page out what is pinned, so a user who keeps all gets plain ones
 
 
 class CudaMemory:
@@ -28,7 +26,7 @@ class CudaMemory:
     def __init__(self, *, graphs: bool = False) -> None:
         self._graphs = graphs
         self._bytes = 0
-        self._images = _Images()
+        self._images = Images(lambda shape: cuda.pinned_array(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """See `Memory.table`."""
@@ -39,7 +37,7 @@ class CudaMemory:
         """See `Memory.zeros`."""
         return self.table(np.zeros(shape, dtype))
 
-    def image(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
         """See `Memory.image`."""
         return self._images.take(shape)
 
@@ -79,42 +77,3 @@ class CudaMemory:
             ) from error
         self._bytes += n_bytes
         return made
-
-
-class _Lease:
-    """What an image refers to as long as anybody looks at it, or at a part of it."""
-
-    def __init__(self, pinned: NDArray[np.float32]) -> None:
-        self.__array_interface__ = pinned.__array_interface__
-
-
-class _Images:
-    """Pinned arrays, handed out again when nobody looks at them any more; pinning takes longer than an image."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._spare: list[NDArray[np.float32]] = []
-        self._n_pinned = 0
-        self._closed = False
-
-    def take(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        with self._lock:
-            pinned = self._spare.pop() if self._spare else None
-            if pinned is None and self._n_pinned == _MOST_PINNED:
-                return np.empty(shape, np.float32)
-            self._n_pinned += pinned is None
-        if pinned is None or pinned.shape != shape:
-            pinned = cuda.pinned_array(shape, np.float32)
-        lease = _Lease(pinned)
-        weakref.finalize(lease, self._give_back, pinned).atexit = False
-        return np.asarray(lease)
-
-    def close(self) -> None:
-        with self._lock:
-            self._closed = True
-            self._spare.clear()
-
-    def _give_back(self, pinned: NDArray[np.float32]) -> None:
-        with self._lock:
-            if not self._closed:
-                self._spare.append(pinned)
