@@ -35,7 +35,7 @@ class Pipeline:
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
         Error that the images may have; that of ``settings.accuracy`` by default.
     graphs : bool
-        Whether a GPU records the chain as a CUDA graph, which saves the processor the launches. Of no effect elsewhere.
+        Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Pipeline:
     ------
     ArgumentError
         The settings name a layout, grid or range that cannot be used, no plan keeps the error, or the device is
-        unknown.
+        unknown or has no graphs.
     DeviceError
         The device cannot be used here, or has too little memory.
 
@@ -126,8 +126,8 @@ class Pipeline:
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, bit by bit as `process` gives them.
 
-        This is faster than one at a time: a GPU takes one measurement in, works on another and gives back a third at
-        the same time, and the cores of a processor each take a measurement of their own.
+        A GPU takes one measurement in, works on another and gives back a third at the same time. The cores of a
+        processor each take a measurement of their own, if there are as many; fewer go one after the other.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class Pipeline:
         return [self._energyscape(energy, measurement) for energy, measurement in zip(energies, batch, strict=True)]
 
     def close(self) -> None:
-        """Give back the memory of the device now; `process` is over. Images that were made stay."""
+        """Give back the memory of the device now; no thread may be processing. Images that were made stay."""
         if not self._closed:
             self._closed = True
             self._chain.close()

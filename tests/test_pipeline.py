@@ -180,6 +180,12 @@ def test_batch_with_a_wrong_measurement_processes_none():
         Pipeline(SHORT).process_batch([noise(SHORT), wrong])
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_graphs_are_refused_where_there_are_none(device):
+    with pytest.raises(ArgumentError, match="graphs is True, and only device 'cuda' has CUDA graphs"):
+        Pipeline(SHORT, device, graphs=True)
+
+
 def test_empty_batch_gives_no_images():
     assert Pipeline(SHORT).process_batch([]) == []
 

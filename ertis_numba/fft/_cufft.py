@@ -46,10 +46,11 @@ class CufftTransforms:
         # CuPy's views keep Numba's arrays alive, and cuFFT's plans take no others.
         self._real, self._bins, self._both = (cupy.asarray(array) for array in (signals, self._spectra, analytic))
         try:
-            with self._stream:
+            # Not from CuPy's pool, which would keep the work areas when the plans are gone.
+            with self._stream, cupy.cuda.using_allocator(None):
                 self._forward = cufft.Plan1d(n, cufft.CUFFT_R2C, n_mics)
                 self._inverse = cufft.Plan1d(n_out, cufft.CUFFT_C2C, n_mics * n_phases)
-        except cupy.cuda.memory.OutOfMemoryError as error:
+        except (cupy.cuda.memory.OutOfMemoryError, cupy.cuda.runtime.CUDARuntimeError, cufft.CuFFTError) as error:
             raise DeviceError(
                 f"device 'cuda' has no room for transforms of {n_mics * n_phases} rows of {n_out} samples ({error}); "
                 "give a shorter processing.range_m or less accuracy.oversampling, or use device 'cpu'"

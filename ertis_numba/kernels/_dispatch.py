@@ -48,7 +48,10 @@ def load(device: str = "auto") -> KernelSet:
         kernels: KernelSet = importlib.import_module(DEVICES[device]).KERNELS
     except DeviceError:
         raise
-    except ImportError as error:  # Numba has announced to drop its CUDA target; numba-cuda is where it lives on
+    except ImportError as error:
+        if device != "cuda":
+            raise
+        # Numba has announced to drop its own CUDA target; numba-cuda is where it lives on.
         raise DeviceError(
             f"device {device!r} cannot be loaded ({error}); use device 'cpu', or install ertis-numba[cu12] or [cu13]"
         ) from error

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ertis_numba.kernels._contract import Array
+from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels._images import Images
+from ertis_numba.kernels._memory import Array
 
 __all__ = ["HostMemory"]
 
@@ -50,7 +51,8 @@ class HostMemory:
     n_lanes = 1
 
     def __init__(self, *, graphs: bool = False) -> None:
-        del graphs  # there is nothing that launching would cost
+        if graphs:
+            raise ArgumentError("graphs is True, and only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
         self._images = Images(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:

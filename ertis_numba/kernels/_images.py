@@ -36,21 +36,19 @@ class Images:
         self._make = make
         self._lock = threading.Lock()
         self._spare: list[NDArray[np.float32]] = []
-        self._bytes = self._count = 0
+        self._count = 0
         self._closed = False
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Return an array, always of the same shape, that nobody looks at and that holds anything."""
-        n_bytes = 4 * shape[0] * shape[1]
         with self._lock:
             array = self._spare.pop() if self._spare else None
             if array is None:
-                if self._closed or self._count == _MOST or self._bytes + n_bytes > _MOST_BYTES:
+                n_bytes = 4 * shape[0] * shape[1]
+                if self._closed or self._count == _MOST or (self._count + 1) * n_bytes > _MOST_BYTES:
                     return np.empty(shape, np.float32)
+                array = self._make(shape)
                 self._count += 1
-                self._bytes += n_bytes
-        if array is None:
-            array = self._make(shape)
         lease = _Lease(array)
         weakref.finalize(lease, self._give_back, array).atexit = False
         return np.asarray(lease)

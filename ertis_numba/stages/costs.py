@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Self
 
@@ -126,7 +126,7 @@ def costs_of(kernels: KernelSet, threads: int) -> Costs:
     """Return the costs of a device on this machine; measured at the first time and kept in `cache_file`."""
     if kernels.simulated:
         return Costs(_NOMINAL)
-    key = (f"{kernels.device}-{kernels.hardware.replace(' ', '-')}" if kernels.hardware else kernels.device, threads)
+    key = (kernels.device, threads, kernels.hardware)
     with _ONE_AT_A_TIME:  # two that measured at once would measure each other
         if key not in _KNOWN:
             path = cache_file(*key)
@@ -134,7 +134,7 @@ def costs_of(kernels: KernelSet, threads: int) -> Costs:
         return _KNOWN[key]
 
 
-# Where kernels are only simulated: what docs/cuda.md predicts of a large GPU.
+# Where kernels are only simulated: guesses of a large GPU, which choose a plan and tell no times.
 _NOMINAL: dict[str, float] = {
     "call": 1e-5,
     "demodulate_16": 5e-12,
@@ -152,15 +152,23 @@ _NOMINAL: dict[str, float] = {
     "image": 1e-12,
 }
 _ONE_AT_A_TIME = threading.Lock()
-_KNOWN: dict[tuple[str, int], Costs] = {}
+_KNOWN: dict[tuple[str, int, str], Costs] = {}
 
 
-def cache_file(device: str, threads: int) -> Path:
-    """Return where the costs of a device are kept; take the file away to have them measured again."""
+def cache_file(device: str, threads: int, hardware: str = "") -> Path:
+    """Return where the costs of a device are kept; take the file away to have them measured again.
+
+    Costs are those of the machine, of a GPU if ``hardware`` names one, and of the libraries' versions.
+    """
     machine = [platform.machine(), platform.processor(), platform.node(), os.environ.get("NUMBA_CPU_NAME", "")]
     with suppress(OSError):
         machine.append(Path("/proc/cpuinfo").read_text("utf-8").partition("\n\n")[0].partition("model name")[2][:80])
     versions = [version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")]
+    if hardware:
+        machine.append(hardware)
+        for name in ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x"):
+            with suppress(PackageNotFoundError):
+                versions.append(version(name))
     digest = hashlib.sha256("\n".join([*machine, *versions, *_UNITS]).encode()).hexdigest()[:12]
     folder = os.environ.get("ERTIS_CACHE_DIR") or platformdirs.user_cache_dir("ertis-numba", appauthor=False)
     return Path(folder) / f"costs-{device}-{threads}-{digest}.json"

@@ -194,22 +194,33 @@ class FastChain:
     ) -> None:
         """Do as `process` for several measurements: on a GPU in lanes, on the host side by side with a thread each.
 
-        Without an array in ``outs`` to fill, an image stays on the GPU.
+        Without an array in ``outs`` to fill, an image is left where the GPU made it, until the lane's next one.
         """
+        pairs = list(zip(words, outs, strict=True))
         if self._memory.n_lanes == 1:
-            with ThreadPoolExecutor(self._threads) as pool:
-                # Threads of one kernel wait for each other after every stage; those of different measurements never.
-                deque(pool.map(lambda each, out: self._finish(self._begin(each, out, 1)), words, outs), maxlen=0)
+            self._side_by_side(pairs)
             return
         under_way: deque[_Buffers] = deque()
         try:
-            for each, out in zip(words, outs, strict=True):
+            for each, out in pairs:
                 if len(under_way) == self._memory.n_lanes:
                     self._finish(under_way.popleft())
                 under_way.append(self._begin(each, out, self._threads))
         finally:
             while under_way:
                 self._finish(under_way.popleft())
+
+    def _side_by_side(self, pairs: list[tuple[NDArray[np.unsignedinteger[Any]], NDArray[np.float32] | None]]) -> None:
+        """Process with a thread for each measurement: threads of one kernel wait for each other after every stage."""
+        if len(pairs) < self._threads or self._threads == 1:
+            for each, out in pairs:
+                self._finish(self._begin(each, out, self._threads))
+        else:
+            deque(self._pool.map(lambda pair: self._finish(self._begin(pair[0], pair[1], 1)), pairs), maxlen=0)
+
+    @functools.cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
 
     def analytic(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]

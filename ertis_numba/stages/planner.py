@@ -411,7 +411,7 @@ class Planner:
     @property
     def costs_file(self) -> Path:
         """Where the costs are kept that predict times; taken away, they are measured again."""
-        return cache_file(self._kernels.device, self._threads)
+        return cache_file(self._kernels.device, self._threads, self._kernels.hardware)
 
     @property
     def _nearest_m(self) -> float:

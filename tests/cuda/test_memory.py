@@ -86,6 +86,20 @@ def test_too_little_memory_is_told_with_how_much_and_what_to_do(monkeypatch, n_b
     assert "give fewer directions, a shorter processing.range_m or less accuracy.oversampling" in text
 
 
+@pytest.mark.parametrize("use", [lambda lane, _: lane.send(np.zeros(5)), lambda _, memory: memory.image((3, 4))])
+def test_memory_that_cannot_be_pinned_is_told(monkeypatch, use):
+    def full(*_):
+        raise CudaAPIError(2, "CUDA_ERROR_OUT_OF_MEMORY")
+
+    memory = kernels.load("cuda").memory()
+    lane = memory.lane()
+    monkeypatch.setattr(cuda, "pinned_array", full)
+    with pytest.raises(DeviceError, match="the host cannot pin 0 MB for device 'cuda'; raise its limit"):
+        use(lane, memory)
+    monkeypatch.undo()
+    assert [memory.image((3, 4)).shape for _ in range(9)] == [(3, 4)] * 9
+
+
 def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
     def broken(*_):
         raise CudaAPIError(700, "CUDA_ERROR_ILLEGAL_ADDRESS")

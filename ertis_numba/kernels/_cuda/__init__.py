@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import KernelSet, NewMemory
+from ertis_numba.kernels._contract import KernelSet
 from ertis_numba.kernels._cuda.add_paths import add_paths
 from ertis_numba.kernels._cuda.combine_capon import combine_capon
 from ertis_numba.kernels._cuda.combine_coherence import combine_coherence
@@ -24,6 +24,7 @@ from ertis_numba.kernels._cuda.multiply_spectra import multiply_spectra
 from ertis_numba.kernels._cuda.quantise_tiles import quantise_tiles
 from ertis_numba.kernels._cuda.remove_group_delay import remove_group_delay
 from ertis_numba.kernels._cuda.unpack_bits import unpack_bits
+from ertis_numba.kernels._memory import NewMemory
 
 __all__ = ["kernel_set"]
 

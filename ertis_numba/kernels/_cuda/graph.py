@@ -23,19 +23,16 @@ class Graph:
 
         self._stream = cupy.cuda.Stream.from_external(stream)
         self._graph: Any = None
-        self._warm = False
 
     def run(self, steps: Callable[[], None]) -> None:
         """Launch the steps: one by one the first time, which compiles kernels and makes arrays, then as a graph."""
-        if not self._warm:
-            steps()
-            self._warm = True
+        if self._graph is not None:
+            self._graph.launch(self._stream)
             return
-        if self._graph is None:
-            with self._stream:
-                self._stream.begin_capture()
-                try:
-                    steps()
-                finally:
-                    self._graph = self._stream.end_capture()
-        self._graph.launch(self._stream)
+        steps()
+        with self._stream:
+            self._stream.begin_capture()
+            try:
+                steps()
+            finally:
+                self._graph = self._stream.end_capture()

@@ -31,16 +31,23 @@ class Lane:
     ----------
     stream : numba.cuda.Stream or 0
         0 is the stream that waits for all others.
-    allocate : callable
-        Shape and type to a new array of the device.
+    allocate, pin : callable
+        Shape and type to a new array, of the device and of the host's pinned memory.
     graphs : bool
         Whether `run` records its steps as a CUDA graph. Without, launching costs the processor some ten
         microseconds per kernel.
     """
 
-    def __init__(self, stream: Any = 0, allocate: Allocate = cuda.device_array, *, graphs: bool = False) -> None:
+    def __init__(
+        self,
+        stream: Any = 0,
+        allocate: Allocate = cuda.device_array,
+        pin: Allocate = cuda.pinned_array,
+        *,
+        graphs: bool = False,
+    ) -> None:
         self.stream = stream
-        self._allocate = allocate
+        self._allocate, self._pin = allocate, pin
         self._rooms: dict[str, Any] = {}
         self._staged: dict[tuple[tuple[int, ...], str], tuple[NDArray[Any], Any]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
@@ -61,7 +68,7 @@ class Lane:
         kind = (array.shape, array.dtype.str)
         if kind not in self._staged:
             # Only from pinned memory does a copy run beside the kernels of other lanes.
-            self._staged[kind] = cuda.pinned_array(array.shape, array.dtype), self._allocate(array.shape, array.dtype)
+            self._staged[kind] = self._pin(array.shape, array.dtype), self._allocate(array.shape, array.dtype)
         staged, here = self._staged[kind]
         np.copyto(staged, array)
         here.copy_to_device(staged, stream=self.stream)

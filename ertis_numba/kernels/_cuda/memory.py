@@ -9,9 +9,9 @@ from numba.cuda.cudadrv.driver import CudaAPIError
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._contract import Array
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
 from ertis_numba.kernels._images import Images
+from ertis_numba.kernels._memory import Array
 
 __all__ = ["CudaMemory"]
 
@@ -26,7 +26,7 @@ class CudaMemory:
     def __init__(self, *, graphs: bool = False) -> None:
         self._graphs = graphs
         self._bytes = 0
-        self._images = Images(lambda shape: cuda.pinned_array(shape, np.float32))
+        self._images = Images(lambda shape: self._pinned(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """See `Memory.table`."""
@@ -43,7 +43,7 @@ class CudaMemory:
 
     def lane(self) -> Lane:
         """See `Memory.lane`."""
-        return Lane(cuda.stream(), self._array, graphs=self._graphs)
+        return Lane(cuda.stream(), self._array, self._pinned, graphs=self._graphs)
 
     def close(self) -> None:
         """See `Memory.close`."""
@@ -52,8 +52,26 @@ class CudaMemory:
             cuda.current_context().deallocations.clear()  # Numba puts them off otherwise
 
     def _array(self, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
-        n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        return self._made(n_bytes, lambda: cuda.device_array(shape, dtype))
+        return self._made(_bytes_of(shape, dtype), lambda: cuda.device_array(shape, dtype))
+
+    def _pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """Return an array of the host that cannot be paged out.
+
+        Raises
+        ------
+        DeviceError
+            It does not fit.
+        """
+        try:
+            array: NDArray[Any] = cuda.pinned_array(shape, dtype)
+        except CudaAPIError as error:
+            if int(error.args[0]) != _OUT_OF_MEMORY:
+                raise
+            raise DeviceError(
+                f"the host cannot pin {_bytes_of(shape, dtype) / 1e6:,.0f} MB for device 'cuda'; raise its limit of "
+                "locked memory, close other pipelines, or use device 'cpu'"
+            ) from error
+        return array
 
     def _made(self, n_bytes: int, make: Callable[[], Any]) -> Any:
         """Return what ``make`` allocates, counted.
@@ -77,3 +95,7 @@ class CudaMemory:
             ) from error
         self._bytes += n_bytes
         return made
+
+
+def _bytes_of(shape: tuple[int, ...], dtype: DTypeLike) -> int:
+    return int(np.prod(shape)) * np.dtype(dtype).itemsize
