@@ -104,7 +104,6 @@ def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> d
     (found,) = gpu["rows"]
     when = dt.datetime.now(dt.UTC)
     report: dict[str, Any] = {
-        "format": 1,
         "date": when.isoformat(timespec="seconds"),
         "revision": _revision(),
         "gpu": found,

@@ -70,8 +70,8 @@ class Scale:
     streams : int
     rivals : int
         Measurements of each rival.
-    ceilings : dict
-        As for `ceilings.ceilings`.
+    ceilings : tuple of (str, int)
+        Names and values of further parameters of `ceilings.ceilings`.
     """
 
     subject: Callable[[], tuple[Measurement, str]] = subject.measurement

@@ -11,22 +11,25 @@ __all__ = ["gpu", "gpu_short"]
 _UNMEASURED = "not measured"
 _PUBLISHED = "GPU GTX 1080 Ti"
 _STREAMS = ("to the host, plain", "to the host, graphs", "stay on the GPU, plain", "stay on the GPU, graphs")
-_CHECKS = ("tests", "memcheck", "racecheck")
+_ONE_AT_A_TIME, _STREAMED = "one at a time, words to image", f"streamed, images {_STREAMS[0]}"
+_PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
 
 
 def gpu(report: dict[str, Any]) -> str:
     """Return all that was measured on a GPU; that nothing was, where the report is empty."""
     if not report:
-        return f"{_times({})}\n\nNo results of a GPU are in the repository: `make gpu` measures them."
-    parts = [_times(report), _stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
-    return "\n\n".join([*(part for part in parts if part), _CONDITIONS.format(**report)])
+        return f"{_times(_lines({}))}\n\n{_NO_RESULTS}"
+    parts = [_stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
+    return "\n\n".join([_times(_lines(report)), *(part for part in parts if part), _CONDITIONS.format(**report)])
 
 
 def gpu_short(report: dict[str, Any]) -> str:
-    """Return the times of the paper's grids."""
+    """Return the times of the paper's grids, launched and one at a time, in a stream, and the paper's."""
     if not report:
-        return _times({})
-    return f"{_times(report)}\n\nMedians on {report['gpu']['name']}, {report['date'][:10]}; docs/cuda.md has the rest."
+        return "No GPU has run the kernels yet: they are simulated and compiled, and nothing is measured."
+    lines = _lines(report)
+    times = _times({name: lines[name] for name in (_ONE_AT_A_TIME, _STREAMED, _PAPER)})
+    return f"{times}\n\nMedians on {report['gpu']['name']}, {report['date'][:10]}; docs/cuda.md has the rest."
 
 
 def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
@@ -34,15 +37,15 @@ def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
     return found
 
 
-def _times(report: dict[str, Any]) -> str:
+def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
     """Return the times of a measurement by grid; a grid that was not measured says so."""
     rows = {row["directions"]: row for row in _rows(report, "paper")}
     lines: dict[str, list[str]] = {
-        "one at a time, words to image": [],
+        _ONE_AT_A_TIME: [],
         "the same as a CUDA graph": [],
         "on the GPU alone, without transfers": [],
         **{f"streamed, images {name}": [] for name in _STREAMS},
-        f"the paper's {_PUBLISHED.removeprefix('GPU ')}": [],
+        _PAPER: [],
         "times faster than that": [],
     }
     for directions, published in zip(DIRECTIONS, PUBLISHED_MS[_PUBLISHED], strict=True):
@@ -51,6 +54,10 @@ def _times(report: dict[str, Any]) -> str:
         faster = "–" if row is None else f"{row['times_faster_than_published']:.0f}×"
         for line, cell in zip(lines.values(), [*cells, f"{published[0]:.2f}", faster], strict=True):
             line.append(cell)
+    return lines
+
+
+def _times(lines: dict[str, list[str]]) -> str:
     head = ["ms per measurement, median", *(f"{n} directions" for n in DIRECTIONS)]
     return table(head, [[name, *cells] for name, cells in lines.items()])
 
@@ -157,6 +164,8 @@ def _machine(report: dict[str, Any]) -> str:
     )
 
 
+_NO_RESULTS = """\
+No GPU has run these kernels yet: `make gpu` would fill this table, and confirm the predictions below or refute them."""
 _CONDITIONS = """\
 {date}, revision {revision}, the measurement is {source}, 0.5–5 m, the plan that settings without any wish give on this
 GPU. Images are checked before they are timed: against the exact one, the processor's of the same plan, and a rival's

@@ -110,14 +110,36 @@ def _distinct_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
     return float(line * len(np.unique(np.concatenate([first + k for k in range(int((last - first).max()) + 1)]))))
 
 
-_TERMS: Final = Loop("term", lambda given: int(given["n_terms"]), 6, 2 + 4 * 3, 2, 4, _of_terms)
+_TERMS: Final = Loop(
+    of="term",
+    passes=lambda given: int(given["n_terms"]),
+    loads=6,
+    lines=2 + 4 * 3,
+    chain=2,
+    points=4,
+    fetched=_of_terms,
+)
 LOOPS: Final = {
     "delay_and_sum_envelope.fill": _TERMS,
     "delay_and_sum.fill": _TERMS,
     "interpolated_beams_envelope.interpolate": Loop(
-        "pair of nodes", lambda given: int(given["n_pairs"]), 10, 2 + 8 * 2, 2, 4, _of_nodes
+        of="pair of nodes",
+        passes=lambda given: int(given["n_pairs"]),
+        loads=10,
+        lines=2 + 8 * 2,
+        chain=2,
+        points=4,
+        fetched=_of_nodes,
     ),
-    "demodulate_words.sum_taps": Loop("tap", lambda given: int(given["taps"].size), 2, 2, 1, 1, _of_words),
+    "demodulate_words.sum_taps": Loop(
+        of="tap",
+        passes=lambda given: int(given["taps"].size),
+        loads=2,
+        lines=2,
+        chain=1,
+        points=1,
+        fetched=_of_words,
+    ),
 }
 """Kernels that spend their time in a loop, by name."""
 

@@ -8,7 +8,6 @@ __all__ = ["ptx"]
 
 _LOOP = ("loads", "multiply-adds", "integer", "others")
 _PARTS = ("instructions", "first cache", "second cache", "memory", "waiting")
-_UNMEASURED = "not measured"
 _ASSUMED = """\
 Counted in code for compute capability 9.0 ({made}). Times are arithmetic:
 
@@ -67,13 +66,12 @@ def _launches(plan: dict[str, Any]) -> str:
             str(row["resident_warps"]),
             *(f"{row['parts_us'][name]:.1f}" for name in _PARTS),
             _range(row["least_us"], row["us"]),
-            _UNMEASURED,
         ]
         for row in plan["launches"]
     ]
     empty = ["–"] * (len(head) - 1)
-    rows += [[row["name"], *empty, f"{row['us']:.1f}", _UNMEASURED] for row in plan["transforms"]]
-    return table([*head, "predicted, µs", "measured, µs"], rows)
+    rows += [[row["name"], *empty, f"{row['us']:.1f}"] for row in plan["transforms"]]
+    return table([*head, "predicted, µs"], rows)
 
 
 def _by(sizes: list[int]) -> str:
@@ -103,17 +101,14 @@ def _loops(loops: list[dict[str, Any]]) -> str:
 
 def _totals(report: dict[str, Any]) -> str:
     plans, goals = report["plans"], report["goals"]
-    head = ["predicted", *(f"{plan['directions']}, {plan['plan']}" for plan in plans), "goal", "measured"]
-    rows = [
-        [f"{name}, µs", *(f"{plan['times_us'][name]:.1f}" for plan in plans), "", _UNMEASURED]
-        for name in plans[0]["times_us"]
-    ]
+    head = ["predicted", *(f"{plan['directions']}, {plan['plan']}" for plan in plans), "goal"]
+    rows = [[f"{name}, µs", *(f"{plan['times_us'][name]:.1f}" for plan in plans), ""] for name in plans[0]["times_us"]]
     one = [f"{plan['one_ms']:.2f}" for plan in plans]
-    rows.append(["one measurement, words to image, ms", *one, f"≤ {goals['one_ms']:g}", _UNMEASURED])
+    rows.append(["one measurement, words to image, ms", *one, f"≤ {goals['one_ms']:g}"])
     for name in plans[0]["per_second"]:
         goal = f"≥ {goals['streamed_per_s']:,.0f}" if name == "images left on the GPU" else ""
         rates = [f"{plan['per_second'][name]:,}" for plan in plans]
-        rows.append([f"measurements per second, {name}", *rates, goal, _UNMEASURED])
+        rows.append([f"measurements per second, {name}", *rates, goal])
     return f"{table(head, rows)}\n\n{_ceiling(report['ceiling'], goals['of_ceiling'])}"
 
 
@@ -124,7 +119,7 @@ def _ceiling(ceiling: dict[str, Any], goal: float) -> str:
         f"`delay_and_sum_envelope` of 3000 direct beams, {ceiling['points'] / 1e6:.0f} million points: ceilings are "
         f"{limits} (a sample of 8 bytes, four multiply-adds). Predicted: {_range(ceiling['least_us'], ceiling['us'])} "
         f"µs, {100 * most:.0f} % of the tighter one if blocks find in the first cache what others have fetched, and "
-        f"{100 * least:.0f} % if none does; wanted are {100 * goal:.0f} %. Measured: {_UNMEASURED}."
+        f"{100 * least:.0f} % if none does; wanted are {100 * goal:.0f} %."
     )
 
 

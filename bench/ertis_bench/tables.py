@@ -104,10 +104,7 @@ def paper(report: dict[str, Any]) -> str:
     columns = [f"{n} directions" for n in DIRECTIONS]
     return "\n\n".join(
         [
-            _table(
-                ["ms, mean ± std (median)", *columns],
-                [*measured, ["`cuda`", *["not measured"] * len(DIRECTIONS)]],
-            ),
+            _table(["ms, mean ± std (median)", *columns], measured),
             _table(["times faster than `scipy`, by medians", *columns], ratios),
             _table(["the paper's own, ms, mean ± std", *columns], published),
             f"Measured on {sentence(report['machine'])}",

@@ -1,10 +1,12 @@
-"""Arithmetic of one number at a time, which the kernels of the processor and those of the GPU share.
+"""Arithmetic of one number at a time, compiled into the kernel that calls it, for its device.
 
-No function here knows arrays or threads: what is written here is compiled into the caller, for its device.
+`power`, `magnitude`, `coherent_level`, `between` and the constants serve kernels of the processor and of the GPU. All
+else is for the GPU only: complex numbers that are one load, roots, hashes.
 
-Compilers may fuse a product and a sum. Of ``a b + c d`` either product may be fused, with other bits, and which of them
-is decided anew each time; of ``(e + a b) + c d`` both are. Kernels are written in the second way, whose bits are the
-same whether a kernel was just compiled or comes from Numba's cache.
+Compilers may fuse a product and a sum. Of ``a b + c d`` either product may be fused, with other bits, and on the
+processor it is decided anew each time which of them; of ``(e + a b) + c d`` both are. What runs there is written in the
+second way, whose bits are the same whether a kernel was just compiled or comes from Numba's cache. GPUs' kernels need
+not be: one compiler makes their code, always the same.
 """
 
 import math

@@ -4,13 +4,12 @@ import numpy as np
 from numba import cuda
 
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, WARP
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARP, WARPS_1, WARPS_2
 from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of
 
-__all__ = ["TILE_RANGES", "delay_and_sum_envelope_int16", "sum_short_terms"]
+__all__ = ["TILE_RANGES", "delay_and_sum_envelope_int16", "store_tile", "sum_short_terms"]
 
 TILE_RANGES = 3 * WARP
-_ONE, _1, _2 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP)
 
 
 @cuda.jit(device=True)
@@ -23,24 +22,37 @@ def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
     entry = direction * n_terms
     end = entry + n_terms
     while entry < end:
-        upper, lower = weights[entry + entry], weights[entry + entry + _ONE]
+        upper, lower = weights[entry + entry], weights[entry + entry + ONE]
         at = np.uint32(place + offsets[entry])
-        entry += _ONE
+        entry += ONE
         p, q, s, t = short_real_of(upper), short_imag_of(upper), short_real_of(lower), short_imag_of(lower)
         # Of 32 bits each time: Numba's own sums of 32 bits have 64.
         x = samples[at]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
         a_real = np.int32(np.int32(a_real + p * x_real) + q * x_imag)
         a_imag = np.int32(np.int32(a_imag + s * x_real) + t * x_imag)
-        x = samples[at + _1]
+        x = samples[at + WARPS_1]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
         b_real = np.int32(np.int32(b_real + p * x_real) + q * x_imag)
         b_imag = np.int32(np.int32(b_imag + s * x_real) + t * x_imag)
-        x = samples[at + _2]
+        x = samples[at + WARPS_2]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
         c_real = np.int32(np.int32(c_real + p * x_real) + q * x_imag)
         c_imag = np.int32(np.int32(c_imag + s * x_real) + t * x_imag)
     return a_real, a_imag, b_real, b_imag, c_real, c_imag
+
+
+@cuda.jit(device=True)
+def store_tile(out, row, start, stop, scale, sums):
+    """Write the magnitudes of a thread's sums of a tile from range ``start`` on, as far as they lie before ``stop``."""
+    a_real, a_imag, b_real, b_imag, c_real, c_imag = sums
+    r, end = np.uint64(start + cuda.threadIdx.x), np.uint64(stop)
+    if r < end:
+        out[row, r] = magnitude(np.float32(a_real), np.float32(a_imag)) * scale
+    if r + WARPS_1 < end:
+        out[row, r + WARPS_1] = magnitude(np.float32(b_real), np.float32(b_imag)) * scale
+    if r + WARPS_2 < end:
+        out[row, r + WARPS_2] = magnitude(np.float32(c_real), np.float32(c_imag)) * scale
 
 
 @cuda.jit(cache=True)
@@ -50,17 +62,8 @@ def _fill(samples, per_tile, scales, starts, stop, offsets, weights, n_terms, we
         return
     tile = np.uint64(cuda.blockIdx.y)
     place = cuda.blockIdx.y * np.int64(per_tile) + cuda.threadIdx.x
-    a_real, a_imag, b_real, b_imag, c_real, c_imag = sum_short_terms(
-        samples, offsets, weights, np.uint64(n_terms), direction, place
-    )
-    scale = np.float32(scales[tile] * weight_scale)
-    r, end = np.uint64(starts[tile] + cuda.threadIdx.x), np.uint64(stop)
-    if r < end:
-        out[direction, r] = magnitude(np.float32(a_real), np.float32(a_imag)) * scale
-    if r + _1 < end:
-        out[direction, r + _1] = magnitude(np.float32(b_real), np.float32(b_imag)) * scale
-    if r + _2 < end:
-        out[direction, r + _2] = magnitude(np.float32(c_real), np.float32(c_imag)) * scale
+    sums = sum_short_terms(samples, offsets, weights, np.uint64(n_terms), direction, place)
+    store_tile(out, direction, starts[tile], stop, np.float32(scales[tile] * weight_scale), sums)
 
 
 def delay_and_sum_envelope_int16(tiles, scales, starts, stop, offsets, weights, weight_scale, out):

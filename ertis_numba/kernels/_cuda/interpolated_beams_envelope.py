@@ -5,19 +5,17 @@ from numba import cuda
 
 from ertis_numba.kernels._cuda.delay_and_sum import beams_from
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, TILE, WARP, beam_grid
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, TILE, WARPS_1, WARPS_2, WARPS_3, beam_grid
 from ertis_numba.kernels._scalar import imag_of, magnitude, real_of
 
 __all__ = ["interpolated_beams_envelope"]
-
-_ONE, _1, _2, _3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
 
 
 @cuda.jit(device=True)
 def _add_node(nodes, at, weight, sums):
     """Return the sums of both parts of four ranges, a warp apart, with a node's added."""
     a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag = sums
-    a, b, c, d = nodes[at], nodes[at + _1], nodes[at + _2], nodes[at + _3]
+    a, b, c, d = nodes[at], nodes[at + WARPS_1], nodes[at + WARPS_2], nodes[at + WARPS_3]
     return (
         a_real + weight * real_of(a),
         a_imag + weight * imag_of(a),
@@ -44,7 +42,7 @@ def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, 
     while entry < end_entry:
         at = np.uint64(np.uint32(places[entry])) * row_width + k
         weights = tap_weights[entry]
-        entry += _ONE
+        entry += ONE
         sums = _add_node(nodes, at, real_of(weights), sums)
         sums = _add_node(nodes, at + row_width, imag_of(weights), sums)
     a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag = sums
@@ -53,12 +51,12 @@ def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, 
     end = np.uint64(stop)
     if r < end:
         out[row, r] = magnitude(a_real, a_imag)
-    if r + _1 < end:
-        out[row, r + _1] = magnitude(b_real, b_imag)
-    if r + _2 < end:
-        out[row, r + _2] = magnitude(c_real, c_imag)
-    if r + _3 < end:
-        out[row, r + _3] = magnitude(d_real, d_imag)
+    if r + WARPS_1 < end:
+        out[row, r + WARPS_1] = magnitude(b_real, b_imag)
+    if r + WARPS_2 < end:
+        out[row, r + WARPS_2] = magnitude(c_real, c_imag)
+    if r + WARPS_3 < end:
+        out[row, r + WARPS_3] = magnitude(d_real, d_imag)
 
 
 def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, rows, first, stop, n_blocks, out):

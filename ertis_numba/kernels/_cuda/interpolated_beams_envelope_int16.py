@@ -3,15 +3,14 @@
 import numpy as np
 from numba import cuda
 
-from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, sum_short_terms
+from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, store_tile, sum_short_terms
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, WARP
-from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of, upper_halves
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2
+from ertis_numba.kernels._scalar import short_imag_of, short_real_of, upper_halves
 
 __all__ = ["interpolated_beams_envelope_int16"]
 
 _WIDTH = np.uint64(TILE_RANGES)
-_ONE, _1, _2 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP)
 
 
 @cuda.jit(cache=True)
@@ -26,8 +25,8 @@ def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
         samples, offsets, weights, np.uint64(n_terms), node, place
     )
     nodes[tile, node, k] = upper_halves(a_real, a_imag)
-    nodes[tile, node, k + _1] = upper_halves(b_real, b_imag)
-    nodes[tile, node, k + _2] = upper_halves(c_real, c_imag)
+    nodes[tile, node, k + WARPS_1] = upper_halves(b_real, b_imag)
+    nodes[tile, node, k + WARPS_2] = upper_halves(c_real, c_imag)
 
 
 @cuda.jit(cache=True)
@@ -44,25 +43,20 @@ def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weig
     while entry < end_entry:
         at = first + np.uint64(np.uint32(places[entry])) * _WIDTH
         weights = tap_weights[entry]
-        entry += _ONE
+        entry += ONE
         low, high = short_real_of(weights), short_imag_of(weights)
         x, y = nodes[at], nodes[at + _WIDTH]
         a_real = np.int32(np.int32(a_real + low * short_real_of(x)) + high * short_real_of(y))
         a_imag = np.int32(np.int32(a_imag + low * short_imag_of(x)) + high * short_imag_of(y))
-        x, y = nodes[at + _1], nodes[at + (_WIDTH + _1)]
+        x, y = nodes[at + WARPS_1], nodes[at + (_WIDTH + WARPS_1)]
         b_real = np.int32(np.int32(b_real + low * short_real_of(x)) + high * short_real_of(y))
         b_imag = np.int32(np.int32(b_imag + low * short_imag_of(x)) + high * short_imag_of(y))
-        x, y = nodes[at + _2], nodes[at + (_WIDTH + _2)]
+        x, y = nodes[at + WARPS_2], nodes[at + (_WIDTH + WARPS_2)]
         c_real = np.int32(np.int32(c_real + low * short_real_of(x)) + high * short_real_of(y))
         c_imag = np.int32(np.int32(c_imag + low * short_imag_of(x)) + high * short_imag_of(y))
-    scale, row = np.float32(scales[tile] * weight_scale), np.uint64(rows[direction])
-    r, end = np.uint64(starts[tile] + cuda.threadIdx.x), np.uint64(stop)
-    if r < end:
-        out[row, r] = magnitude(np.float32(a_real), np.float32(a_imag)) * scale
-    if r + _1 < end:
-        out[row, r + _1] = magnitude(np.float32(b_real), np.float32(b_imag)) * scale
-    if r + _2 < end:
-        out[row, r + _2] = magnitude(np.float32(c_real), np.float32(c_imag)) * scale
+    sums = a_real, a_imag, b_real, b_imag, c_real, c_imag
+    row, scale = np.uint64(rows[direction]), np.float32(scales[tile] * weight_scale)
+    store_tile(out, row, starts[tile], stop, scale, sums)
 
 
 def interpolated_beams_envelope_int16(

@@ -10,14 +10,26 @@ from numba import cuda
 
 from ertis_numba.kernels._scalar import imag_of, real_of
 
-__all__ = ["BLOCK", "DIRECTIONS", "TILE", "WARP", "beam_grid", "complexes", "sum_term_tile", "sum_terms"]
+__all__ = [
+    "BLOCK",
+    "DIRECTIONS",
+    "ONE",
+    "TILE",
+    "WARP",
+    "WARPS_1",
+    "WARPS_2",
+    "WARPS_3",
+    "beam_grid",
+    "complexes",
+    "fill_beams",
+]
 
 WARP = 32
 DIRECTIONS = 4
 BLOCK = (WARP, DIRECTIONS)
 RANGES_PER_THREAD = 4
 TILE = RANGES_PER_THREAD * WARP
-_ONE, _1, _2, _3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
+ONE, WARPS_1, WARPS_2, WARPS_3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
 
 
 def complexes(array):
@@ -31,7 +43,7 @@ def beam_grid(n_directions, n_ranges):
 
 
 @cuda.jit(device=True)
-def sum_term_tile(signals, offsets, weights, n_terms, direction, place):
+def _sum_tile(signals, offsets, weights, n_terms, direction, place):
     """Return real and imaginary parts of a beam at ``place`` and one, two and three warps further."""
     a_real = a_imag = b_real = b_imag = c_real = c_imag = d_real = d_imag = np.float32(0)
     entry = direction * n_terms
@@ -39,9 +51,9 @@ def sum_term_tile(signals, offsets, weights, n_terms, direction, place):
     while entry < end:
         weight = weights[entry]
         at = np.uint32(place + offsets[entry])  # of 32 bits: then an address is one instruction
-        entry += _ONE
+        entry += ONE
         w_real, w_imag = real_of(weight), imag_of(weight)
-        a, b, c, d = signals[at], signals[at + _1], signals[at + _2], signals[at + _3]
+        a, b, c, d = signals[at], signals[at + WARPS_1], signals[at + WARPS_2], signals[at + WARPS_3]
         a_real = (a_real + real_of(a) * w_real) - imag_of(a) * w_imag
         a_imag = (a_imag + real_of(a) * w_imag) + imag_of(a) * w_real
         b_real = (b_real + real_of(b) * w_real) - imag_of(b) * w_imag
@@ -54,15 +66,46 @@ def sum_term_tile(signals, offsets, weights, n_terms, direction, place):
 
 
 @cuda.jit(device=True)
-def sum_terms(signals, offsets, weights, n_terms, direction, place):
+def _sum_terms(signals, offsets, weights, n_terms, direction, place):
     """Return real and imaginary part of a beam at ``place``."""
     real = imag = np.float32(0)
     entry = direction * n_terms
     end = entry + n_terms
     while entry < end:
         weight, sample = weights[entry], signals[np.uint32(place + offsets[entry])]
-        entry += _ONE
+        entry += ONE
         w_real, w_imag = real_of(weight), imag_of(weight)
         real = (real + real_of(sample) * w_real) - imag_of(sample) * w_imag
         imag = (imag + real_of(sample) * w_imag) + imag_of(sample) * w_real
     return real, imag
+
+
+@cuda.jit(device=True)
+def fill_beams(value_of, signals, offsets, weights, n_terms, origin, first, stop, end, out):
+    """Write ``value_of`` both parts of a thread's beams from ``first`` to ``stop``, and of 0 from there to ``end``.
+
+    The grid begins at ``first``; ``origin`` is where the signals have the range that ``out`` has at 0.
+    """
+    direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
+    if direction >= np.uint64(out.shape[0]):
+        return
+    terms = np.uint64(n_terms)
+    tile = np.int64(first + cuda.blockIdx.y * TILE)
+    place = tile + cuda.threadIdx.x
+    if tile + TILE <= stop:
+        a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag = _sum_tile(
+            signals, offsets, weights, terms, direction, origin + place
+        )
+        r = np.uint64(place)
+        out[direction, r] = value_of(a_real, a_imag)
+        out[direction, r + WARPS_1] = value_of(b_real, b_imag)
+        out[direction, r + WARPS_2] = value_of(c_real, c_imag)
+        out[direction, r + WARPS_3] = value_of(d_real, d_imag)
+    else:
+        while place < stop:
+            real, imag = _sum_terms(signals, offsets, weights, terms, direction, origin + place)
+            out[direction, np.uint64(place)] = value_of(real, imag)
+            place += WARP
+        while stop < end and place < end:  # where they are the same argument, no code is made of this
+            out[direction, np.uint64(place)] = value_of(np.float32(0), np.float32(0))
+            place += WARP
