@@ -95,11 +95,9 @@ class Pipeline:
         self._words_shape = (settings.recording.n_samples, layout.n_words)
         self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
         self._closed = False
-        self._chain = _chain(settings, kernel_set, threads, graphs=graphs)
+        self._chain = self._made_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
-        if not kernel_set.simulated:
-            self._chain.warm_up(np.zeros(self._words_shape, self._words_dtype))
 
     def process(self, measurement: Measurement, out: NDArray[np.float32] | None = None) -> Energyscape:
         """Return the energyscape of one measurement.
@@ -139,6 +137,7 @@ class Pipeline:
         DataError
             As for `process`; then nothing is processed.
         """
+        self._require_open()
         batch = list(measurements)
         words = [self._words_of(measurement) for measurement in batch]
         energies = [self._chain.new_image() for _ in batch]
@@ -146,16 +145,34 @@ class Pipeline:
         return [self._energyscape(energy, measurement) for energy, measurement in zip(energies, batch, strict=True)]
 
     def close(self) -> None:
-        """Give back the memory of the device now; no thread may be processing. Images that were made stay."""
+        """Give back the memory of the device, when threads that are processing are done. Images that were made stay."""
         if not self._closed:
             self._closed = True
             self._chain.close()
 
     def __enter__(self) -> Self:
+        self._require_open()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _made_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
+        """Return the chain, its kernels compiled and its buffers made."""
+        try:
+            chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
+            if not kernel_set.simulated:
+                chain.warm_up(np.zeros(self._words_shape, self._words_dtype))
+        except DeviceError as error:
+            failed = str(error)
+        else:
+            return chain
+        # Out here, as an error in flight would keep what did not fit, and a smaller pipeline would not fit either.
+        raise DeviceError(failed)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise ArgumentError("the pipeline is closed; make another one")
 
     def _energyscape(self, energy: NDArray[np.float32], measurement: Measurement) -> Energyscape:
         return Energyscape(
@@ -168,8 +185,7 @@ class Pipeline:
         )
 
     def _words_of(self, measurement: Measurement) -> NDArray[np.unsignedinteger[Any]]:
-        if self._closed:
-            raise ArgumentError("the pipeline is closed; make another one")
+        self._require_open()
         self._require_same_sensor(measurement.settings)
         return self._checked_words(measurement.words)
 

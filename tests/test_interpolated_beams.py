@@ -24,7 +24,7 @@ SHAPE_NAMES = sized(
     ["one short of two tiles", "prime", "line array", "eRTIS", "six by six"],
 )
 SOME = "few directions" if SIMULATED else "prime"
-WINDOWS = sized([(0, 151), (3, 151), (17, 18), (5, 60)], [(0, 64), (40, 104), (130, 151), (150, 151)])
+WINDOWS = sized([(0, 151), (3, 151), (17, 18), (5, 60), (5, 116)], [(0, 64), (40, 104), (130, 151), (150, 151)])
 MOST_BLOCKS = 4
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Images"]
 
-_MOST, _MOST_BYTES = 8, 2**28  # of the arrays that are kept: who holds on to more images gets arrays of their own
+_MOST_BYTES = 2**28  # of all arrays that are kept: who holds on to more images gets arrays of their own
 
 
 class _Lease:
@@ -34,7 +34,7 @@ class Images:
 
     def __init__(self, make: Callable[[tuple[int, ...]], NDArray[np.float32]]) -> None:
         self._make = make
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # an image may be given back amid a garbage collection
         self._spare: list[NDArray[np.float32]] = []
         self._count = 0
         self._closed = False
@@ -45,7 +45,7 @@ class Images:
             array = self._spare.pop() if self._spare else None
             if array is None:
                 n_bytes = 4 * shape[0] * shape[1]
-                if self._closed or self._count == _MOST or (self._count + 1) * n_bytes > _MOST_BYTES:
+                if self._closed or (self._count + 1) * n_bytes > _MOST_BYTES:
                     return np.empty(shape, np.float32)
                 array = self._make(shape)
                 self._count += 1

@@ -2,11 +2,11 @@
 
 import functools
 import math
+import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from queue import Empty, LifoQueue
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet, Lane
 from ertis_numba.settings import Call, Settings
@@ -96,6 +97,7 @@ class FastChain:
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
         self._memory = kernels.memory(graphs=graphs)
+        self._change = threading.Condition()
         with one_thread():
             self._make(settings, kernels, threads)
 
@@ -183,7 +185,9 @@ class FastChain:
                 table.offsets(window.n_outputs),
                 table.weights.astype(np.complex64),
             )
-        self._spare: LifoQueue[_Buffers] = LifoQueue()
+        self._spare: list[_Buffers] = []
+        self._n_busy = 0
+        self._closed = False
 
     def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
@@ -226,16 +230,17 @@ class FastChain:
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]
     ) -> tuple[NDArray[np.complex64], int]:
         """Do as `process`; return the analytic signals too, (mic, phase, sample), and the sample of the first range."""
-        buffers = self._begin(words, out, self._threads)
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
-        buffers.lane.fetch(buffers.analytic, heard)
-        self._finish(buffers)
+        buffers = self._begin(words, out, self._threads)
+        try:
+            buffers.lane.fetch(buffers.analytic, heard)
+        finally:
+            self._finish(buffers)
         return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
-        buffers = self._take_buffers()
-        with self._entered(buffers.lane, self._threads):
+        with self._taken(self._threads) as buffers:
             image = buffers.lane.target(out)
             self._demodulate.filtered(signals, buffers.signals)
             self._image(buffers, image, self._threads)
@@ -255,19 +260,20 @@ class FastChain:
         return self._memory.image((len(self.grid), len(self.range_m)))
 
     def close(self) -> None:
-        """Give back the memory of the device now rather than when nothing refers to the chain any more."""
-        with suppress(Empty):
-            while True:
-                self._spare.get_nowait()
-        del self._demodulate, self._matched_filter, self._beamform, self._adaptive
+        """Give back the memory of the device, when the measurements that are under way are done."""
+        with self._change:
+            self._closed = True
+            self._change.wait_for(lambda: not self._n_busy)
+            self._spare.clear()
+        for name in ("_demodulate", "_matched_filter", "_beamform", "_adaptive"):
+            self.__dict__.pop(name, None)
         self._memory.close()
 
     def _begin(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
     ) -> _Buffers:
         """Begin one measurement; its image is in ``out`` when the lane is done."""
-        buffers = self._take_buffers()
-        with self._entered(buffers.lane, threads):
+        with self._taken(threads) as buffers:
             here = buffers.lane.send(words)
             image = buffers.lane.target(self._no_image if out is None else out)
 
@@ -281,8 +287,10 @@ class FastChain:
         return buffers
 
     def _finish(self, buffers: _Buffers) -> None:
-        buffers.lane.wait()
-        self._spare.put(buffers)
+        try:
+            buffers.lane.wait()
+        finally:
+            self._give_back(buffers)
 
     def _image(self, buffers: _Buffers, out: NDArray[np.float32], threads: int) -> None:
         self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
@@ -292,21 +300,40 @@ class FastChain:
             self._adaptive(buffers.analytic, out)
 
     @contextmanager
-    def _entered(self, lane: Lane, threads: int) -> Iterator[None]:
-        with self._kernels.threads(threads), lane.entered():
-            yield
+    def _taken(self, threads: int) -> Iterator[_Buffers]:
+        """Run the enclosed kernels on buffers that no other thread uses; there are as many as ever ran at once.
+
+        Who has begun gives them back; so does this where that fails.
+
+        Raises
+        ------
+        ArgumentError
+            The chain is closed.
+        """
+        with self._change:
+            if self._closed:
+                raise ArgumentError("the pipeline is closed; make another one")
+            buffers = self._spare.pop() if self._spare else None
+            self._n_busy += 1
+        try:
+            buffers = self._new_buffers() if buffers is None else buffers
+            with self._kernels.threads(threads), buffers.lane.entered():
+                yield buffers
+        except BaseException:
+            self._give_back(None)  # what was begun on the buffers may not be over
+            raise
+
+    def _give_back(self, buffers: _Buffers | None) -> None:
+        with self._change:
+            if buffers is not None:
+                self._spare.append(buffers)
+            self._n_busy -= 1
+            self._change.notify_all()
 
     @functools.cached_property
     def _no_image(self) -> NDArray[np.float32]:
         """An array of an image's shape and of no size, for images that nobody fetches from a GPU."""
         return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
-
-    def _take_buffers(self) -> _Buffers:
-        """Return buffers that no other thread uses; there are as many as ever ran at once."""
-        try:
-            return self._spare.get_nowait()
-        except Empty:
-            return self._new_buffers()
 
     def _new_buffers(self) -> _Buffers:
         memory, lane = self._memory, self._memory.lane()

@@ -1,6 +1,7 @@
 """What a pipeline keeps on the GPU: made once, given back at once, and missed with a remedy."""
 
 import gc
+import threading
 import weakref
 
 import numpy as np
@@ -9,7 +10,8 @@ from numba import cuda
 from numba.cuda.cudadrv.driver import CudaAPIError
 
 from ertis_numba import kernels
-from ertis_numba.errors import DeviceError
+from ertis_numba.errors import ArgumentError, DeviceError
+from ertis_numba.kernels import _images
 from ertis_numba.pipeline import Pipeline
 from tests.cases import noise
 from tests.cuda.plans import PLANS, TINY
@@ -100,6 +102,50 @@ def test_memory_that_cannot_be_pinned_is_told(monkeypatch, use):
     assert [memory.image((3, 4)).shape for _ in range(9)] == [(3, 4)] * 9
 
 
+def test_what_did_not_fit_is_gone_where_the_error_is_caught(monkeypatch, made):
+    """So that a smaller pipeline can be made there."""
+    left = [6]
+
+    def full(array, *_, make=cuda.to_device):
+        left[0] -= 1
+        if left[0] < 0:
+            raise CudaAPIError(2, "CUDA_ERROR_OUT_OF_MEMORY")
+        return make(array)
+
+    monkeypatch.setattr(cuda, "to_device", full)
+    try:
+        Pipeline(SETTINGS, device="cuda")
+    except DeviceError:
+        alive = [reference for reference in made if reference() is not None]
+    assert len(made) == 6
+    assert not alive
+
+
+def test_close_waits_for_what_is_under_way():
+    """And refuses what comes later; the image of the measurement that was under way is whole."""
+    pipeline = Pipeline(SETTINGS, device="cuda")
+    expected = pipeline.process(noise(SETTINGS)).energy.copy()
+    chain, begun, images = pipeline._chain, threading.Event(), []  # noqa: SLF001 - to hold it at the worst moment
+    finish = chain._finish  # noqa: SLF001
+
+    def slow(buffers):
+        begun.set()
+        closing.join(0.2)  # which does not come back before this is done
+        assert closing.is_alive()
+        finish(buffers)
+
+    chain._finish = slow  # noqa: SLF001
+    working = threading.Thread(target=lambda: images.append(pipeline.process(noise(SETTINGS)).energy))
+    closing = threading.Thread(target=lambda: (begun.wait(), pipeline.close()))
+    working.start()
+    closing.start()
+    working.join()
+    closing.join()
+    assert (images[0] == expected).all()
+    with pytest.raises(ArgumentError, match="the pipeline is closed"):
+        chain.process(noise(SETTINGS).words.reshape(-1, 1), images[0])
+
+
 def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
     def broken(*_):
         raise CudaAPIError(700, "CUDA_ERROR_ILLEGAL_ADDRESS")
@@ -123,7 +169,8 @@ def test_memory_of_an_image_is_used_again_when_nobody_looks_at_any_part_of_it():
     assert (second == 2).all()
 
 
-def test_images_without_number_are_not_all_pinned(made):
+def test_images_without_number_are_not_all_pinned(made, monkeypatch):
+    monkeypatch.setattr(_images, "_MOST_BYTES", 9 * 48)
     memory = kernels.load("cuda").memory()
     images = [memory.image((3, 4)) for _ in range(50)]
     assert len(made) < 10

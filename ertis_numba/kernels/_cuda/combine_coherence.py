@@ -9,15 +9,15 @@ from ertis_numba.kernels._scalar import coherent_level, imag_of, power, real_of
 
 __all__ = ["combine_coherence"]
 
-_ONE = np.uint64(1)
+_ONE, _ZERO = np.uint64(1), np.float32(0)  # adding 0 says which product is fused
 
 
 @cuda.jit(device=True)
 def _add(sums, sample, w_real, w_imag):
     """Return the sums of y, in parts, and of its power, with another y added."""
     real, imag, total = sums
-    y_real = real_of(sample) * w_real - imag_of(sample) * w_imag
-    y_imag = real_of(sample) * w_imag + imag_of(sample) * w_real
+    y_real = (_ZERO + real_of(sample) * w_real) - imag_of(sample) * w_imag
+    y_imag = (_ZERO + real_of(sample) * w_imag) + imag_of(sample) * w_real
     return real + y_real, imag + y_imag, total + power(y_real, y_imag)
 
 
@@ -28,7 +28,7 @@ def _combine(signals, offsets, weights, n_mics, out):
     place = np.int64(cuda.blockIdx.y * TILE + cuda.threadIdx.x)
     if direction >= np.uint64(out.shape[0]) or place >= n_ranges:
         return
-    # Ranges past the last are the last one: the same number, written more than once.
+    # Ranges past the last are read as the last one, and not written.
     last = n_ranges - 1 - place
     step_1 = np.uint64(min(np.int64(WARP), last))
     step_2 = np.uint64(min(np.int64(2 * WARP), last))
@@ -47,9 +47,12 @@ def _combine(signals, offsets, weights, n_mics, out):
         d = _add(d, signals[at + step_3], w_real, w_imag)
     r, count = np.uint64(place), np.float32(n_mics)
     out[direction, r] = coherent_level(a[0], a[1], a[2], count)
-    out[direction, r + step_1] = coherent_level(b[0], b[1], b[2], count)
-    out[direction, r + step_2] = coherent_level(c[0], c[1], c[2], count)
-    out[direction, r + step_3] = coherent_level(d[0], d[1], d[2], count)
+    if last >= WARP:
+        out[direction, r + step_1] = coherent_level(b[0], b[1], b[2], count)
+    if last >= 2 * WARP:
+        out[direction, r + step_2] = coherent_level(c[0], c[1], c[2], count)
+    if last >= 3 * WARP:
+        out[direction, r + step_3] = coherent_level(d[0], d[1], d[2], count)
 
 
 def combine_coherence(signals, offsets, weights, out):

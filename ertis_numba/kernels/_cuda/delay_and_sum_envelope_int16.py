@@ -4,7 +4,7 @@ import numpy as np
 from numba import cuda
 
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARP, WARPS_1, WARPS_2
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARP, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of
 
 __all__ = ["TILE_RANGES", "delay_and_sum_envelope_int16", "store_tile", "sum_short_terms"]
@@ -70,7 +70,7 @@ def delay_and_sum_envelope_int16(tiles, scales, starts, stop, offsets, weights, 
     """See `DelayAndSumEnvelopeInt16`."""
     n_directions, n_terms = offsets.shape
     n_tiles = tiles.shape[0]
-    samples = tiles.reshape(-1).view(np.uint32)
+    samples = indexed(tiles.reshape(-1).view(np.uint32))
     launch(
         _fill,
         (-(-n_directions // DIRECTIONS), n_tiles),

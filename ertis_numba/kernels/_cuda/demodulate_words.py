@@ -8,6 +8,7 @@ import numpy as np
 from numba import cuda
 
 from ertis_numba.kernels._cuda.lane import launch
+from ertis_numba.kernels._cuda.terms import indexed
 
 __all__ = ["demodulate_words"]
 
@@ -51,7 +52,7 @@ def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out
         _sum_taps,
         grid,
         block,
-        octets.reshape(-1),
+        indexed(octets.reshape(-1)),
         *octets.shape,
         channels,
         taps,

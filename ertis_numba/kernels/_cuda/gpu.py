@@ -1,5 +1,6 @@
 """The kernels on the GPU of this machine. Importing this is what looks for one."""
 
+import importlib
 import importlib.util
 
 from numba import cuda
@@ -24,12 +25,19 @@ def _hardware() -> str:
     """
     if SIMULATED:
         return "Numba's CUDA simulator"
+    # Looked for first: the target that Numba itself still ships crashes on newer drivers.
+    if importlib.util.find_spec("numba_cuda") is None:
+        raise DeviceError(f"device 'cuda' needs numba-cuda, which is not installed; {_REMEDY}")
     if not cuda.is_available():
         reason = " ".join(str(cuda.cuda_error() or "none is visible").split())
         raise DeviceError(f"device 'cuda' finds no NVIDIA GPU ({reason}); {_REMEDY}")
-    missing = [name for name in ("numba_cuda", "cupy") if importlib.util.find_spec(name) is None]
-    if missing:  # the target that Numba itself still ships crashes on newer drivers
-        raise DeviceError(f"device 'cuda' needs {' and '.join(missing)}, not installed here; {_REMEDY}")
+    try:
+        importlib.import_module("cupy.cuda.cufft")
+    except ImportError as error:
+        reason = " ".join(str(error).split())
+        raise DeviceError(
+            f"device 'cuda' needs CuPy with cuFFT, which cannot be loaded ({reason}); {_REMEDY}"
+        ) from error
     name = cuda.get_current_device().name
     return str(name.decode() if isinstance(name, bytes) else name)
 

@@ -3,6 +3,7 @@
 Numba has no graphs of its own; CuPy records whatever is launched on a stream, Numba's kernels and cuFFT's alike.
 """
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -34,5 +35,8 @@ class Graph:
             self._stream.begin_capture()
             try:
                 steps()
-            finally:
-                self._graph = self._stream.end_capture()
+            except BaseException:
+                with contextlib.suppress(Exception):  # a stream must not be left recording; what failed is told
+                    self._stream.end_capture()
+                raise
+            self._graph = self._stream.end_capture()

@@ -5,7 +5,7 @@ from numba import cuda
 
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, store_tile, sum_short_terms
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2
+from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import short_imag_of, short_real_of, upper_halves
 
 __all__ = ["interpolated_beams_envelope_int16"]
@@ -66,7 +66,7 @@ def interpolated_beams_envelope_int16(
     n_nodes, n_terms = offsets.shape
     n_directions, n_pairs = places.shape
     n_tiles = tiles.shape[0]
-    samples = tiles.reshape(-1).view(np.uint32)
+    samples = indexed(tiles.reshape(-1).view(np.uint32))
     nodes = workspace(f"nodes of {n_tiles} tiles", (n_tiles, n_nodes, TILE_RANGES), np.uint32)
     launch(
         _fill_nodes,

@@ -10,6 +10,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import DTypeLike, NDArray
 
+from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._cuda.graph import Graph
 
 __all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
@@ -17,6 +18,8 @@ __all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 
 numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image is a small grid: no mistake to be told of
+
+_MOST_BLOCKS = 65_535  # along all axes of a grid but the first
 
 Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
@@ -119,7 +122,18 @@ def current() -> Lane:
 
 
 def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
-    """Run ``kernel`` with ``grid`` blocks of ``block`` threads, after what was launched on this lane before."""
+    """Run ``kernel`` with ``grid`` blocks of ``block`` threads, after what was launched on this lane before.
+
+    Raises
+    ------
+    DeviceError
+        No grid has so many blocks.
+    """
+    if max(grid[1:], default=0) > _MOST_BLOCKS:
+        raise DeviceError(
+            f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks, and {_MOST_BLOCKS:,} are the most; "
+            "give a shorter processing.range_m or fewer microphones, or use device 'cpu'"
+        )
     if all(grid):  # where there is nothing to do a launch would be an error
         current().launch(kernel, grid, block, *arguments)
 

@@ -89,7 +89,7 @@ class CudaMemory:
             free, total = cuda.current_context().get_memory_info()
             raise DeviceError(
                 f"device 'cuda' has {free / 1e6:,.0f} of {total / 1e6:,.0f} MB free, and this pipeline needs "
-                f"{n_bytes / 1e6:,.0f} MB more than the {self._bytes / 1e6:,.0f} MB that it has; "
+                f"at least {n_bytes / 1e6:,.0f} MB more than the {self._bytes / 1e6:,.0f} MB that it has; "
                 "give fewer directions, a shorter processing.range_m or less accuracy.oversampling, close other "
                 "pipelines, or use device 'cpu'"
             ) from error

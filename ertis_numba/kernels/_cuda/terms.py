@@ -8,6 +8,7 @@ complex64 would be loaded in halves. Indices are unsigned: Numba tests signed on
 import numpy as np
 from numba import cuda
 
+from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._scalar import imag_of, real_of
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "beam_grid",
     "complexes",
     "fill_beams",
+    "indexed",
 ]
 
 WARP = 32
@@ -31,10 +33,28 @@ RANGES_PER_THREAD = 4
 TILE = RANGES_PER_THREAD * WARP
 ONE, WARPS_1, WARPS_2, WARPS_3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
 
+_MOST_INDEXED = 2**32 - 1
+
 
 def complexes(array):
     """Return complex64 numbers as a flat array of uint64."""
-    return array.reshape(-1).view(np.uint64)
+    return indexed(array.reshape(-1).view(np.uint64))
+
+
+def indexed(array):
+    """Return a flat array if 32 bits are enough for its indices, as kernels count on.
+
+    Raises
+    ------
+    DeviceError
+        They are not.
+    """
+    if array.size > _MOST_INDEXED:
+        raise DeviceError(
+            f"device 'cuda' would have to index {array.size:,} numbers and can {_MOST_INDEXED:,}; "
+            "give a shorter record or range, or use device 'cpu'"
+        )
+    return array
 
 
 def beam_grid(n_directions, n_ranges):

@@ -1,0 +1,31 @@
+"""What a GPU cannot do is refused in one line, before the driver does it in its own."""
+
+import types
+
+import numpy as np
+import pytest
+from numba import cuda
+
+from ertis_numba.errors import DeviceError
+from ertis_numba.kernels._cuda import lane, terms
+
+
+@cuda.jit
+def _nothing(out):
+    out[0] = np.float32(1)
+
+
+@pytest.mark.parametrize("grid", [(1, 65_536), (1, 1, 70_000)])
+def test_grid_of_too_many_blocks(grid):
+    with pytest.raises(
+        DeviceError, match=r"would need a grid of \d+,\d+ blocks, and 65,535 are the most; give a shorter"
+    ):
+        lane.launch(_nothing, grid, (1,), np.zeros(1, np.float32))
+
+
+def test_more_numbers_than_32_bits_can_index():
+    too_many = types.SimpleNamespace(size=2**32)
+    with pytest.raises(DeviceError, match="would have to index 4,294,967,296 numbers"):
+        terms.indexed(too_many)
+    enough = types.SimpleNamespace(size=2**32 - 1)
+    assert terms.indexed(enough) is enough
