@@ -17,9 +17,7 @@ def _nothing(out):
 
 @pytest.mark.parametrize("grid", [(1, 65_536), (1, 1, 70_000)])
 def test_grid_of_too_many_blocks(grid):
-    with pytest.raises(
-        DeviceError, match=r"a grid of \d+,\d+ blocks, and 65,535 are the most; give a shorter"
-    ):
+    with pytest.raises(DeviceError, match=r"a grid of \d+,\d+ blocks, and 65,535 are the most; give a shorter"):
         lane.launch(_nothing, grid, (1,), np.zeros(1, np.float32))
 
 
