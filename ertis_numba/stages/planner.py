@@ -317,13 +317,14 @@ class Planner:
         found: list[tuple[int, float]] = [] if given.beam_taps else [(0, given.beam_density or 2.0)]
         for beam_taps in [given.beam_taps] if given.beam_taps else _DENSITIES:
             densities = _DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
-            for density in reversed(densities):  # the coarser, the cheaper, until they err too much
+            for density in densities:  # from the coarsest, which is the cheapest, to those that are needlessly exact
                 if not given.beam_taps and self._count_nodes(beam_taps, density) >= self._n_directions:
-                    continue
-                nodes = self._nodes(beam_taps, density)
-                if nodes.error > budget and not given.beam_taps:
                     break
-                found.append((beam_taps, density))
+                error = self._nodes(beam_taps, density).error
+                if error <= budget or given.beam_taps:
+                    found.append((beam_taps, density))
+                if error <= _NEEDLESS * budget:
+                    break
         return found
 
     def _stop_bands_db(self, budget: float) -> list[float]:

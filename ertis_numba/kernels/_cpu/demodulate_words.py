@@ -13,6 +13,8 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ertis_numba.kernels._cpu.spans import clear
+
 __all__ = ["demodulate_words"]
 
 _GROUP = 4  # outputs summed side by side: enough chains to hide the latency of an addition
@@ -114,4 +116,4 @@ def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out
                     at = (start + row * factor) * n_words + word
                     _sum_masked_taps(words, at, factor * n_words, taps, tile, row)
                 _turn_tile(tile, word, channels, tap_total, scale, begin, end, out)
-        out[:, end : min(begin + _TILE, out.shape[1])] = np.float32(0)
+        clear(out, end, min(begin + _TILE, out.shape[1]))

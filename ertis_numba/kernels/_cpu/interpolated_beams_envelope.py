@@ -10,6 +10,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.dot32 import FLOAT, TILE, Dot32, Planes
+from ertis_numba.kernels._cpu.spans import node_span
 
 __all__ = ["interpolated_beams_envelope"]
 
@@ -73,8 +74,8 @@ def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, 
         end = min(begin + block, n_directions)
         if begin == end:
             continue
-        lowest = places[begin:end].min()
-        nodes = np.empty((places[begin:end].max() + 2 - lowest, 2, TILE), np.float32)
+        lowest, highest = node_span(places, begin, end)
+        nodes = np.empty((highest + 1 - lowest, 2, TILE), np.float32)
         for node in range(nodes.shape[0]):
             _node_tile(signals, offsets, weights, lowest + node, at, nodes, node)
         short = np.empty((1, TILE), np.float32)

@@ -12,6 +12,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.dot16 import INT32, LANES, RANGES, SHORTS, SUMS, VECTORS, Dot16
+from ertis_numba.kernels._cpu.spans import node_span
 
 __all__ = ["interpolated_beams_envelope_int16"]
 
@@ -139,8 +140,7 @@ def interpolated_beams_envelope_int16(
         end = min(begin + block, n_directions)
         if begin == end:
             continue
-        first = places[begin:end].min()
-        last = places[begin:end].max() + 1
+        first, last = node_span(places, begin, end)
         pairs = _node_pairs(tiles, tile, offsets, weights, first, last)
         scale = scales[tile] * weight_scale
         short = np.empty((1, RANGES), np.float32)

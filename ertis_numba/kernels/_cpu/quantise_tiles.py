@@ -1,5 +1,7 @@
 """Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale."""
 
+import math
+
 import numpy as np
 from numba import njit, prange
 
@@ -7,47 +9,45 @@ __all__ = ["quantise_tiles"]
 
 
 @njit(nogil=True, cache=True)
-def _largest(signals, begin, end):
-    """Largest squared magnitude of any sample in ``begin … end``, as the bits of a float.
+def _largest(parts, begin, end, powers, bits):
+    """Largest magnitude of any sample in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32.
 
     Non-negative floats are ordered like their bits, and a maximum of integers is one vector
-    instruction where a maximum of floats, for the sake of NaN, is a loop.
+    instruction where a maximum of floats, for the sake of NaN, is a loop. ``bits`` is a view of ``powers``.
     """
-    n_mics, n_phases, _ = signals.shape
-    parts = signals.view(np.float32)
-    powers = np.empty(end - begin, np.float32)
-    bits = powers.view(np.int32)
+    n_mics, n_phases, _ = parts.shape
     largest = np.int32(0)
     for mic in range(n_mics):
         for phase in range(n_phases):
             part = parts[mic, phase, 2 * begin : 2 * end]
-            for k in range(powers.size):
+            for k in range(end - begin):
                 powers[k] = part[2 * k] * part[2 * k] + part[2 * k + 1] * part[2 * k + 1]
-            for k in range(bits.size):
+            for k in range(end - begin):
                 largest = max(largest, bits[k])
-    return largest
+    bits[0] = largest
+    return np.float32(math.sqrt(powers[0]))
+
+
+@njit(nogil=True, cache=True)
+def _round(source, factor, target):
+    """Fill ``target`` with the numbers of ``source``, which may be fewer, times ``factor`` and rounded."""
+    for k in range(source.size):
+        target[k] = np.int16(np.rint(source[k] * factor))
+    for k in range(source.size, target.size):
+        target[k] = np.int16(0)
 
 
 @njit(parallel=True, nogil=True, cache=True)
 def quantise_tiles(signals, starts, limit, tiles, scales):
     """See `QuantiseTiles`."""
     n_tiles, n_mics, n_phases, width, _ = tiles.shape
-    n_samples = signals.shape[2]
-    bits = np.zeros(n_tiles, np.int32)
+    parts, targets = signals.view(np.float32), tiles.reshape(n_tiles, n_mics, n_phases, 2 * width)
     for tile in prange(n_tiles):
-        bits[tile] = _largest(signals, starts[tile], min(starts[tile] + width, n_samples))
-    largest = np.sqrt(bits.view(np.float32))
-    for tile in range(n_tiles):
-        scales[tile] = largest[tile] / limit
-    parts = signals.view(np.float32)
-    targets = tiles.reshape(n_tiles, n_mics, n_phases, 2 * width)
-    for row in prange(n_tiles * n_mics):
-        tile, mic = row // n_mics, row % n_mics
-        factor = np.float32(0) if largest[tile] == 0 else limit / largest[tile]
-        inside = 2 * (min(starts[tile] + width, n_samples) - starts[tile])
-        for phase in range(n_phases):
-            source = parts[mic, phase, 2 * starts[tile] : 2 * starts[tile] + inside]
-            target = targets[tile, mic, phase]
-            for k in range(inside):
-                target[k] = np.int16(np.rint(source[k] * factor))
-            target[inside:] = np.int16(0)
+        begin, end = starts[tile], min(starts[tile] + width, signals.shape[2])
+        powers = np.empty(width, np.float32)
+        largest = _largest(parts, begin, end, powers, powers.view(np.int32))
+        scales[tile] = largest / limit
+        factor = np.float32(0) if largest == 0 else limit / largest
+        for mic in range(n_mics):
+            for phase in range(n_phases):
+                _round(parts[mic, phase, 2 * begin : 2 * end], factor, targets[tile, mic, phase])
