@@ -196,19 +196,22 @@ def test_rows_before_a_failure_are_kept(monkeypatch):
 
 
 def test_tests_count_what_ran_on_the_gpu(monkeypatch, tmp_path):
-    """Tests that pass without any on the GPU are not a pass."""
+    """Those of other devices do not run; where none is left, nothing is passed."""
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_it.py").write_text(
-        "import pytest\n@pytest.mark.parametrize('device', ['cpu'])\ndef test_a(device): pass\n"
-        "def test_b(): pytest.skip('x')\ndef test_c(): assert False\n",
+        "import pytest\n@pytest.mark.parametrize('device', ['cpu', 'cuda'])\ndef test_a(device): pass\n"
+        "def test_b_cuda(): pytest.skip('x')\ndef test_c_cuda(): assert False\n",
         "utf-8",
     )
+    (tmp_path / "tests" / "test_other.py").write_text("def test_a(): pass\n", "utf-8")
     monkeypatch.setattr(gpu, "_ROOT", tmp_path)
     monkeypatch.setattr(gpu, "_TESTED", ("tests/test_it.py",))
     found = gpu.tested()
     assert found["status"].startswith("failed (1): ")
-    assert (found["passed"], found["passed_on_gpu"], found["failed"], found["skipped"]) == (1, 0, 1, 1)
-    assert found["names_failed"] == ["tests.test_it::test_c"]
+    assert (found["passed"], found["passed_on_gpu"], found["failed"], found["skipped"]) == (1, 1, 1, 1)
+    assert found["names_failed"] == ["tests.test_it::test_c_cuda"]
+    monkeypatch.setattr(gpu, "_TESTED", ("tests/test_other.py",))
+    assert gpu.tested()["status"].startswith("failed (5): ")
 
 
 @pytest.mark.parametrize(
