@@ -5,16 +5,37 @@ is checked: shapes and bounds are the business of the stages, which know them wh
 Arrays are C-contiguous. Axes are named in this order: mic, phase, sample; direction, range.
 """
 
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.kernels._memory import NewMemory
-
-__all__ = ["KernelSet"]
+__all__ = [
+    "AddPaths",
+    "CombineCapon",
+    "CombineCoherence",
+    "CombineDmas",
+    "Complex",
+    "Decimate",
+    "DelayAndSum",
+    "DelayAndSumEnvelope",
+    "DelayAndSumEnvelopeInt16",
+    "DemodulateWords",
+    "Envelope",
+    "Index",
+    "InterpolatedBeamsEnvelope",
+    "InterpolatedBeamsEnvelopeInt16",
+    "ModulatePdm",
+    "MultiplyAndFold",
+    "MultiplySpectra",
+    "QuantiseTiles",
+    "Real",
+    "RemoveGroupDelay",
+    "Short",
+    "Taps",
+    "UnpackBits",
+    "Words",
+]
 
 Words = NDArray[np.unsignedinteger[Any]]
 Real = NDArray[np.float32]
@@ -459,65 +480,3 @@ class ModulatePdm(Protocol):
         first: int,
         out: NDArray[np.uint8],
     ) -> None: ...
-
-
-class Threads(Protocol):
-    """Run the enclosed kernels of this Python thread on ``count`` threads.
-
-    Raises
-    ------
-    ArgumentError
-        There are fewer.
-    """
-
-    def __call__(self, count: int) -> AbstractContextManager[None]: ...
-
-
-@dataclass(frozen=True, slots=True)
-class KernelSet:
-    """The kernels of one device, and what else there is to know of it.
-
-    Attributes
-    ----------
-    device : str
-    hardware : str
-        Name of the GPU; empty for the processor.
-    transforms : {"scipy", "cufft"}
-        What goes with the kernels: see `fft`.
-    max_threads : int
-    tile_ranges : int
-        Ranges in a tile of the 16-bit kernels; 0 where the device cannot run them.
-    fastest_precision : {"float32", "int16"}
-    simulated : bool
-        Whether the device is only played by the processor, far too slowly for anything but tests.
-    memory : callable
-        Returns a `Memory`; ``graphs`` asks for lanes that record what they run.
-    """
-
-    device: str
-    hardware: str
-    transforms: str
-    max_threads: int
-    tile_ranges: int
-    fastest_precision: str
-    simulated: bool
-    memory: NewMemory
-    threads: Threads
-    unpack_bits: UnpackBits
-    decimate: Decimate
-    remove_group_delay: RemoveGroupDelay
-    demodulate_words: DemodulateWords
-    multiply_spectra: MultiplySpectra
-    multiply_and_fold: MultiplyAndFold
-    delay_and_sum: DelayAndSum
-    envelope: Envelope
-    delay_and_sum_envelope: DelayAndSumEnvelope
-    interpolated_beams_envelope: InterpolatedBeamsEnvelope
-    quantise_tiles: QuantiseTiles
-    delay_and_sum_envelope_int16: DelayAndSumEnvelopeInt16
-    interpolated_beams_envelope_int16: InterpolatedBeamsEnvelopeInt16
-    combine_coherence: CombineCoherence
-    combine_dmas: CombineDmas
-    combine_capon: CombineCapon
-    add_paths: AddPaths
-    modulate_pdm: ModulatePdm

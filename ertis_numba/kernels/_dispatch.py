@@ -8,7 +8,7 @@ from typing import Final
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._contract import KernelSet
+from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = ["DEVICES", "load", "usable"]
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["Array", "Lane", "Memory", "NewMemory"]
+__all__ = ["Array", "Lane", "Memory", "NewMemory", "Threads"]
 
 Array = TypeVar("Array", bound=NDArray[Any])
 
@@ -89,3 +89,15 @@ class NewMemory(Protocol):
     """
 
     def __call__(self, *, graphs: bool = False) -> Memory: ...
+
+
+class Threads(Protocol):
+    """Run the enclosed kernels of this Python thread on ``count`` threads.
+
+    Raises
+    ------
+    ArgumentError
+        There are fewer.
+    """
+
+    def __call__(self, count: int) -> AbstractContextManager[None]: ...

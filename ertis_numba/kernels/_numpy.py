@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, Index, KernelSet, Real, Short, Taps, Words
+from ertis_numba.kernels._contract import Complex, Index, Real, Short, Taps, Words
 from ertis_numba.kernels._host import HostMemory
+from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = ["KERNELS"]
 
@@ -334,7 +335,8 @@ def _noise_and_dither(
     return noise, dither
 
 
-KERNELS = KernelSet(
+KERNELS = KernelSet.of(
+    vars(),
     device="numpy",
     hardware="",
     transforms="scipy",
@@ -344,22 +346,4 @@ KERNELS = KernelSet(
     tile_ranges=_TILE_RANGES,
     fastest_precision="float32",
     threads=threads,
-    unpack_bits=unpack_bits,
-    decimate=decimate,
-    remove_group_delay=remove_group_delay,
-    demodulate_words=demodulate_words,
-    multiply_spectra=multiply_spectra,
-    multiply_and_fold=multiply_and_fold,
-    delay_and_sum=delay_and_sum,
-    envelope=envelope,
-    delay_and_sum_envelope=delay_and_sum_envelope,
-    interpolated_beams_envelope=interpolated_beams_envelope,
-    quantise_tiles=quantise_tiles,
-    delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
-    interpolated_beams_envelope_int16=interpolated_beams_envelope_int16,
-    combine_coherence=combine_coherence,
-    combine_dmas=combine_dmas,
-    combine_capon=combine_capon,
-    add_paths=add_paths,
-    modulate_pdm=modulate_pdm,
 )

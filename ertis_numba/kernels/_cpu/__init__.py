@@ -15,27 +15,9 @@ import numba
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._contract import KernelSet
-from ertis_numba.kernels._cpu.add_paths import add_paths
-from ertis_numba.kernels._cpu.combine_capon import combine_capon
-from ertis_numba.kernels._cpu.combine_coherence import combine_coherence
-from ertis_numba.kernels._cpu.combine_dmas import combine_dmas
-from ertis_numba.kernels._cpu.decimate import decimate
-from ertis_numba.kernels._cpu.delay_and_sum import delay_and_sum
-from ertis_numba.kernels._cpu.delay_and_sum_envelope import delay_and_sum_envelope
-from ertis_numba.kernels._cpu.delay_and_sum_envelope_int16 import delay_and_sum_envelope_int16
-from ertis_numba.kernels._cpu.demodulate_words import demodulate_words
 from ertis_numba.kernels._cpu.dot16 import HAS_INT16_DOT, RANGES
-from ertis_numba.kernels._cpu.envelope import envelope
-from ertis_numba.kernels._cpu.interpolated_beams_envelope import interpolated_beams_envelope
-from ertis_numba.kernels._cpu.interpolated_beams_envelope_int16 import interpolated_beams_envelope_int16
-from ertis_numba.kernels._cpu.modulate_pdm import modulate_pdm
-from ertis_numba.kernels._cpu.multiply_and_fold import multiply_and_fold
-from ertis_numba.kernels._cpu.multiply_spectra import multiply_spectra
-from ertis_numba.kernels._cpu.quantise_tiles import quantise_tiles
-from ertis_numba.kernels._cpu.remove_group_delay import remove_group_delay
-from ertis_numba.kernels._cpu.unpack_bits import unpack_bits
 from ertis_numba.kernels._host import HostMemory
+from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
 __all__ = ["KERNELS"]
 
@@ -73,7 +55,8 @@ def threads(count: int) -> Iterator[None]:
             numba.set_num_threads(before)
 
 
-KERNELS = KernelSet(
+KERNELS = KernelSet.of(
+    twins_in(__name__),
     device="cpu",
     hardware="",
     transforms="scipy",
@@ -83,22 +66,4 @@ KERNELS = KernelSet(
     tile_ranges=RANGES if HAS_INT16_DOT else 0,
     fastest_precision="int16" if HAS_INT16_DOT else "float32",
     threads=threads,
-    unpack_bits=unpack_bits,
-    decimate=decimate,
-    remove_group_delay=remove_group_delay,
-    demodulate_words=demodulate_words,
-    multiply_spectra=multiply_spectra,
-    multiply_and_fold=multiply_and_fold,
-    delay_and_sum=delay_and_sum,
-    envelope=envelope,
-    delay_and_sum_envelope=delay_and_sum_envelope,
-    interpolated_beams_envelope=interpolated_beams_envelope,
-    quantise_tiles=quantise_tiles,
-    delay_and_sum_envelope_int16=delay_and_sum_envelope_int16,
-    interpolated_beams_envelope_int16=interpolated_beams_envelope_int16,
-    combine_coherence=combine_coherence,
-    combine_dmas=combine_dmas,
-    combine_capon=combine_capon,
-    add_paths=add_paths,
-    modulate_pdm=modulate_pdm,
 )

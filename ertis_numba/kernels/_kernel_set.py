@@ -1,0 +1,75 @@
+"""What a device is: its kernels, and what else there is to know of it."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Self
+
+from ertis_numba.kernels import _contract
+from ertis_numba.kernels._memory import NewMemory, Threads
+
+__all__ = ["KERNEL_NAMES", "KernelSet", "twins_in"]
+
+
+@dataclass(frozen=True, slots=True)
+class KernelSet:
+    """The kernels of one device, and what else there is to know of it.
+
+    Attributes
+    ----------
+    device : str
+    hardware : str
+        Name of the GPU; empty for the processor.
+    transforms : {"scipy", "cufft"}
+        What goes with the kernels: see `fft`.
+    max_threads : int
+    tile_ranges : int
+        Ranges in a tile of the 16-bit kernels; 0 where the device cannot run them.
+    fastest_precision : {"float32", "int16"}
+    simulated : bool
+        Whether the device is only played by the processor, far too slowly for anything but tests.
+    memory : callable
+        Returns a `Memory`; ``graphs`` asks for lanes that record what they run.
+    """
+
+    device: str
+    hardware: str
+    transforms: str
+    max_threads: int
+    tile_ranges: int
+    fastest_precision: str
+    simulated: bool
+    memory: NewMemory
+    threads: Threads
+    unpack_bits: _contract.UnpackBits
+    decimate: _contract.Decimate
+    remove_group_delay: _contract.RemoveGroupDelay
+    demodulate_words: _contract.DemodulateWords
+    multiply_spectra: _contract.MultiplySpectra
+    multiply_and_fold: _contract.MultiplyAndFold
+    delay_and_sum: _contract.DelayAndSum
+    envelope: _contract.Envelope
+    delay_and_sum_envelope: _contract.DelayAndSumEnvelope
+    interpolated_beams_envelope: _contract.InterpolatedBeamsEnvelope
+    quantise_tiles: _contract.QuantiseTiles
+    delay_and_sum_envelope_int16: _contract.DelayAndSumEnvelopeInt16
+    interpolated_beams_envelope_int16: _contract.InterpolatedBeamsEnvelopeInt16
+    combine_coherence: _contract.CombineCoherence
+    combine_dmas: _contract.CombineDmas
+    combine_capon: _contract.CombineCapon
+    add_paths: _contract.AddPaths
+    modulate_pdm: _contract.ModulatePdm
+
+    @classmethod
+    def of(cls, twins: Mapping[str, Any], **facts: Any) -> Self:
+        """Return the set of the kernels in ``twins``, by their names; ``facts`` are the other attributes."""
+        return cls(**facts, **{name: twins[name] for name in KERNEL_NAMES})
+
+
+KERNEL_NAMES: Final = tuple(field.name for field in fields(KernelSet) if field.type in vars(_contract).values())
+"""Which attributes of a `KernelSet` are kernels: those with a contract."""
+
+
+def twins_in(package: str) -> dict[str, Any]:
+    """Return the kernels of a package that has one file for each, of the kernel's name."""
+    return {name: getattr(importlib.import_module(f"{package}.{name}"), name) for name in KERNEL_NAMES}
