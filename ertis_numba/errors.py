@@ -7,7 +7,9 @@
     │   └── SettingsError                a settings file or structure cannot be used
     ├── DataError (ValueError)           a file or measurement does not hold what it should
     │   └── FormatVersionError           a file was written by a newer version
-    └── DeviceError (RuntimeError)       the compute device asked for is not there
+    ├── DeviceError (RuntimeError)       the compute device asked for is not there
+    └── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
+        └── SonarGoneError               it was unplugged
 
 Each class also inherits the builtin that a caller would catch without knowing this package.
 """
@@ -19,6 +21,8 @@ __all__ = [
     "ErtisError",
     "FormatVersionError",
     "SettingsError",
+    "SonarError",
+    "SonarGoneError",
 ]
 
 
@@ -44,3 +48,11 @@ class FormatVersionError(DataError):
 
 class DeviceError(ErtisError, RuntimeError):
     """The compute device asked for is not available."""
+
+
+class SonarError(ErtisError, OSError):
+    """A sensor cannot be opened, or does not answer as it should."""
+
+
+class SonarGoneError(SonarError):
+    """A sensor was unplugged."""
