@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx check data pictures bench gpu clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx check data pictures bench soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -20,10 +20,7 @@ $(VENV)/ready-to-test: $(VENV)/ready  # what tests and checks need: CUDA's compi
 	touch $@
 
 demo: $(VENV)/ready
-	$(BIN)/ertis process data/synthetic/reflectors.h5 --output demo.h5 --directions 2d:181 --force
-	$(BIN)/ertis peaks demo.h5 --top 5
-	$(BIN)/ertis compare demo.h5
-	$(BIN)/ertis plot demo.h5 --output demo.png --force
+	PATH="$(CURDIR)/$(BIN):$$PATH" examples/demo.sh
 
 # Times are measured first, while nothing else runs. Then two legs run at a time; each says what it found when it ends.
 test: $(VENV)/ready-to-test
@@ -62,9 +59,12 @@ bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 	$(BIN)/ertis bench simulation --update bench/README.md
 
+soak: $(VENV)/ready  ## an hour of faults, kills and full disks; SEED=N for the same ones again
+	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/reliability.md
+
 gpu: $(VENV)/ready  ## test and measure this machine's NVIDIA GPU, in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'
 	$(BIN)/ertis bench gpu --results bench/results --update docs/cuda.md --update README.md
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo.h5 demo.png
+	rm -rf $(VENV) build dist *.egg-info demo

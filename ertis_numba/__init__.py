@@ -23,6 +23,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ertis_numba.devices.commands import Setup
+    from ertis_numba.devices.emulator import Emulator
+    from ertis_numba.devices.sonar import Sonar
     from ertis_numba.errors import (
         ArgumentError,
         DataError,
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
         ErtisError,
         FormatVersionError,
         SettingsError,
+        SonarError,
+        SonarGoneError,
     )
     from ertis_numba.figures import plot
     from ertis_numba.frames import Energyscape, Measurement, Peak, Reflector, Stamp
@@ -50,6 +55,7 @@ __all__ = [
     "ArgumentError",
     "DataError",
     "DeviceError",
+    "Emulator",
     "Energyscape",
     "ErtisError",
     "FormatVersionError",
@@ -60,7 +66,11 @@ __all__ = [
     "Scene",
     "Settings",
     "SettingsError",
+    "Setup",
     "Simulator",
+    "Sonar",
+    "SonarError",
+    "SonarGoneError",
     "Stamp",
     "compare",
     "find_peaks",
@@ -77,7 +87,19 @@ __all__ = [
 ]
 
 _HOMES = {
-    "errors": ("ArgumentError", "DataError", "DeviceError", "ErtisError", "FormatVersionError", "SettingsError"),
+    "devices.commands": ("Setup",),
+    "devices.emulator": ("Emulator",),
+    "devices.sonar": ("Sonar",),
+    "errors": (
+        "ArgumentError",
+        "DataError",
+        "DeviceError",
+        "ErtisError",
+        "FormatVersionError",
+        "SettingsError",
+        "SonarError",
+        "SonarGoneError",
+    ),
     "figures": ("plot",),
     "frames": ("Energyscape", "Measurement", "Peak", "Reflector", "Stamp"),
     "geometry": ("load_layout",),

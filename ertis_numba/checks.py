@@ -2,6 +2,7 @@
 
 import difflib
 import math
+import re
 from collections.abc import Iterable
 
 import numpy as np
@@ -9,7 +10,21 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["between", "choice", "finite", "finite_array", "interval", "positive", "shape", "whole"]
+__all__ = [
+    "between",
+    "choice",
+    "finite",
+    "finite_array",
+    "gap",
+    "interval",
+    "positive",
+    "sensor_name",
+    "shape",
+    "whole",
+]
+
+_REASON_BYTES = 64
+_SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
 
 
 def finite(name: str, value: float) -> float:
@@ -78,3 +93,17 @@ def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
     """Refuse an array whose shape is not ``wanted``."""
     if actual != wanted:
         raise ArgumentError(f"{name} has shape {actual}; give shape {wanted}")
+
+
+def sensor_name(name: str) -> str:
+    """Return the name of a sensor if it can be that of a group in a file."""
+    if not _SENSOR_NAME.fullmatch(name):
+        raise ArgumentError(f"sensor name {name!r} cannot stand in a file; give letters, digits and _ . @ + -")
+    return name
+
+
+def gap(first: int, last: int, reason: str) -> None:
+    """Refuse sequence numbers from ``first`` to ``last`` that a file cannot say to be missing for this reason."""
+    whole("last missing sequence number", last, whole("first missing sequence number", first, 0), 2**63 - 1)
+    if not reason or not reason.isprintable() or len(reason.encode()) > _REASON_BYTES:
+        raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_REASON_BYTES} bytes")

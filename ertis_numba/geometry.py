@@ -6,6 +6,7 @@ taken from the centroid of the enabled microphones.
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Array, Processing
+from ertis_numba.settings import Array, Processing, Settings
 
 __all__ = [
     "PAPER_GRIDS",
@@ -28,11 +29,15 @@ __all__ = [
     "layout_names",
     "load_layout",
     "microphones",
+    "mounting",
+    "self_contained",
     "spherical_delays",
+    "storable",
     "unit_vectors",
 ]
 
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
+_UNIT = 1e-6  # of deviation that rounding to six digits leaves
 
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
@@ -226,6 +231,66 @@ def microphones(array: Array) -> Layout:
         delay_s=np.zeros(len(enabled)) if array.delay_s is None else np.asarray(array.delay_s, dtype=np.float64),
         word_bits=array.word_bits,
     )
+
+
+def self_contained(settings: Settings) -> Settings:
+    """Return settings whose microphones are written out, so that they depend on no layout file."""
+    if settings.array.positions_m is not None:
+        return settings
+    return settings.replace(array=microphones(settings.array).to_array())
+
+
+def storable(settings: Settings) -> Settings:
+    """Return settings as a recording holds them, which depend on no file.
+
+    Raises
+    ------
+    ArgumentError
+        The directions are those of a file, or the layout cannot be used.
+    """
+    if settings.processing.directions.lower().endswith(".csv"):
+        raise ArgumentError(
+            f"processing.directions is the file {settings.processing.directions}, which a recording cannot hold; "
+            "name a grid, and give the file when processing"
+        )
+    return self_contained(settings)
+
+
+def mounting(
+    sensor: str, translation_m: Sequence[float] = (0.0, 0.0, 0.0), rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+) -> dict[str, NDArray[np.float64]]:
+    """Return where a sensor is and how it is turned, at the origin and not turned by default.
+
+    Parameters
+    ----------
+    sensor : str
+        Its name, for errors.
+    translation_m : sequence of 3 float
+        x, y, z.
+    rotation_xyzw : sequence of 4 float
+        The unit quaternion that turns the sensor frame into that of the surroundings.
+
+    Returns
+    -------
+    dict of str to NDArray
+        ``translation_m``: (3,) float64, and ``rotation_xyzw``: (4,) float64.
+
+    Raises
+    ------
+    ArgumentError
+        A number is missing or not finite, or the quaternion has not length 1.
+    """
+    made = {
+        "translation_m": np.asarray(translation_m, dtype=np.float64),
+        "rotation_xyzw": np.asarray(rotation_xyzw, dtype=np.float64),
+    }
+    for (name, values), size in zip(made.items(), (3, 4), strict=True):
+        checks.shape(f"{name} of sensor {sensor}", values.shape, (size,))
+        checks.finite_array(f"{name} of sensor {sensor}", values)
+    length = float(np.linalg.norm(made["rotation_xyzw"]))
+    if abs(length - 1) > _UNIT:
+        raise ArgumentError(f"rotation_xyzw of sensor {sensor} has length {length:g}; give a unit quaternion")
+    return made
 
 
 def direction_grid(processing: Processing) -> Grid:

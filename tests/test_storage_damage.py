@@ -10,12 +10,12 @@ import h5py
 import numpy as np
 import pytest
 
+from ertis_numba import atomic
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
 from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
 from ertis_numba.storage import (
     Truth,
-    atomic,
     file_kind,
     open_energyscapes,
     open_recording,

@@ -13,13 +13,21 @@ __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
+    "capture": ("ertis_cli.capture:capture", "Take measurements of sensors into a recording."),
     "compare": ("ertis_cli.compare:compare", "Say how far an energyscape file is from the truth."),
+    "devices": ("ertis_cli.devices:devices", "List the sensors that are plugged in."),
+    "emulate": (
+        "ertis_cli.emulate:emulate",
+        "Be a sensor: on a port, with the measurements of a scene or a recording.",
+    ),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
     "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),
+    "recover": ("ertis_cli.recover:recover", "Make recordings of what a crash has left."),
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
+    "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),
 }
 """Where each command is, and what its help says first: commands are imported when they are run."""
 

@@ -1,7 +1,7 @@
 """Files: recordings and energyscapes. The only door to h5py."""
 
+from ertis_numba.atomic import check_target, replacing
 from ertis_numba.storage._reader import file_kind, sensor_names
-from ertis_numba.storage.atomic import check_target, replacing
 from ertis_numba.storage.energyscape import (
     EnergyscapeReader,
     EnergyscapeWriter,

@@ -20,7 +20,7 @@ from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
 from ertis_numba.storage.truth import Truth, read_truth
 
-__all__ = ["Reader", "file_kind", "sensor_names"]
+__all__ = ["Reader", "file_kind", "plain", "sensor_names"]
 
 Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
@@ -88,7 +88,7 @@ class Reader(ABC, Generic[Item]):
                 self._group = self._file["sensors"][self.sensor]
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data)
-                self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
+                self.attributes = {name: plain(value) for name, value in self._file.attrs.items()}
                 self.settings = Settings.from_toml(self._group["settings"][()].decode(), f"{self.path}: settings")
                 self._require_shapes()
                 self._load()
@@ -181,7 +181,7 @@ class Reader(ABC, Generic[Item]):
                 raise DataError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
 
     def _require_content(self) -> None:
-        wanted = _plain(self._group.attrs["content_sha256"])
+        wanted = plain(self._group.attrs["content_sha256"])
         got = content_sha256(self._group, self._table)
         if got != wanted:
             raise DataError(
@@ -229,8 +229,8 @@ def _open(path: Path) -> h5py.File:
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
-    kind = _plain(file.attrs.get("ertis_format", ""))
-    version = _plain(file.attrs.get("ertis_format_version", 0))
+    kind = plain(file.attrs.get("ertis_format", ""))
+    version = plain(file.attrs.get("ertis_format_version", 0))
     if not isinstance(kind, str) or kind not in _A or not isinstance(version, int):
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
     if version > FORMAT_VERSION:
@@ -240,7 +240,8 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     return str(kind)
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
+    """Return what an attribute holds as Python has it."""
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value

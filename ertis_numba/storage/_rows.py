@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.atomic import require_room
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Stamp
-from ertis_numba.storage.atomic import require_room
+from ertis_numba.storage._gaps import Numbers
 from ertis_numba.storage.schema import CHUNK_ROWS
 
 __all__ = ["RowReader", "RowWriter"]
@@ -44,7 +45,7 @@ class RowWriter:
         self._n_rows = 0
         self._last: Stamp | None = None
         self._epoch = 0
-        self.gaps: list[tuple[int, int]] = []
+        self.numbers = Numbers()
         self.check = 0
         """CRC-32 over all rows, to compare with what can be read back."""
 
@@ -86,11 +87,9 @@ class RowWriter:
         return self._n_rows
 
     def _count(self, stamp: Stamp) -> None:
-        if self._last is not None:
-            if stamp.sync_count < self._last.sync_count:
-                self._epoch += 1
-            if stamp.sequence > self._last.sequence + 1:
-                self.gaps.append((self._last.sequence + 1, stamp.sequence - 1))
+        if self._last is not None and stamp.sync_count < self._last.sync_count:
+            self._epoch += 1
+        self.numbers.add(stamp.sequence)
         self._last = stamp
 
 

@@ -13,12 +13,10 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
+from ertis_numba.atomic import check_target, replacing, require_room
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.geometry import microphones
-from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader, RowWriter
-from ertis_numba.storage.atomic import check_target, replacing, require_room
 from ertis_numba.storage.schema import (
     CONVENTIONS,
     FORMAT_VERSION,
@@ -32,7 +30,7 @@ from ertis_numba.storage.schema import (
 )
 from ertis_numba.storage.truth import Truth, write_truth
 
-__all__ = ["Writer", "self_contained"]
+__all__ = ["Writer"]
 
 Item = TypeVar("Item", Measurement, Energyscape)
 
@@ -46,13 +44,14 @@ class Writer(ABC, Generic[Item]):
     _kind: ClassVar[str]
     _data: ClassVar[str]
     _table: ClassVar[tuple[Variable, ...]]
+    _part_token: ClassVar[str | None] = None
 
     def __init__(
         self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str], truth: Mapping[str, Truth] | None
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
-        self._attributes = attributes
+        self._attributes = dict(attributes)
         self._truth = truth or {}
         self._part: Path
         self._file: h5py.File | None = None
@@ -76,7 +75,7 @@ class Writer(ABC, Generic[Item]):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._part = stack.enter_context(replacing(self.path, overwrite=self._overwrite))
+            self._part = stack.enter_context(replacing(self.path, overwrite=self._overwrite, token=self._part_token))
             self._file = stack.enter_context(self._open_part())
             self._stack = stack.pop_all()
         return self
@@ -187,13 +186,6 @@ class Writer(ABC, Generic[Item]):
             raise DataError(
                 f"{self.path} cannot be written ({_reason(error)}); free some space or write elsewhere"
             ) from error
-
-
-def self_contained(settings: Settings) -> Settings:
-    """Return settings whose microphones are written out, so that they depend on no layout file."""
-    if settings.array.positions_m is not None:
-        return settings
-    return settings.replace(array=microphones(settings.array).to_array())
 
 
 def _reason(error: Exception) -> str:

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.atomic import check_target
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import self_contained
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage._writer import Writer, self_contained
-from ertis_numba.storage.atomic import check_target
+from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.recording import RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import Layout, microphones
+from ertis_numba.geometry import Layout, microphones, self_contained, storable
+from ertis_numba.geometry import mounting as mounted
 from ertis_numba.settings import Air, Settings
-from ertis_numba.storage._reader import Reader
+from ertis_numba.storage._reader import Reader, plain
 from ertis_numba.storage._rows import RowWriter
-from ertis_numba.storage._writer import Writer, self_contained
+from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.schema import RECORDING, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
@@ -26,7 +27,6 @@ __all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write
 Mounting = tuple[Sequence[float], Sequence[float]]
 """Where a sensor is, x, y, z in m, and how it is turned, a unit quaternion x, y, z, w."""
 
-_UNIT = 1e-6  # of deviation that rounding to six digits leaves
 _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
 
 
@@ -60,6 +60,8 @@ class RecordingWriter(Writer[Measurement]):
         Where each sensor is and how it is turned, by its name: x, y, z in metres, and the unit
         quaternion x, y, z, w that turns the sensor frame into that of the surroundings. At the origin,
         not turned, by default.
+    firmware : mapping of str to str, optional
+        Version of each sensor's firmware, by its name.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -75,12 +77,29 @@ class RecordingWriter(Writer[Measurement]):
         source: str = "",
         truth: Mapping[str, Truth] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
+        firmware: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(path, overwrite=overwrite, attributes={"source": source, "history": ""}, truth=truth)
         self._given = settings
         self._settings: dict[str, Settings] = {}
         self._checked: dict[str, Settings] = {}
-        self._mounting = {sensor: _checked_mounting(sensor, *given) for sensor, given in (mounting or {}).items()}
+        self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
+        self._firmware = firmware or {}
+        self._noted: dict[str, list[tuple[int, int, str]]] = {}
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str) -> None:
+        """Say why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
+
+        They may also lie before the first measurement of the sensor or after its last one. What is there
+        after all is no gap; of other gaps, the reason is "not among the measurements given".
+
+        Raises
+        ------
+        ArgumentError
+            ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
+        """
+        checks.gap(first, last, reason)
+        self._noted.setdefault(sensor, []).append((first, last, reason))
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
         sensor = first.stamp.sensor
@@ -90,12 +109,7 @@ class RecordingWriter(Writer[Measurement]):
                 f"and {sensor}; give none, so that each has its own"
             )
         given = self._given or first.settings
-        if given.processing.directions.lower().endswith(".csv"):
-            raise ArgumentError(
-                f"processing.directions is the file {given.processing.directions}, which a recording cannot hold; "
-                "name a grid, and give the file when processing"
-            )
-        settings = self._settings[sensor] = self_contained(given)
+        settings = self._settings[sensor] = storable(given)
         layout = microphones(settings.array)
         samples = call_samples(settings.call)
         several = {"word": layout.n_words} if layout.n_words > 1 else {}
@@ -113,7 +127,8 @@ class RecordingWriter(Writer[Measurement]):
             dtypes={"pdm": f"<u{layout.word_bits // 8}"},
             texts={"settings": settings.to_toml()},
         )
-        describe(group, _identity(sensor, settings) | self._mounting.get(sensor, _checked_mounting(sensor)))
+        identity = _identity(sensor, settings, self._firmware.get(sensor, ""))
+        describe(group, identity | self._mounting.get(sensor, mounted(sensor)))
         describe(group["pdm"], {"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
         describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
         group["microphone"][:] = np.arange(len(layout.enabled))
@@ -138,17 +153,20 @@ class RecordingWriter(Writer[Measurement]):
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
-        self._require_sensors("mounting", self._mounting)
+        for name, given in (("mounting", self._mounting), ("firmware", self._firmware), ("a gap", self._noted)):
+            self._require_sensors(name, given)
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        sensor = group.name.rpartition("/")[2]
+        gaps = rows.numbers.missing(self._noted.get(sensor, ()))
         values: dict[str, list[Any]] = {
-            "gap": [0.0] * len(rows.gaps),
-            "gap_first": [first for first, _ in rows.gaps],
-            "gap_last": [last for _, last in rows.gaps],
-            "gap_reason": ["not among the measurements given"] * len(rows.gaps),
+            "gap": [0.0] * len(gaps),
+            "gap_first": [first for first, _, _ in gaps],
+            "gap_last": [last for _, last, _ in gaps],
+            "gap_reason": [reason.encode() for _, _, reason in gaps],
         }
         for name, column in values.items():
-            group[name].resize((len(rows.gaps),))
+            group[name].resize((len(gaps),))
             if len(column):
                 group[name][:] = column
 
@@ -163,26 +181,9 @@ def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
     }
 
 
-def _identity(sensor: str, settings: Settings) -> dict[str, Any]:
+def _identity(sensor: str, settings: Settings, firmware: str) -> dict[str, Any]:
     """Return who the sensor is."""
-    return {"serial_number": sensor, "model": settings.array.layout, "firmware": "", "frame_id": sensor}
-
-
-def _checked_mounting(
-    sensor: str, translation_m: Sequence[float] = (0.0, 0.0, 0.0), rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
-) -> dict[str, NDArray[np.float64]]:
-    """Return how a sensor is mounted, or refuse it."""
-    made = {
-        "translation_m": np.asarray(translation_m, dtype=np.float64),
-        "rotation_xyzw": np.asarray(rotation_xyzw, dtype=np.float64),
-    }
-    for (name, values), size in zip(made.items(), (3, 4), strict=True):
-        checks.shape(f"{name} of sensor {sensor}", values.shape, (size,))
-        checks.finite_array(f"{name} of sensor {sensor}", values)
-    length = float(np.linalg.norm(made["rotation_xyzw"]))
-    if abs(length - 1) > _UNIT:
-        raise ArgumentError(f"rotation_xyzw of sensor {sensor} has length {length:g}; give a unit quaternion")
-    return made
+    return {"serial_number": sensor, "model": settings.array.layout, "firmware": firmware, "frame_id": sensor}
 
 
 class RecordingReader(Reader[Measurement]):
@@ -191,6 +192,8 @@ class RecordingReader(Reader[Measurement]):
     Attributes
     ----------
     gaps : tuple of Gap
+    firmware : str
+        Its version; empty where it is not known.
     translation_m : (3,) float64
         Where the sensor is.
     rotation_xyzw : (4,) float64
@@ -202,6 +205,7 @@ class RecordingReader(Reader[Measurement]):
     _table: ClassVar[tuple[Variable, ...]] = RECORDING
 
     gaps: tuple[Gap, ...]
+    firmware: str
     translation_m: NDArray[np.float64]
     rotation_xyzw: NDArray[np.float64]
 
@@ -211,6 +215,7 @@ class RecordingReader(Reader[Measurement]):
         self.gaps = tuple(
             Gap(int(first), int(last), reason.decode()) for first, last, reason in zip(*columns, strict=True)
         )
+        self.firmware = str(plain(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = (
             np.asarray(self._group.attrs[name], dtype=np.float64) for name in ("translation_m", "rotation_xyzw")
         )

@@ -7,7 +7,6 @@ and MATLAB show the same names. One group ``/sensors/<name>`` holds one sensor.
 import hashlib
 import math
 import os
-import re
 import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
+from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
 __all__ = [
@@ -46,7 +46,6 @@ _TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
 _COLUMN_TEXT_BYTES: Final = 64
 _MOST_CHUNK_BYTES: Final = 2**32 - 1
 _UNLIMITED: Final = ("time", "gap")
-_SENSOR_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,9 +262,7 @@ def sensor_path(name: str) -> str:
     ArgumentError
         The name cannot be the name of a group.
     """
-    if not _SENSOR_NAME.fullmatch(name):
-        raise ArgumentError(f"sensor name {name!r} cannot stand in a file; give letters, digits and _ . @ + -")
-    return f"/sensors/{name}"
+    return f"/sensors/{checks.sensor_name(name)}"
 
 
 def date_created() -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["check_target", "replacing", "require_room"]
+__all__ = ["check_target", "part_of", "replacing", "require_room", "sync"]
 
 # HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
 # 914), so writing stops while there is still room for its tables.
@@ -60,12 +60,24 @@ def require_room(folder: Path, n_bytes: int) -> None:
         )
 
 
+def part_of(path: Path, token: str) -> Path:
+    """Return the name under which a file is written that is to become ``path``."""
+    return path.with_name(f"{path.name}.{token}.part")
+
+
 @contextmanager
-def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def replacing(path: Path, *, overwrite: bool = False, token: str | None = None) -> Iterator[Path]:
     """Yield the name to write to; when the block ends well, that file becomes ``path``.
 
     The name ends in ``.part`` and is nobody else's, so that two writers never share it. The
     file reaches the disk before it takes its name. Whatever ends the block, no ``.part`` is left.
+
+    Parameters
+    ----------
+    path : Path
+    overwrite : bool
+    token : str, optional
+        What makes the name nobody else's; some random digits by default.
 
     Raises
     ------
@@ -73,20 +85,22 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         As `check_target`, before the block and again before the file takes its name.
     """
     check_target(path, overwrite=overwrite)
-    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    part = part_of(path, token or secrets.token_hex(4))
     try:
         yield part
-        _sync(part)
+        sync(part)
         check_target(path, overwrite=overwrite)
         part.replace(path)
     except BaseException:  # Ctrl-C, too, must leave nothing behind
         part.unlink(missing_ok=True)
         raise
-    if os.name == "posix":  # elsewhere a folder cannot be opened
-        _sync(path.parent)
+    sync(path.parent)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring a file, or the names in a folder, to the disk."""
+    if path.is_dir() and os.name != "posix":
+        return  # there, a folder cannot be opened
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)

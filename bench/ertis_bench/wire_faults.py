@@ -1,0 +1,254 @@
+"""Send blocks over a line with faults, and tell what the receiver made of them."""
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.devices.commands import encode_block
+from ertis_numba.devices.faults import Faults, Spoilt, Stall, Unplug
+from ertis_numba.devices.protocol import Block, Instant, Receiver
+
+__all__ = ["KINDS", "Line", "Report", "send"]
+
+KINDS: Final[dict[str, float]] = {
+    "flip": 0.12,
+    "duplicate": 0.05,
+    "lose": 0.12,
+    "add": 0.1,
+    "swap": 0.06,
+    "cut": 0.08,
+    "drop": 0.03,
+    "stall": 0.1,
+    "unplug": 0.01,
+    "short_reads": True,
+}
+"""Faults on about half of all blocks."""
+
+_SHORTEST_S: Final = 0.04  # between two triggers
+_INTERVAL_S: Final = 0.05
+_BYTES_PER_S: Final = 1e6  # at least; a block takes …
+_BLOCK_S: Final = 0.02  # … so long at most
+_KEPT: Final = 64  # emissions, as long as something of them may still be in the receiver
+
+
+@dataclass(slots=True)
+class Report:
+    """What became of all blocks.
+
+    Attributes
+    ----------
+    sent, spoilt, untouched : int
+        All blocks; those that something was done to; those whose bytes came as they were, stalled or not.
+    delivered : int
+        With their own number and words.
+    untouched_lost : int
+        Untouched and not delivered.
+    mixed : int
+        Accepted, but of pieces of several blocks, or displaced.
+    wrong_counter : int
+        Accepted under a number that is not theirs.
+    twice : int
+        Accepted again.
+    altered, altered_accepted : int
+        Blocks of which some of the words were replaced by others in place, and how many of them were accepted.
+    lost, pending : int
+        As the receiver counts them; ``pending`` with the bytes of what it holds.
+    fed : int
+        Bytes that it was given.
+    rejected, rejected_blocks : Counter of str
+        As the receiver counts them.
+    """
+
+    sent: int = 0
+    spoilt: int = 0
+    untouched: int = 0
+    delivered: int = 0
+    untouched_lost: int = 0
+    mixed: int = 0
+    wrong_counter: int = 0
+    twice: int = 0
+    altered: int = 0
+    altered_accepted: int = 0
+    lost: int = 0
+    fed: int = 0
+    pending: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    rejected_blocks: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(slots=True)
+class _Sent:
+    crc32: int
+    data: bytes  # as it was sent
+    untouched: bool
+    delivered: bool = False
+
+
+class Line:
+    """Triggers, a line with faults, and a receiver whose blocks are compared with those that were sent.
+
+    Parameters are those of `send`.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_samples: int,
+        faults: Faults,
+        counter: int = 0,
+        triggers: Literal["regular", "irregular", "at once"] = "regular",
+        deadline_s: float | None = None,
+        bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.report = Report()
+        self._receiver = Receiver(n_samples, expected=counter, shortest_s=_SHORTEST_S, bits=bits)
+        self._faults, self._triggers, self._deadline_s = faults, triggers, deadline_s
+        self._random = np.random.default_rng(seed)
+        self._counter = counter
+        self._sent: dict[int, _Sent] = {}
+        self._trigger_s = self._now_s = 0.0
+        self._bytes_per_s = max(_BYTES_PER_S, self._receiver.n_bytes / _BLOCK_S)
+
+    def measure(self, words: NDArray[np.uint32]) -> None:
+        """Send one more block."""
+        self._wait()
+        counter, self._counter = self._counter, (self._counter + 1) % 2**32
+        block = encode_block(counter, words)
+        spoilt = self._faults.spoil(block)
+        self._note(counter, block, spoilt)
+        for piece in spoilt.pieces:
+            if isinstance(piece, Stall):
+                self._now_s += piece.duration_s
+            elif isinstance(piece, Unplug):
+                self._take(self._receiver.finish())
+                self._receiver.expect(self._counter)
+            else:
+                at_ns = round(self._now_s * 1e9) if self._triggers != "at once" else 0
+                self.report.fed += len(piece)
+                self._take(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
+                self._now_s += len(piece) / self._bytes_per_s
+
+    def finish(self) -> Report:
+        """Return what became of all blocks; nothing is sent any more."""
+        receiver, report = self._receiver, self.report
+        self._take(receiver.finish())
+        report.pending = receiver.pending + receiver.held * receiver.n_bytes
+        report.lost, report.rejected, report.rejected_blocks = (
+            receiver.lost,
+            receiver.rejected,
+            receiver.rejected_blocks,
+        )
+        for counter in [*self._sent]:
+            self._forget(counter)
+        return report
+
+    def _wait(self) -> None:
+        """Let time pass until the next trigger, and a deadline with it."""
+        interval_s = _INTERVAL_S
+        if self._triggers == "irregular":
+            interval_s = _SHORTEST_S + float(self._random.exponential(_INTERVAL_S))
+        self._trigger_s = max(self._trigger_s + interval_s, self._now_s)
+        if self._deadline_s is not None and self._trigger_s - self._now_s > self._deadline_s:
+            while self._receiver.missing:
+                self._take(self._receiver.expire())
+        self._now_s = self._trigger_s
+
+    def _note(self, counter: int, block: bytes, spoilt: Spoilt) -> None:
+        data, report = spoilt.data, self.report
+        self._sent[counter] = _Sent(zlib.crc32(block[8:-4]), data, untouched=data == block)
+        report.sent += 1
+        report.spoilt += bool(spoilt.faults)
+        report.untouched += data == block
+        whole = len(data) == len(block) and data[:8] == block[:8] and data[-4:] == block[-4:]
+        report.altered += whole and data != block
+        if len(self._sent) > _KEPT:
+            self._forget(next(iter(self._sent)))
+
+    def _forget(self, counter: int) -> None:
+        sent = self._sent.pop(counter)
+        self.report.delivered += sent.delivered
+        self.report.untouched_lost += sent.untouched and not sent.delivered
+
+    def _take(self, blocks: list[Block]) -> None:
+        """Compare what the receiver accepts with what was sent."""
+        report = self.report
+        for block in blocks:
+            words = block.words.astype("<u4").tobytes()
+            crc32 = zlib.crc32(words)
+            sent = self._sent.get(block.counter)
+            if sent is not None and crc32 == sent.crc32:
+                report.twice += sent.delivered
+                sent.delivered = True
+            elif sent is not None and words in sent.data:
+                report.altered_accepted += 1
+            elif any(crc32 == other.crc32 or words in other.data for other in self._sent.values()):
+                report.wrong_counter += 1
+            else:
+                report.mixed += 1
+
+
+def send(
+    n_blocks: int,
+    *,
+    seed: int = 1,
+    n_samples: int = 128,
+    words: NDArray[np.uint32] | None = None,
+    kinds: Mapping[str, float] = KINDS,
+    triggers: Literal["regular", "irregular", "at once"] = "regular",
+    deadline_s: float | None = None,
+    bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+    progress: Callable[[], object] | None = None,
+) -> Report:
+    """Send ``n_blocks`` over a line with faults and return what became of them.
+
+    Parameters
+    ----------
+    n_blocks : int
+        The counter runs over its end half-way.
+    seed : int
+    n_samples : int
+        Words of a block.
+    words : (sample,) uint32, optional
+        Of which each block has a stretch from a random place; random words by default.
+    kinds : mapping of str to float
+        As `Faults` takes them.
+    triggers : {"regular", "irregular", "at once"}
+        Every 50 ms; 40 ms apart and 50 ms more on average; all bytes without a moment between them, so that time
+        tells nothing.
+    deadline_s : float, optional
+        Silence after which what has begun is given up; never by default.
+    bits : callable, optional
+        The receiver's check of the bits.
+    progress : callable, optional
+        Called after each block.
+
+    Returns
+    -------
+    Report
+    """
+    random = np.random.default_rng(seed)
+    line = Line(
+        n_samples=n_samples,
+        faults=Faults(seed, kinds),
+        counter=(2**32 - n_blocks // 2) % 2**32,
+        triggers=triggers,
+        deadline_s=deadline_s,
+        bits=bits,
+        seed=seed,
+    )
+    for _ in range(n_blocks):
+        if words is None:
+            block = random.integers(0, 2**32, n_samples, dtype=np.uint32)
+        else:
+            begin = int(random.integers(len(words) - n_samples + 1))
+            block = words[begin : begin + n_samples]
+        line.measure(block)
+        if progress is not None:
+            progress()
+    return line.finish()

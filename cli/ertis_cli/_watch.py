@@ -1,0 +1,161 @@
+"""What is told while measurements are captured, and what ends that."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.devices.bits import BitCheck
+
+    from ertis_numba.capture import Session
+    from ertis_numba.journal import Entry, Journal
+
+__all__ = ["Signals", "Watch", "report", "stopped_by_signals"]
+
+_REFRESH_S = 0.25
+_ALIVE = 0.05  # share of ones, and of zeros, of a microphone that is
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+class Signals:
+    """What asked this program to end, and what is to be done about it."""
+
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        self.stop: Callable[[], None] | None = None
+
+    def __call__(self, number: int, _: object) -> None:
+        self.came.append(number)
+        if self.stop is None or len(self.came) > 1:  # before there is anything to save, or who asks twice means it
+            raise KeyboardInterrupt
+        self.stop()
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[Signals]:
+    """Yield what remembers the signals that ask this program to end."""
+    asked = Signals()
+    before = {name: signal.signal(getattr(signal, name), asked) for name in _SIGNALS if hasattr(signal, name)}
+    try:
+        yield asked
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
+
+
+class Watch:
+    """What is told while a capture runs: lines of JSON, notes, and one line that is written again and again."""
+
+    def __init__(self, *, quiet: bool, as_json: bool) -> None:
+        self._quiet, self._as_json = quiet, as_json
+        self._line = sys.stderr.isatty() and not quiet
+        self._next_s = 0.0
+        self.took: dict[str, float] = {}
+        self._session: Session | None = None
+        self._checks: dict[str, BitCheck] = {}
+
+    def run(self, session: "Session", journal: "Journal", checks: "dict[str, BitCheck]") -> Exception | None:
+        """Run a session, and return what has ended it before its time."""
+        self._session, self._checks = session, checks
+        begun_s, cpu_s = time.monotonic(), time.process_time()
+        try:
+            session.run(journal)
+        except (OSError, ValueError) as error:  # what was stored is sealed whatever happened
+            return error
+        finally:
+            self.took = {"seconds": time.monotonic() - begun_s, "cpu_s": time.process_time() - cpu_s}
+            if self._line:
+                click.echo("\r\x1b[K", err=True, nl=False)
+        return None
+
+    def stored(self, entries: "list[Entry]") -> None:
+        """Tell of measurements that are durable."""
+        if self._as_json:
+            for entry in entries:
+                stamp = entry.measurement.stamp
+                options.print_json(
+                    {
+                        "event": "stored",
+                        "sensor": stamp.sensor,
+                        "sequence": stamp.sequence,
+                        "sync_count": stamp.sync_count,
+                        "time_ns": stamp.timestamp_ns,
+                        "uncertainty_ns": stamp.timestamp_uncertainty_ns,
+                        "crc32": entry.crc32,
+                    }
+                )
+        if self._line and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _REFRESH_S
+            click.echo(f"\r\x1b[K{self._progress()}", err=True, nl=False)
+
+    def note(self, sensor: str, text: str) -> None:
+        """Tell what happened to a sensor."""
+        if self._as_json:
+            options.print_json({"event": "note", "sensor": sensor, "text": text})
+        self._say(f"{sensor}: {text}")
+
+    def back(self, sensor: str, away_s: float) -> None:
+        """Tell that a sensor was unplugged and measures again."""
+        if self._as_json:
+            options.print_json({"event": "back", "sensor": sensor, "away_s": round(away_s, 3)})
+        self._say(f"{sensor}: is back after {away_s:.1f} s")
+
+    def _say(self, text: str) -> None:
+        options.say(("\r\x1b[K" if self._line else "") + text, quiet=self._quiet)
+
+    def _progress(self) -> str:
+        session = self._session
+        if session is None:
+            return ""
+        counts = session.counts.values()
+        parts = [
+            f"{sum(each.stored for each in counts)} stored",
+            " ".join(f"{each.rate_hz:.1f}" for each in counts) + " Hz",
+            f"{sum(each.lost for each in counts)} lost",
+            *(f"{sensor}: {text}" for sensor, text in self._health()),
+        ]
+        return "   ".join(parts)[:160]
+
+    def _health(self) -> Iterator[tuple[str, str]]:
+        """Yield how many microphones of each sensor give ones and zeros."""
+        for sensor, check in self._checks.items():
+            density = check.density
+            if density is not None:
+                alive = int(((density > _ALIVE) & (density < 1 - _ALIVE)).sum())
+                yield sensor, f"{alive}/{len(density)} microphones"
+
+
+def report(target: Path, session: "Session", took: dict[str, float], *, quiet: bool, as_json: bool) -> None:
+    """Tell what has come of it."""
+    counts = session.counts
+    several = len(counts) > 1
+    stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))
+    groups = f", {session.complete} complete groups, {session.incomplete} incomplete" if several else ""
+    options.say(f"{target}: {options.counted(stored, 'measurement')}, {lost} lost{groups}", quiet=quiet)
+    for sensor, each in counts.items():
+        for reason, count in each.missing.items():
+            options.say(f"{sensor}: {count} missing, {reason}", quiet=quiet)
+    if as_json:
+        report: dict[str, Any] = {
+            sensor: {
+                "stored": each.stored,
+                "missing": dict(each.missing),
+                "failed": each.failed,
+                "unplugged": each.unplugged,
+            }
+            for sensor, each in counts.items()
+        }
+        groups_report = {"complete": session.complete, "incomplete": session.incomplete} if several else None
+        options.print_json(
+            {"event": "captured", "output": str(target), "stored": stored, "lost": lost, "sensors": report}
+            | {name: round(value, 3) for name, value in took.items()}
+            | ({"groups": groups_report} if groups_report else {})
+        )

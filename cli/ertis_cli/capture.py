@@ -1,0 +1,208 @@
+"""``ertis capture``: sensors to a recording."""
+
+import re
+import sys
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ertis_cli import options
+from ertis_cli._watch import Watch, report, stopped_by_signals
+
+if TYPE_CHECKING:
+    from ertis_numba.devices.commands import Setup
+    from ertis_numba.devices.sonar import Sonar
+    from ertis_numba.settings import Settings
+
+__all__ = ["capture"]
+
+
+@click.command()
+@click.option(
+    "--port",
+    "ports",
+    multiple=True,
+    required=True,
+    metavar="PORT",
+    help="Path, serial number or name of a sensor; several times for several sensors.",
+)
+@options.output("Recording to write; SERIAL_TIME.h5 by default.")
+@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor.")
+@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option(
+    "--trigger",
+    type=click.Choice(["command", "sync"]),
+    default="command",
+    show_default=True,
+    help="What starts a measurement: this program, or pulses of the SYNC chain.",
+)
+@click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Of commands.")
+@click.option("--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="Input of the SYNC pulses.")
+@click.option("--passive", is_flag=True, help="Only listen: nothing is emitted.")
+@click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Calls per measurement.")
+@click.option(
+    "--preset", metavar="NAME", help="short_, default_ or long_ with 20_80 or 25_50; default_25_50 by default."
+)
+@click.option("--layout", metavar="NAME", help="Array: eRTIS_v3D1, the default, and others, or a .toml or .csv file.")
+@click.option("--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings as TOML.")
+@click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
+@click.option("--name", "names", multiple=True, metavar="NAME", help="Of the sensors, in the order of the ports.")
+@click.option(
+    "--patience",
+    type=float,
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="How long a sensor may be silent or away.",
+)
+@click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse words that cannot be PDM.")
+@click.option("--dry-run", is_flag=True, help="Print the commands that the sensor would get, and end.")
+@options.force
+@options.quiet
+@options.as_json
+def capture(
+    *,
+    ports: tuple[str, ...],
+    target: Path | None,
+    n: int | None,
+    duration: float | None,
+    trigger: str,
+    rate: float,
+    pin: int,
+    passive: bool,
+    emissions: int,
+    preset: str | None,
+    layout: str | None,
+    settings_file: Path | None,
+    temperature: float | None,
+    names: tuple[str, ...],
+    patience: float,
+    check_bits: bool,
+    dry_run: bool,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Take measurements of sensors into a recording.
+
+    Each measurement is durable, in a journal beside the recording, before it is told of; the recording appears
+    complete at the end. Ctrl-C ends a capture after the measurement that has begun. What a crash leaves,
+    'ertis recover' seals. With --json there is a line for each measurement.
+    """
+    from ertis_numba.devices.commands import Setup
+
+    settings = _settings(preset, layout, settings_file, temperature)
+    setup = Setup.of(settings, active=not passive, trigger=trigger, pin=pin, emissions=emissions)
+    if dry_run:
+        _print_commands(setup, as_json=as_json)
+        return
+    _require_one_each(ports, names)
+    from ertis_numba.devices.bits import BitCheck
+
+    from ertis_numba.atomic import check_target
+    from ertis_numba.capture import Session
+    from ertis_numba.devices.sonar import Sonar
+    from ertis_numba.journal import SUFFIX, Journal
+
+    if target is not None:
+        check_target(target, overwrite=force)
+    watch = Watch(quiet=quiet, as_json=as_json)
+    with stopped_by_signals() as signals, ExitStack() as stack:
+        sonars = _named([stack.enter_context(Sonar.open(port)) for port in ports], names)
+        target = target or Path(_default_name(list(sonars)))
+        check_target(target, overwrite=force)
+        session = Session(
+            sonars,
+            settings,
+            trigger=trigger,
+            rate_hz=rate,
+            n=n,
+            duration_s=duration,
+            patience_s=patience,
+            on_stored=watch.stored,
+            on_note=watch.note,
+            on_back=watch.back,
+        )
+        checks = {name: BitCheck(setup.n_samples, setup.pdm_rate_hz) for name in sonars}
+        for name, sonar in sonars.items():
+            sonar.configure(setup, bits=checks[name].check if check_bits else None)
+        path = target.with_name(f"{target.name}{SUFFIX}")
+        journal = stack.enter_context(Journal.create(path, target=target.name, source=", ".join(ports)))
+        signals.stop = session.stop
+        failure = watch.run(session, journal, checks)
+        stack.close()
+        _seal(path, failure, overwrite=force)
+    report(target, session, watch.took, quiet=quiet, as_json=as_json)
+    if failure is not None:
+        raise failure
+    if signals.came and (n is not None or duration is not None):
+        sys.exit(128 + signals.came[0])
+
+
+def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
+    """Make the recording, whatever has ended the capture; what that was is told rather than that nothing came."""
+    from ertis_numba.capture.sealer import seal_apart
+
+    try:
+        seal_apart(path, overwrite=overwrite)
+    except (OSError, ValueError) as error:
+        raise failure or error from error
+    except KeyboardInterrupt:
+        click.echo(f"the measurements are safe in {path}; seal them by 'ertis recover {path}'", err=True)
+        raise
+
+
+def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
+    for port in ports:
+        if ports.count(port) > 1:
+            raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
+    if names and len(names) != len(ports):
+        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one for each")
+
+
+def _settings(
+    preset: str | None, layout: str | None, settings_file: Path | None, temperature: float | None
+) -> "Settings":
+    """Return settings from a preset or a file, with the array and the air that were named."""
+    from ertis_numba.settings import Air, Array, Settings
+
+    if settings_file is not None and preset is not None:
+        raise click.UsageError("--preset and --settings both say how to record; give one of them")
+    settings = Settings.load(settings_file) if settings_file else Settings.from_preset(preset or "default_25_50")
+    if layout is not None:
+        settings = settings.replace(array=Array(layout=layout))
+    if temperature is not None:
+        air = Air() if settings_file is None else settings.air
+        settings = settings.replace(air=air.replace(temperature_c=temperature))
+    return settings
+
+
+def _print_commands(setup: "Setup", *, as_json: bool) -> None:
+    """Print what a sensor would be told; the samples of the call as one line."""
+    before, call, after = setup.before_call(), setup.call(), setup.after_call()
+    if as_json:
+        lines = [command.encode().decode().strip() for command in (*before, *call, *after)]
+        options.print_json({"commands": lines})
+        return
+    rows = [(command.encode().decode().strip(), command.about) for command in before]
+    rows.append((f"!C,0… to {len(call) - 1}", "samples of the call, unless they are loaded already"))
+    rows += [(command.encode().decode().strip(), command.about) for command in after]
+    for line, about in rows:
+        click.echo(f"{line:20}  {about}")
+
+
+def _named(opened: "list[Sonar]", names: tuple[str, ...]) -> "dict[str, Sonar]":
+    """Return sensors by the names that they are to have, their serial numbers by default."""
+    chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", sonar.serial_number) or "sensor" for sonar in opened]
+    for name in chosen:
+        if chosen.count(name) > 1:
+            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; name each differently by --name")
+    return dict(zip(chosen, opened, strict=True))
+
+
+def _default_name(sensors: list[str]) -> str:
+    first = sensors[0] if len(sensors) == 1 else f"{sensors[0]}+{len(sensors) - 1}"
+    return f"{first}_{datetime.now(UTC):%Y%m%dT%H%M%SZ}.h5"

@@ -1,0 +1,82 @@
+"""``ertis devices``: which sensors are plugged in."""
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.devices.survey import Answer
+
+__all__ = ["devices"]
+
+_HEADINGS = ("port", "serial number", "state", "firmware", "call", "what")
+
+
+@click.command()
+@click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Ask this one only; may be repeated.")
+@options.as_json
+def devices(*, names: tuple[str, ...], as_json: bool) -> None:
+    """List the eRTIS devices that are plugged in or emulated.
+
+    Ports that may be one, which are those of USB CDC-ACM, are asked for their firmware and the hash of their call; one
+    that still measures for a program that has ended is stopped by that. Those that another program uses are listed, but
+    not asked. With --port any other serial port is asked, too, by its path, serial number or name.
+
+    The exit code is 0 even if there is none; with --port it is 1 unless all of them are an eRTIS or in use.
+    """
+    from ertis_numba.devices.ports import find_ports, resolve
+    from ertis_numba.devices.survey import survey
+
+    found = [resolve(name) for name in names] if names else [port for port in find_ports() if port.may_be_sonar]
+    answers = survey(found)
+    listed = [answer for answer in answers if names or answer.state != "no answer"]
+    if as_json:
+        options.print_json({"devices": [_report(answer) for answer in listed]})
+    else:
+        _print_table(listed)
+    for answer in answers:
+        if not names and answer.error is not None and answer.state != "in use":
+            click.echo(str(answer.error), err=True)
+    if not listed:
+        click.echo("no eRTIS was found; plug one in, or start an emulated one with 'ertis emulate'", err=True)
+    for answer in answers:
+        if names and answer.error is not None and answer.state != "in use":
+            raise answer.error
+
+
+def _report(answer: "Answer") -> dict[str, Any]:
+    port = answer.port
+    return {
+        "port": port.path,
+        "link": port.link,
+        "serial_number": port.serial_number,
+        "description": port.description,
+        "emulated": port.emulated,
+        "state": answer.state,
+        "firmware": answer.firmware,
+        "call_hash": answer.call_hash,
+    }
+
+
+def _print_table(answers: list["Answer"]) -> None:
+    if not answers:
+        return
+    rows = [_HEADINGS, *(_row(answer) for answer in answers)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _row(answer: "Answer") -> tuple[str, ...]:
+    port = answer.port
+    call = "-" if answer.call_hash is None else f"{answer.call_hash:#06x}"
+    return (
+        port.path,
+        port.serial_number or "-",
+        answer.state,
+        answer.firmware or "-",
+        call,
+        port.description or "-",
+    )

@@ -1,0 +1,83 @@
+"""``ertis verify``: whether all of a file is there, and as it was written."""
+
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.storage.verify import SensorReport
+
+__all__ = ["verify"]
+
+_FAILED, _INCOMPLETE = 1, 3
+
+
+@click.command()
+@click.argument("paths", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.quiet
+@options.as_json
+@click.pass_context
+def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
+    """Check every measurement of a file, and what is missing.
+
+    In recordings and in journals, each measurement is read and compared with its checksum. The exit code is 0 if all is there and as it
+    was written; 3 if measurements are missing, damaged or out of order; 1 if a file cannot be read at all.
+    """
+    from ertis_numba.errors import ErtisError
+    from ertis_numba.storage.verify import verify as verified
+
+    files: list[dict[str, Any]] = []
+    code = 0
+    for path in paths:
+        try:
+            reports = verified(path)
+        except (ErtisError, OSError) as error:
+            click.echo(f"ertis: error: {error}", err=True)
+            files.append({"file": str(path), "error": str(error)})
+            code = _FAILED
+            continue
+        whole = all(report.whole for report in reports)
+        code = code or (0 if whole else _INCOMPLETE)
+        sensors = [{**asdict(report), "missing": report.missing, "whole": report.whole} for report in reports]
+        files.append({"file": str(path), "whole": whole, "sensors": sensors})
+        if not (quiet or as_json):
+            for report in reports:
+                click.echo(f"{path}  {_line(report)}")
+    if as_json:
+        options.print_json({"files": files})
+    ctx.exit(code)
+
+
+def _line(report: "SensorReport") -> str:
+    """Return what was found of a sensor."""
+    if report.fault:
+        return f"{report.sensor}: {report.fault}"
+    told = [options.counted(report.measurements, "measurement")]
+    if report.gaps:
+        gaps = "; ".join(f"{_span(gap.first, gap.last)}: {gap.reason}" for gap in report.gaps)
+        told.append(f"{report.missing} missing ({gaps})")
+    if report.damaged:
+        told.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
+    if report.disordered:
+        told.append(f"{len(report.disordered)} out of order (at {_places(report.disordered)})")
+    return f"{report.sensor}: {', '.join(told)}{', whole' if report.whole else ''}"
+
+
+def _places(places: Iterable[int]) -> str:
+    """Return numbers in words, where neighbours are told together."""
+    runs: list[list[int]] = []
+    for place in places:
+        if runs and place == runs[-1][1] + 1:
+            runs[-1][1] = place
+        else:
+            runs.append([place, place])
+    return ", ".join(_span(first, last) for first, last in runs)
+
+
+def _span(first: int, last: int) -> str:
+    return str(first) if first == last else f"{first} to {last}"

@@ -1,0 +1,169 @@
+"""Threads that take blocks from sensors: one for each, so that none waits for another or for the disk."""
+
+import math
+import queue
+import threading
+import time
+from dataclasses import dataclass
+
+from ertis_numba.devices.protocol import Block
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.errors import SonarError, SonarGoneError
+
+__all__ = ["Arrived", "Ended", "Event", "Failed", "Note", "Pace", "Reader", "Returned"]
+
+_MOST_FAILURES = 5  # measurements in a row without an answer
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """A measurement is here."""
+
+    sensor: str
+    block: Block
+    tick: int | None
+    """Number of the command; None where SYNC pulses trigger."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A measurement that was asked for did not come."""
+
+    sensor: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something that whoever watches should know."""
+
+    sensor: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Returned:
+    """A sensor was unplugged and is back; its counter has started again."""
+
+    sensor: str
+    away_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A sensor gives no more."""
+
+    sensor: str
+    error: Exception | None
+
+
+Event = Arrived | Failed | Note | Returned | Ended
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pace:
+    """When commands are given: ticks that all sensors share.
+
+    Attributes
+    ----------
+    start_s : float
+        Of the first, by `time.monotonic`.
+    rate_hz : float
+    n : int, optional
+        Measurements that each sensor is to give.
+    """
+
+    start_s: float
+    rate_hz: float
+    n: int | None
+
+
+class Reader(threading.Thread):
+    """Takes the blocks of one sensor, and survives that it is unplugged.
+
+    Parameters
+    ----------
+    sensor : str
+    sonar : Sonar
+        Configured, and armed if pulses trigger it.
+    pace : Pace, optional
+        Of commands; SYNC pulses trigger where there is none.
+    patience_s : float
+        How long a sensor may be silent or away.
+    events : queue.Queue
+        Where everything goes; while it is full the sensor waits.
+    """
+
+    def __init__(
+        self, sensor: str, sonar: Sonar, *, pace: Pace | None, patience_s: float, events: "queue.Queue[Event]"
+    ) -> None:
+        super().__init__(name=f"reader of {sensor}", daemon=True)
+        self._sensor, self._sonar, self._pace = sensor, sonar, pace
+        self._patience_s, self._events = patience_s, events
+        self._stop_asked = threading.Event()
+        self._abandoned = threading.Event()
+
+    def stop(self) -> None:
+        """Take the measurement that has begun, and no more."""
+        self._stop_asked.set()
+
+    def abandon(self) -> None:
+        """Stop, and let go of what cannot be handed over: nobody takes it any more."""
+        self._stop_asked.set()
+        self._abandoned.set()
+
+    def run(self) -> None:
+        """Take blocks until asked to stop, or until the sensor has gone for good."""
+        error: Exception | None = None
+        try:
+            if self._pace is None:
+                self._listen()
+            else:
+                self._command(self._pace)
+        except Exception as failure:  # noqa: BLE001  whatever it was, whoever waits for this thread must hear of it
+            error = failure
+        self._put(Ended(self._sensor, error))
+
+    def _listen(self) -> None:
+        while not self._stop_asked.is_set():
+            try:
+                for block in self._sonar.listen(stop=self._stop_asked.is_set, timeout_s=self._patience_s):
+                    self._put(Arrived(self._sensor, block, None))
+            except SonarGoneError as error:
+                self._come_back(error)
+
+    def _command(self, pace: Pace) -> None:
+        tick = taken = failures = 0
+        while pace.n is None or taken < pace.n:
+            due_s = pace.start_s + tick / pace.rate_hz
+            if self._stop_asked.wait(max(0.0, due_s - time.monotonic())):
+                return
+            try:
+                block = self._sonar.measure()
+            except SonarGoneError as error:
+                self._come_back(error)
+            except SonarError as error:
+                failures += 1
+                self._put(Failed(self._sensor, str(error)))
+                if failures == _MOST_FAILURES:
+                    raise
+            else:
+                failures, taken = 0, taken + 1
+                self._put(Arrived(self._sensor, block, tick))
+            late = math.ceil((time.monotonic() - pace.start_s) * pace.rate_hz - 1e-3)
+            tick = max(tick + 1, late)
+
+    def _come_back(self, error: SonarGoneError) -> None:
+        self._put(Note(self._sensor, str(error)))
+        gone_s = time.monotonic()
+        self._sonar.reconnect(within_s=self._patience_s, stop=self._stop_asked.is_set)
+        if not self._stop_asked.is_set():
+            self._put(Returned(self._sensor, time.monotonic() - gone_s))
+
+    def _put(self, event: Event) -> None:
+        while not self._abandoned.is_set():
+            try:
+                self._events.put(event, timeout=0.2)
+            except queue.Full:
+                continue
+            return

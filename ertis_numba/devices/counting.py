@@ -1,0 +1,224 @@
+"""Which blocks carry the number that the sensor gave them."""
+
+import bisect
+import statistics
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from ertis_numba.devices.blocks import Block
+
+__all__ = ["CounterCheck"]
+
+_NUMBERS: Final = 2**32
+_MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
+_BURST = 0.75  # of the shortest interval: what comes later than this after a block's first byte is of another trigger
+_AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
+_INTERVALS = 8  # remembered; of these …
+_ALIKE = 6  # … so many …
+_REGULAR = 0.03  # … are so near their median, as a share of it, where triggers are regular
+_FAR = 10  # intervals beyond which the median is too coarse to count them
+_NEAR = 0.15  # of an interval: farther from a whole number of them, something has come late
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A block with what tells about its number: all the bytes rejected before it, and the burst that it began in."""
+
+    counter: int
+    rejected: float
+    burst: int
+    block: Block | None = None  # None where it stands for a counter that was set
+
+
+class CounterCheck:
+    """Tells numbers that were sent from numbers that were damaged.
+
+    Nothing in a block says that its counter is right. What says so is other blocks:
+
+    1. The next number directly behind its predecessor, not a byte rejected between them, is right.
+    2. So is a number that is ahead by as many as there were triggers since. Where these are regular they are counted by
+       the clock, else by the bursts in which bytes came, damaged ones included: a sensor that is triggered
+       sends at once and then is silent.
+    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2 are right,
+       whatever was taken before them; so the count is found again after any loss, and after a sensor began anew.
+    4. A number between the last right one and a later one is right if the time between them has room for it.
+
+    A block is held for three others at most, and a number that is the last one's again is a copy.
+
+    Parameters
+    ----------
+    shortest_s : float
+        Time from one trigger to the next at least.
+    expected : int, optional
+        Number of the first block; it or the one after is right. Any by default.
+
+    Attributes
+    ----------
+    lost : int
+        Numbers skipped between those that were right.
+    """
+
+    def __init__(self, *, shortest_s: float, expected: int | None = None) -> None:
+        self.lost = 0
+        self._shortest_ns = shortest_s * 1e9
+        self._bursts = 0  # before those in the list
+        self._burst_ns: list[int] = []  # beginning of each since the last block
+        self._intervals_ns: deque[float] = deque(maxlen=_INTERVALS)
+        self._held: list[_Entry] = []
+        self._decided: list[tuple[Block, bool]] = []
+        self._last: _Entry | None = None
+        if expected is not None:
+            self.expect(expected)
+
+    @property
+    def held(self) -> int:
+        """Blocks that are not decided."""
+        return len(self._held)
+
+    def expect(self, counter: int) -> list[tuple[Block, bool]]:
+        """Say that ``counter``, or the number after it, comes next; return what was held, none of it right."""
+        self._reject_held()
+        self._last = _Entry((counter - 1) % _NUMBERS, 0.0, self._bursts + len(self._burst_ns))
+        return self._results()
+
+    def heard(self, at_ns: int) -> None:
+        """Note that bytes came, whatever they are."""
+        if not self._burst_ns or at_ns - self._burst_ns[-1] >= _BURST * self._shortest_ns:
+            self._burst_ns.append(at_ns)
+
+    def judge(self, block: Block, rejected: float) -> list[tuple[Block, bool]]:
+        """Return all blocks that are decided by this one, in the order in which they came, and whether they are right.
+
+        Parameters
+        ----------
+        block : Block
+        rejected : float
+            Bytes that were rejected so far outside of blocks, by those of a block.
+        """
+        place = bisect.bisect_right(self._burst_ns, block.arrived.monotonic_ns) - 1
+        self._bursts += max(place, 0)
+        # What has come since is all of this block, even if it came late.
+        self._burst_ns = self._burst_ns[max(place, 0) :][:1]
+        entry = _Entry(block.counter, rejected, self._bursts + 1, block)
+        if self._last is None:
+            self._accept(entry)
+        elif self._last.block is not None and entry.counter == self._last.counter:
+            self._decided.append((block, False))
+        else:
+            self._decide(entry, self._last)
+        return self._results()
+
+    def finish(self) -> list[tuple[Block, bool]]:
+        """Decide what is held: what fits the time is right."""
+        self._accept_fitting(self._held)
+        return self._results()
+
+    def _results(self) -> list[tuple[Block, bool]]:
+        decided, self._decided = self._decided, []
+        return decided
+
+    def _decide(self, entry: _Entry, last: _Entry) -> None:
+        *_, before = [last, *self._held]
+        if before is not last and _directly(before, entry):
+            self._agree(before, entry)
+        elif (before is last and _directly(last, entry)) or self._as_triggered(last, entry):
+            self._reject_held()
+            self._accept(entry)
+        elif agreeing := [held for held in self._held if self._as_triggered(held, entry)]:
+            self._agree(agreeing[-1], entry)
+        elif any(self._fits(last, held) and self._fits(held, entry) for held in self._held):
+            self._accept_fitting(self._held, entry)
+            self._held.append(entry)
+        else:
+            if len(self._held) == _MOST_HELD:
+                self._reject(self._held.pop(0))
+            self._held.append(entry)
+
+    def _agree(self, held: _Entry, entry: _Entry) -> None:
+        """Take two that agree, and what fits in before them."""
+        place = self._held.index(held)
+        earlier, self._held = self._held[:place], self._held[place + 1 :]
+        self._accept_fitting(earlier, held)
+        self._accept(held)
+        self._reject_held()
+        self._accept(entry)
+
+    def _accept_fitting(self, entries: list[_Entry], end: _Entry | None = None) -> None:
+        """Take those of the held ones that the time has room for after the last right one and before ``end``."""
+        for entry in [*entries]:
+            before = self._last is None or self._fits(self._last, entry)
+            if before and (end is None or self._fits(entry, end)):
+                self._accept(entry)
+            else:
+                self._reject(entry)
+        entries.clear()
+
+    def _accept(self, entry: _Entry) -> None:
+        last, self._last = self._last, entry
+        if entry.block is not None:
+            self._decided.append((entry.block, True))
+        if last is None or not self._has_room(last, entry):
+            return
+        ahead = _ahead(last, entry)
+        if last.block is None:  # whether a sensor that is set to n counts from n or n + 1 is its own affair
+            self.lost += ahead - 1 - (ahead != entry.burst - last.burst)
+        else:
+            self.lost += ahead - 1
+            self._intervals_ns.append(_elapsed_ns(last, entry) / ahead)
+
+    def _reject(self, entry: _Entry) -> None:
+        if entry.block is not None:
+            self._decided.append((entry.block, False))
+
+    def _reject_held(self) -> None:
+        for entry in self._held:
+            self._reject(entry)
+        self._held.clear()
+
+    def _as_triggered(self, first: _Entry, second: _Entry) -> bool:
+        """Whether numbers went on by as many as there were triggers."""
+        ahead = _ahead(first, second)
+        if first.block is None:
+            return 0 <= ahead - max(1, second.burst - first.burst) <= 1
+        return ahead == self._n_triggers(first, second)
+
+    def _n_triggers(self, first: _Entry, second: _Entry) -> int:
+        return self._by_clock(first, second) or max(1, second.burst - first.burst)
+
+    def _by_clock(self, first: _Entry, second: _Entry) -> int | None:
+        """Return how many regular triggers there were, None where they are not regular or that is not clear."""
+        if len(self._intervals_ns) < _INTERVALS:
+            return None
+        typical_ns = statistics.median(self._intervals_ns)
+        n_alike = sum(abs(interval_ns - typical_ns) <= _REGULAR * typical_ns for interval_ns in self._intervals_ns)
+        if n_alike < _ALIKE or typical_ns <= 0:
+            return None
+        passed = _elapsed_ns(first, second) / typical_ns
+        count = round(passed)
+        return count if 1 <= count <= _FAR and abs(passed - count) <= _NEAR else None
+
+    def _fits(self, first: _Entry, second: _Entry) -> bool:
+        """Whether nothing speaks against two numbers both being right."""
+        return self._has_room(first, second) and self._by_clock(first, second) in {None, _ahead(first, second)}
+
+    def _has_room(self, first: _Entry, second: _Entry) -> bool:
+        """Whether so many triggers may have come between two blocks, of which all that sent anything were heard."""
+        bursts = max(1, second.burst - first.burst)
+        time = bursts if first.block is None else _elapsed_ns(first, second) / self._shortest_ns
+        return bursts <= _ahead(first, second) <= _AHEAD + max(time, second.rejected - first.rejected)
+
+
+def _directly(first: _Entry, second: _Entry) -> bool:
+    """Whether a number is the next one and its block, too."""
+    return _ahead(first, second) == 1 and second.rejected == first.rejected and first.block is not None
+
+
+def _ahead(first: _Entry, second: _Entry) -> int:
+    return (second.counter - first.counter) % _NUMBERS
+
+
+def _elapsed_ns(first: _Entry, second: _Entry) -> int:
+    if first.block is None or second.block is None:
+        return 0
+    return second.block.arrived.monotonic_ns - first.block.arrived.monotonic_ns

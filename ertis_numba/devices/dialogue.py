@@ -1,0 +1,188 @@
+"""What is said to a sensor, and told from what it still sends: commands with their answers."""
+
+import errno
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from ertis_numba.devices.commands import Command, Setup, call_hash, decode_answer
+from ertis_numba.devices.line import Line, sonar_error
+from ertis_numba.errors import SonarError
+
+__all__ = ["Dialogue"]
+
+_ANSWER_BYTES = 4
+_GROUP = 16  # commands sent at once: their 250 bytes fit the smallest of buffers
+_QUIET_S = 0.1  # without a byte: then a sensor has measured and sent what it had begun
+_MOST_BYTES = 2**30
+
+_log = logging.getLogger("ertis_numba")
+
+
+class Dialogue(Line):
+    """A line on which commands are sent and answered.
+
+    Nothing tells an answer from four bytes of a measurement but that nothing comes with it.
+
+    Parameters
+    ----------
+    path : str
+    timeout_s : float
+        How long an answer may take.
+    stop : callable
+        See `Line`.
+
+    Attributes
+    ----------
+    dropped : int
+        Bytes that belonged to nothing that was asked for.
+    """
+
+    def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
+        super().__init__(path, stop=stop)
+        self.dropped = 0
+        self._timeout_s = timeout_s
+
+    def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
+        """Drop what comes until nothing does, and return how many bytes that were.
+
+        Parameters
+        ----------
+        within_s : float
+        repeat : Command, optional
+            Sent again and again while bytes keep coming: the first may have followed half of another command.
+
+        Raises
+        ------
+        SonarError
+            There is no end to it.
+        """
+        count = 0
+        began = last = told = time.monotonic()
+        while True:
+            data, arrived = self.receive(_MOST_BYTES)
+            now = arrived.monotonic_ns / 1e9
+            if data:
+                count, last = count + len(data), now
+            elif now - last >= _QUIET_S:
+                self.dropped += count
+                return count
+            if now - began > within_s:
+                raise sonar_error(f"{self.path} keeps sending whatever it is told; is it an eRTIS?", errno.ETIMEDOUT)
+            if repeat is not None and now - told > 2 * _QUIET_S:
+                self.send(repeat.encode())
+                told = now
+
+    def quieten(self, command: Command, *, within_s: float) -> None:
+        """Send the command that ends a stream, and drop what still comes, its answer among that."""
+        before = self.dropped
+        self.send(command.encode())
+        count = self.drain(within_s=max(within_s, 4 * _QUIET_S), repeat=command)
+        self.dropped = before + max(0, count - _ANSWER_BYTES)
+
+    def ask(self, command: Command, *, alone: bool = True) -> int:
+        """Send a command and return its answer.
+
+        What has come before is dropped. If more than an answer comes, it was the rest of something else: then the
+        command is sent again once that has ended.
+
+        Parameters
+        ----------
+        command : Command
+        alone : bool
+            False where measurements may follow the answer.
+
+        Raises
+        ------
+        SonarError
+            No answer came, or none by itself.
+        """
+        deadline = time.monotonic() + self._timeout_s
+        while True:
+            if self.waiting:
+                self.drain(within_s=self._timeout_s)
+            self.send(command.encode())
+            data = self._answers(1)
+            if len(data) < _ANSWER_BYTES:
+                raise self._no_answer(command, data)
+            if not (alone and self.waiting):
+                _log.debug("%s: %s: %d", self.path, command.about, decode_answer(data))
+                return decode_answer(data)
+            self.dropped += len(data)
+            if time.monotonic() > deadline:
+                raise sonar_error(
+                    f"{self.path} answers {command.about!r} with more than a number, first {data!r}; is it an eRTIS?",
+                    errno.ETIMEDOUT,
+                )
+
+    def ask_twice(self, command: Command) -> int:
+        """Return an answer that came twice: four bytes of something else may look like one, but not again.
+
+        Raises
+        ------
+        SonarError
+            The second answer is another one, or as `ask`.
+        """
+        first, second = self.ask(command), self.ask(command)
+        if first != second:
+            raise sonar_error(
+                f"{self.path} answers {command.about!r} with {first} and then with {second}; is it an eRTIS?",
+                errno.ETIMEDOUT,
+            )
+        return first
+
+    def ask_all(self, commands: Sequence[Command]) -> None:
+        """Send many commands, a few at a time, and take their answers.
+
+        Raises
+        ------
+        SonarError
+            Answers are missing.
+        """
+        for start in range(0, len(commands), _GROUP):
+            group = commands[start : start + _GROUP]
+            self.send(b"".join(command.encode() for command in group))
+            n_answers, rest = divmod(len(data := self._answers(len(group))), _ANSWER_BYTES)
+            if n_answers < len(group):
+                raise self._no_answer(group[n_answers], data[len(data) - rest :])
+
+    def tell(self, setup: Setup, *, counter: int) -> None:
+        """Send the setup, the call only if the sensor holds another one, and the number of the next measurement.
+
+        Raises
+        ------
+        SonarError
+            A command is not answered, or the sensor holds another call than it was sent.
+        """
+        for command in setup.before_call():
+            self.ask(command)
+        wanted = call_hash(setup.codes)
+        if self.ask(Command("L")) != wanted:
+            self.ask_all(setup.call())
+            held = self.ask(Command("L"))
+            if held != wanted:
+                raise SonarError(
+                    f"{self.path} was sent a call with hash {wanted:#06x} and holds one with {held:#06x}; plug it out "
+                    "and in, and try again"
+                )
+            _log.info("%s: a call of %d samples was sent", self.path, len(setup.codes))
+        for command in (*setup.after_call(), Command("B", counter)):
+            self.ask(command)
+
+    def _answers(self, count: int) -> bytes:
+        """Return so many answers, or fewer if nothing comes for a time."""
+        data = b""
+        latest = time.monotonic()
+        while len(data) < count * _ANSWER_BYTES and time.monotonic() - latest <= self._timeout_s:
+            piece, _ = self.receive(count * _ANSWER_BYTES - len(data))
+            if piece:
+                data, latest = data + piece, time.monotonic()
+        return data
+
+    def _no_answer(self, command: Command, data: bytes) -> SonarError:
+        instead = f", but sends {data!r}" if data else ""
+        return sonar_error(
+            f"{self.path} does not answer {command.about!r} within {self._timeout_s:g} s{instead}; "
+            "is it an eRTIS, and has it power?",
+            errno.ETIMEDOUT,
+        )

@@ -1,0 +1,289 @@
+"""An emulated eRTIS on a pseudo terminal, which sends the words that it is given."""
+
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TextIO
+
+from ertis_numba.devices.faults import Faults, Stall, Unplug
+from ertis_numba.devices.mainboard import Mainboard, Quirks
+from ertis_numba.devices.outputs import Measurements, Output, Pieces, Words
+from ertis_numba.devices.places import HeldLink
+from ertis_numba.devices.registers import Registers
+from ertis_numba.devices.terminal import Terminal
+
+__all__ = ["Emulator", "Quirks"]
+
+_SECOND_NS = 1_000_000_000
+_MOST_UNREAD = 1_000  # answers; then the device takes no more commands
+_PACE_S = 2e-3  # a slow device sends portions of so long
+_CATCH_UP_NS = 20_000_000  # of what a busy machine has missed
+_PATIENCE_S = 10.0
+
+
+class Emulator:
+    """One device. It lives until it is closed; use it in a ``with`` statement.
+
+    Every measurement gets the next number of the device's counter. A measurement that is triggered by a command, or
+    by `trigger` without a number, has the words of this number, those that are given being used in turn: the counter
+    tells which words a block has to hold. With a number of a pulse it has the words of that, so that all devices of a
+    SYNC chain hear the same moment whatever their counters are.
+
+    Its first byte comes when it has been recorded, the length by the clock after its trigger; then as fast as the host
+    reads. The next may be recorded meanwhile. A trigger while it records is ignored. Two measurements wait for a
+    reader; others are dropped as a whole, and the counter goes on. Answers and measurements leave in the order in
+    which they came about, so an answer waits for the measurements before it.
+
+    A command that is none is answered by 0. The authors' code for Linux sends ``J`` with four numbers and that for
+    Windows ``A`` without the end of the line: both are taken.
+
+    Parameters
+    ----------
+    words : sequence of (sample,) uint32
+        One array per measurement. If the host asks for another length, they are cut or go on from their beginning.
+    passive : sequence of (sample,) uint32, optional
+        The same for measurements without emission, which are those that are asked for and active ones while the
+        amplifier is off. By default they have the words of active ones.
+    name : str
+    faults : Faults, optional
+        What happens to the bytes of measurements.
+    link : Path, optional
+        A symbolic link that leads to the port while the device is plugged in.
+    log : TextIO, optional
+        Gets a line of JSON per measurement before its first byte leaves: name, index of the words, counter, active or
+        not, CRC-32 of the words as little-endian bytes, fault (empty if nothing was done to it, "dropped", or in the
+        words of `Faults`) and time_ns since 1970. Those that may not have been read when the device is unplugged get
+        another line, whose fault is "unplugged"; the last line about a measurement holds.
+    quirks : Quirks
+        May be replaced at any time.
+    on_port : callable, optional
+        Is called with the port when the device is there again, by another thread.
+
+    Attributes
+    ----------
+    port : str
+        Path of the pseudo terminal. It may change when the device is plugged in again.
+    error : Exception or None
+        What has ended the device before its time: words that could not be read or a log that could not be written.
+
+    Raises
+    ------
+    ArgumentError
+        There are no words, or not of uint32; or the link belongs to another.
+    """
+
+    def __init__(
+        self,
+        words: Sequence[Words],
+        *,
+        passive: Sequence[Words] | None = None,
+        name: str = "emulated",
+        faults: Faults | None = None,
+        link: Path | None = None,
+        log: TextIO | None = None,
+        quirks: Quirks | None = None,
+        on_port: Callable[[str], None] | None = None,
+    ) -> None:
+        self._measurements = Measurements(words, passive, name=name, faults=faults, log=log)
+        self.name, self.link, self.quirks = name, link, quirks or Quirks()
+        self._on_port = on_port
+        self._held = None if link is None else HeldLink(link)
+        self.error: Exception | None = None
+        self._refused = 0  # before it was unplugged
+        self._changed = threading.Condition()
+        self._wish_plugged = True
+        self._back_ns: int | None = None
+        self._closing = self._ended = False
+        self._woken, self._waker = os.pipe()
+        os.set_blocking(self._waker, False)
+        self._terminal: Terminal | None = None
+        self._plug_in()
+        self._thread = threading.Thread(target=self._run, name=f"emulated {name}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def registers(self) -> Registers:
+        """What it was told since it was powered up, which it is when it is plugged in."""
+        return self._board.registers
+
+    @property
+    def refused(self) -> int:
+        """Commands that were none, and those whose numbers the device cannot use."""
+        return self._refused + self._board.refused
+
+    def close(self) -> None:
+        """Hang up for good and take the link away; closing twice does no harm."""
+        with self._changed:
+            self._closing = True
+            self._wake()
+        self._thread.join()
+        if self._held is not None:
+            self._held.release()
+            self._held = None
+
+    def trigger(self, pulse: int | None = None, *, at_ns: int | None = None) -> bool:
+        """Take a SYNC pulse, at whichever pin the device listens to, and tell whether it starts a measurement.
+
+        It does not while the device is unplugged or records, or its external trigger is off.
+
+        Parameters
+        ----------
+        pulse : int, optional
+            Number of the words; that of the counter by default.
+        at_ns : int, optional
+            When it came, by the monotonic clock; now by default.
+        """
+        with self._changed:
+            registers = self._board.registers
+            if self._terminal is None or not registers.armed:
+                return False
+            at_ns = time.monotonic_ns() if at_ns is None else at_ns
+            taken = self._board.begin(active=bool(registers.active), at_ns=at_ns, index=pulse)
+            self._wake()
+            return taken
+
+    def unplug(self, for_s: float | None = None) -> None:
+        """Go away, until `replug` or for a time. Whoever has the port open gets a hang-up, and the link goes."""
+        self._wish(plugged=False, back_ns=None if for_s is None else time.monotonic_ns() + int(for_s * _SECOND_NS))
+
+    def replug(self) -> None:
+        """Come back as after power-up, on a new pseudo terminal."""
+        self._wish(plugged=True, back_ns=None)
+
+    def _wish(self, *, plugged: bool, back_ns: int | None) -> None:
+        with self._changed:
+            self._wish_plugged, self._back_ns = plugged, back_ns
+            self._wake()
+            self._changed.wait_for(
+                lambda: self._ended or (self._terminal is not None) == self._wish_plugged, timeout=_PATIENCE_S
+            )
+
+    def _wake(self) -> None:
+        if not self._ended:
+            with suppress(BlockingIOError):  # it has been woken often enough
+                os.write(self._waker, b"!")
+
+    def _forget(self) -> None:
+        self._board = Mainboard(self._measurements)
+        self._sent = Output(deque())  # the latest
+        self._pause_ns = 0  # nothing is sent before
+
+    def _plug_in(self) -> None:
+        self._forget()
+        self._terminal = Terminal()
+        self.port = self._terminal.port
+        if self._held is not None:
+            self._held.point_to(self.port)
+
+    def _pull_out(self) -> None:
+        """Hang up, and log what may not have been read."""
+        if self._terminal is None:
+            return
+        if self._terminal.unread:
+            self._measurements.tell(self._sent, "unplugged")
+        self._board.lose()
+        self._refused += self._board.refused
+        self._forget()
+        self._terminal.close()
+        self._terminal = None
+        if self._held is not None:
+            self._held.clear()
+
+    def _run(self) -> None:
+        try:
+            self._live()
+        except Exception as error:  # noqa: BLE001  it is for those who look after the device
+            self.error = error
+            self._forget()  # to log what is lost may be what has failed
+        with self._changed:
+            self._pull_out()
+            self._ended = True
+            os.close(self._woken)
+            os.close(self._waker)
+            self._changed.notify_all()
+
+    def _live(self) -> None:
+        ready: list[int] = []
+        while not self._closing:
+            with self._changed:
+                came_back, reads, writes, due_ns = self._step(ready, time.monotonic_ns())
+            if came_back and self._on_port is not None:
+                self._on_port(self.port)
+            timeout_s = None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) / _SECOND_NS)
+            ready = select.select([self._woken, *reads], writes, [], timeout_s)[0]
+            if self._woken in ready:
+                os.read(self._woken, 4096)
+
+    def _step(self, ready: list[int], now_ns: int) -> tuple[bool, list[int], list[int], int | None]:
+        """Do what is due; return whether the device came back, what to wait for, and until when."""
+        came_back = self._follow_wish(now_ns)
+        terminal, board = self._terminal, self._board
+        full = False
+        if terminal is not None:
+            if terminal.master in ready:
+                board.take(terminal.read(), self.quirks, now_ns)
+            board.go_on(self.quirks, now_ns)
+            full = self._send(terminal, now_ns)
+        if terminal is None or terminal is not self._terminal:  # a fault may have unplugged it
+            return came_back, [], [], self._back_ns
+        pause_ns = self._pause_ns if board.outputs and not full else None
+        due_ns = min((each for each in (board.due_ns, self._back_ns, pause_ns) if each is not None), default=None)
+        master = [terminal.master]
+        return came_back, master if len(board.outputs) < _MOST_UNREAD else [], master if full else [], due_ns
+
+    def _follow_wish(self, now_ns: int) -> bool:
+        """Plug in or pull out, as was asked for; tell whether the device came back."""
+        if self._back_ns is not None and now_ns >= self._back_ns:
+            self._wish_plugged, self._back_ns = True, None
+        if (self._terminal is not None) == self._wish_plugged:
+            return False
+        if self._wish_plugged:
+            self._plug_in()
+        else:
+            self._pull_out()
+        self._changed.notify_all()
+        return self._wish_plugged
+
+    def _send(self, terminal: Terminal, now_ns: int) -> bool:
+        """Send what goes; return whether that ended because nobody has read."""
+        outputs = self._board.outputs
+        while outputs and now_ns >= self._pause_ns:
+            pieces = outputs[0].pieces
+            if not pieces:
+                self._sent = outputs.popleft()
+                continue
+            piece = pieces.popleft()
+            if isinstance(piece, Unplug):
+                self._wish_plugged, self._back_ns = False, now_ns + int(self.quirks.away_s * _SECOND_NS)
+                self._follow_wish(now_ns)
+                return False
+            if isinstance(piece, Stall):
+                self._pause_ns = now_ns + int(piece.duration_s * _SECOND_NS)
+            elif piece and not self._write(terminal, piece, pieces, now_ns):
+                return True
+        return False
+
+    def _write(self, terminal: Terminal, piece: memoryview, pieces: Pieces, now_ns: int) -> bool:
+        """Write of a piece what goes, and tell whether that was anything; the rest is put back."""
+        rate = self.quirks.bytes_per_s
+        n_bytes = terminal.write(piece if rate is None else piece[: max(1, int(_PACE_S * rate))])
+        if n_bytes < len(piece):
+            pieces.appendleft(piece[n_bytes:])
+        if rate is not None:
+            since_ns = max(self._pause_ns, now_ns - _CATCH_UP_NS)
+            self._pause_ns = since_ns + int(n_bytes / rate * _SECOND_NS)
+        return n_bytes > 0

@@ -1,0 +1,215 @@
+"""Faults of a line, drawn by chance: what a cable, a hub and a full buffer do to the bytes of a block."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.devices.commands import FRAME_BYTES
+
+__all__ = ["KINDS", "Fault", "Faults", "Spoilt", "Stall", "Unplug"]
+
+KINDS: Final = ("flip", "duplicate", "lose", "add", "swap", "cut", "drop", "stall", "unplug")
+"""What may happen to a block, in the order in which it does."""
+
+_SHORT_READS: Final = "short_reads"
+_MOST_BYTES: Final = 4095  # of a piece, a terminal's buffer; and of a loss
+_PARTS: Final = {"header": 0, "counter": 4, "footer": -4}
+_WORD: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Stall:
+    """Nothing is sent for so long."""
+
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unplug:
+    """The sensor goes; nothing of this block comes after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that was done to a block.
+
+    Attributes
+    ----------
+    kind : str
+        One of `KINDS`.
+    place : int
+        First byte that it concerns, counted in what the faults before it have left.
+    n_bytes : int
+        How many it concerns.
+    detail : str
+        For a flip the part of the block, for a swap where the bytes were added again.
+    """
+
+    kind: str
+    place: int
+    n_bytes: int
+    detail: str = ""
+
+    def __str__(self) -> str:
+        detail = f" ({self.detail})" if self.detail else ""
+        return f"{self.kind} {self.n_bytes} at {self.place}{detail}"
+
+
+@dataclass(frozen=True, slots=True)
+class Spoilt:
+    """A block as it is to be sent.
+
+    Attributes
+    ----------
+    pieces : tuple of bytes, Stall or Unplug
+        In this order.
+    faults : tuple of Fault
+        What was done; empty where the block is untouched.
+    """
+
+    pieces: tuple[bytes | Stall | Unplug, ...]
+    faults: tuple[Fault, ...]
+
+    @property
+    def note(self) -> str:
+        """All faults in words, such as ``lose 37 at 120, stall 0 at 400``; empty where there are none."""
+        return ", ".join(map(str, self.faults))
+
+    @property
+    def data(self) -> bytes:
+        """All bytes that are sent."""
+        return b"".join(piece for piece in self.pieces if isinstance(piece, bytes))
+
+
+class Faults:
+    """Draws faults, the same ones for the same seed and the same blocks.
+
+    ``flip``: a byte is changed, half of the time in header, counter or footer. ``duplicate``: the block comes twice.
+    ``lose``: bytes are cut out, half of the time whole words. ``add``: random bytes get in. ``swap``: bytes are lost
+    in one place and as many random ones added in another, so that the length stays. ``cut``: the rest never comes;
+    ``drop``: nothing of it comes. ``stall``: a pause. ``unplug``: the sensor goes in the middle. Each is drawn by
+    itself, so that a block may have several.
+
+    Parameters
+    ----------
+    seed : int
+    kinds : mapping of str to float
+        Probability per block of each of `KINDS`, 0 by default. ``short_reads``: True for pieces of 1 to 4,095 bytes
+        by chance, which is no fault; else pieces are as long as can be.
+    longest_stall_s : float
+
+    Raises
+    ------
+    ArgumentError
+        There is no such kind, or a probability is not within 0 and 1.
+    """
+
+    def __init__(
+        self, seed: int = 0, kinds: Mapping[str, float] | None = None, *, longest_stall_s: float = 0.02
+    ) -> None:
+        kinds = {} if kinds is None else kinds
+        for kind in kinds:
+            checks.choice("kind of fault", kind, (*KINDS, _SHORT_READS))
+        self._short_reads = bool(kinds.get(_SHORT_READS, False))
+        self._chances = np.array(
+            [checks.between(f"probability of {kind}", kinds.get(kind, 0.0), 0.0, 1.0) for kind in KINDS]
+        )
+        self._longest_stall_s = checks.between("longest_stall_s", longest_stall_s, 0.0, 3600.0)
+        self._random = np.random.default_rng(checks.whole("seed", seed, 0))
+        self._faults: list[Fault] = []
+
+    def spoil(self, block: bytes) -> Spoilt:
+        """Return a block as it is to be sent, and what was done to it."""
+        self._faults = []
+        data = bytearray(block)
+        drawn = {kind for kind, hit in zip(KINDS, self._random.random(len(KINDS)) < self._chances, strict=True) if hit}
+        for kind, spoil in {
+            "flip": self._flip,
+            "duplicate": self._duplicate,
+            "lose": self._lose,
+            "add": self._add,
+            "swap": self._swap,
+            "cut": self._cut,
+            "drop": self._drop,
+        }.items():
+            if kind in drawn and data:
+                spoil(data)
+        pieces: list[bytes | Stall | Unplug] = []
+        begin = 0
+        if "stall" in drawn and data:
+            begin = self._note("stall", self._place(data), 0)
+            pieces = [*self._pieces(data[:begin]), Stall(float(self._random.uniform(0.0, self._longest_stall_s)))]
+        if "unplug" in drawn:
+            end = self._note("unplug", int(self._random.integers(begin, len(data) + 1)), 0)
+            return Spoilt((*pieces, *self._pieces(data[begin:end]), Unplug()), tuple(self._faults))
+        return Spoilt((*pieces, *self._pieces(data[begin:])), tuple(self._faults))
+
+    def _note(self, kind: str, place: int, n_bytes: int, detail: str = "") -> int:
+        self._faults.append(Fault(kind, place, n_bytes, detail))
+        return place
+
+    def _place(self, data: bytearray) -> int:
+        return int(self._random.integers(len(data)))
+
+    def _length(self) -> int:
+        """Return a number of bytes: each order of magnitude as often as the others."""
+        return int(_MOST_BYTES ** self._random.random())
+
+    def _bytes(self, count: int) -> bytes:
+        return self._random.bytes(count)
+
+    def _flip(self, data: bytearray) -> None:
+        parts = list(_PARTS)
+        part = parts[self._random.integers(len(parts))] if self._random.random() < 0.5 else "words"
+        if part == "words":
+            place = int(self._random.integers(8, len(data) - 4)) if len(data) > FRAME_BYTES else 0
+        else:
+            place = _PARTS[part] % len(data) + int(self._random.integers(_WORD))
+        data[place] ^= int(self._random.integers(1, 256))
+        self._note("flip", place, 1, part)
+
+    def _duplicate(self, data: bytearray) -> None:
+        self._note("duplicate", len(data), len(data))
+        data *= 2
+
+    def _lose(self, data: bytearray) -> None:
+        place, count = self._place(data), self._length()
+        if self._random.random() < 0.5:
+            place, count = place - place % _WORD, count + -count % _WORD
+        count = min(count, len(data) - place)
+        del data[place : place + count]
+        self._note("lose", place, count)
+
+    def _add(self, data: bytearray) -> None:
+        place, added = int(self._random.integers(len(data) + 1)), self._bytes(self._length())
+        data[place:place] = added
+        self._note("add", place, len(added))
+
+    def _swap(self, data: bytearray) -> None:
+        place = self._place(data)
+        count = min(self._length(), len(data) - place)
+        del data[place : place + count]
+        again = int(self._random.integers(len(data) + 1))
+        data[again:again] = self._bytes(count)
+        self._note("swap", place, count, f"at {again}")
+
+    def _cut(self, data: bytearray) -> None:
+        place = self._place(data)
+        self._note("cut", place, len(data) - place)
+        del data[place:]
+
+    def _drop(self, data: bytearray) -> None:
+        self._note("drop", 0, len(data))
+        data.clear()
+
+    def _pieces(self, data: bytearray) -> list[bytes]:
+        """Return pieces that a terminal takes at once."""
+        pieces, begin = [], 0
+        while begin < len(data):
+            length = int(self._random.integers(1, _MOST_BYTES + 1)) if self._short_reads else _MOST_BYTES
+            pieces.append(bytes(data[begin : begin + length]))
+            begin += length
+        return pieces

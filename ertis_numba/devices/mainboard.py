@@ -1,0 +1,168 @@
+"""What an emulated device does, without a port, a thread or a clock of its own."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from ertis_numba import checks
+from ertis_numba.devices.commands import Command, encode_answer
+from ertis_numba.devices.faults import Stall
+from ertis_numba.devices.outputs import Measurements, Output
+from ertis_numba.devices.registers import Registers
+from ertis_numba.devices.terminal import Lines
+from ertis_numba.errors import DataError
+
+__all__ = ["Mainboard", "Quirks"]
+
+_LEFT_NS = 20_000_000  # an unfinished line that is a whole command is taken after so long
+_BUFFERED = 2  # measurements that wait for a reader
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quirks:
+    """What a device does wrong apart from its data.
+
+    Attributes
+    ----------
+    silent : bool
+        It does what commands say, but answers nothing.
+    wrong_hash : bool
+        It tells a wrong hash of the call, however often that is loaded.
+    answer_delay_s : float
+        How long each answer takes.
+    bytes_per_s : float, optional
+        How fast it sends; as fast as the host reads by default.
+    away_s : float
+        How long it is gone when a fault unplugs it.
+    """
+
+    silent: bool = False
+    wrong_hash: bool = False
+    answer_delay_s: float = 0.0
+    bytes_per_s: float | None = None
+    away_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        checks.between("answer_delay_s", self.answer_delay_s, 0.0, 3600.0)
+        checks.between("away_s", self.away_s, 0.0, 3600.0)
+        if self.bytes_per_s is not None:
+            checks.between("bytes_per_s", self.bytes_per_s, 1e3, 1e12)
+
+
+@dataclass(slots=True, eq=False)
+class _Recording:
+    due_ns: int
+    index: int
+    counter: int
+    active: bool
+    n_samples: int
+    output: Output | None = None  # made while it is recorded
+
+
+class Mainboard:
+    """Obeys commands and records, from power-up until it is pulled out.
+
+    Parameters
+    ----------
+    measurements : Measurements
+
+    Attributes
+    ----------
+    registers : Registers
+    outputs : deque of Output
+        What waits to be sent, in order.
+    refused : int
+        Commands that were none, and those whose numbers the device cannot use.
+    """
+
+    def __init__(self, measurements: Measurements) -> None:
+        self.registers = Registers()
+        self.outputs: deque[Output] = deque()
+        self.refused = 0
+        self._measurements = measurements
+        self._lines = Lines()
+        self._left_ns: int | None = None  # when an unfinished line is taken
+        self._recording: _Recording | None = None
+
+    @property
+    def due_ns(self) -> int | None:
+        """When to go on, if there is something to go on with."""
+        dues_ns = (self._left_ns, None if self._recording is None else self._recording.due_ns)
+        return min((due_ns for due_ns in dues_ns if due_ns is not None), default=None)
+
+    def take(self, data: bytes, quirks: Quirks, now_ns: int) -> None:
+        """Do what the host says."""
+        for line in self._lines.feed(data):
+            self._obey(line, quirks, now_ns)
+        self._left_ns = now_ns + _LEFT_NS if _command(self._lines.unfinished) else None
+
+    def _obey(self, line: bytes, quirks: Quirks, now_ns: int) -> None:
+        command = _command(line)
+        if command is not None and not command.answers:
+            self.begin(active=command.first == 1, at_ns=now_ns)
+            return
+        answer = None if command is None else self.registers.answer(command)
+        self.refused += answer is None
+        answer = answer or 0  # nothing better is known for what is refused
+        if command is not None and command.code == "L" and quirks.wrong_hash:
+            answer ^= 1
+        if not quirks.silent:
+            self.outputs.append(Output(deque([Stall(quirks.answer_delay_s), memoryview(encode_answer(answer))])))
+
+    def begin(self, *, active: bool, at_ns: int, index: int | None = None) -> bool:
+        """Start to record, unless that goes on already; return whether it was started."""
+        if self._recording is not None:
+            return False
+        registers = self.registers
+        counter = registers.counter
+        registers.counter = (counter + 1) % 2**32
+        self._recording = _Recording(
+            due_ns=at_ns + registers.duration_ns,
+            index=counter if index is None else index,
+            counter=counter,
+            active=active and bool(registers.amplifier),
+            n_samples=registers.n_samples,
+        )
+        return True
+
+    def go_on(self, quirks: Quirks, now_ns: int) -> None:
+        """Do what is due: a line that nobody will end, a measurement that is complete."""
+        if self._left_ns is not None and now_ns >= self._left_ns:
+            self._left_ns = None
+            self._obey(self._lines.take(), quirks, now_ns)
+        if self._recording is None:
+            return
+        output = self._output(self._recording)
+        if now_ns < self._recording.due_ns:
+            return
+        self._recording = None
+        if sum(bool(waiting.entry) for waiting in self.outputs) < _BUFFERED:
+            self._measurements.tell(output)
+            self.outputs.append(output)
+        else:
+            self._measurements.tell(output, "dropped")
+
+    def lose(self) -> None:
+        """Be pulled out: log what is not going to be sent."""
+        waiting = list(self.outputs)
+        if self._recording is not None:
+            waiting.append(self._output(self._recording))
+        for output in waiting:
+            self._measurements.tell(output, "unplugged")
+
+    def _output(self, recording: _Recording) -> Output:
+        """Return what is to be sent of a measurement; it is made once."""
+        if recording.output is None:
+            recording.output = self._measurements.output(
+                recording.index, recording.counter, active=recording.active, n_samples=recording.n_samples
+            )
+        return recording.output
+
+
+def _command(line: bytes) -> Command | None:
+    """Return the command in a line, or None if there is none."""
+    if line.startswith(b"!J"):
+        line = b",".join(line.split(b",")[:4])  # the authors' code for Linux sends a number more
+    try:
+        return Command.decode(line)
+    except DataError:
+        return None

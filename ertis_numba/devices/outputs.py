@@ -1,0 +1,83 @@
+"""What an emulated device sends: its measurements with what happens to them, and the log of that."""
+
+import json
+import threading
+import time
+import zlib
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.devices.commands import encode_block
+from ertis_numba.devices.faults import Faults, Stall, Unplug
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["Measurements", "Output", "Pieces", "Words"]
+
+Words = NDArray[np.uint32]
+Pieces = deque[memoryview | Stall | Unplug]
+"""What to do one after the other."""
+
+_LOGGING = threading.Lock()  # devices may share a log
+
+
+@dataclass(slots=True, eq=False)
+class Output:
+    """Something to be sent; a measurement has an entry, which is its line in the log."""
+
+    pieces: Pieces
+    entry: dict[str, Any] = field(default_factory=dict)
+
+
+class Measurements:
+    """Measurements to be sent in turn; for the arguments see `Emulator`."""
+
+    def __init__(
+        self,
+        words: Sequence[Words],
+        passive: Sequence[Words] | None,
+        *,
+        name: str,
+        faults: Faults | None,
+        log: TextIO | None,
+    ) -> None:
+        self._words = {True: words, False: words if passive is None else passive}
+        for given in self._words.values():
+            checks.whole("number of measurements to emulate", len(given), 1)
+            if given[0].dtype != np.uint32 or given[0].ndim != 1:
+                raise ArgumentError(
+                    f"measurements to emulate are {given[0].ndim}-dimensional {given[0].dtype}; give one uint32 word "
+                    "per sample"
+                )
+        self._name, self._faults, self._log = name, faults, log
+
+    def output(self, index: int, counter: int, *, active: bool, n_samples: int) -> Output:
+        """Return measurement ``index`` in the length that is asked for, under a number."""
+        given = self._words[active]
+        index %= len(given)
+        words = given[index]
+        if len(words) != n_samples:
+            words = np.resize(words, n_samples)  # cuts, or goes on from the beginning
+        entry = {"name": self._name, "index": index, "counter": counter, "active": active, "fault": ""}
+        if self._log is not None:
+            entry["crc32"] = zlib.crc32(np.ascontiguousarray(words, dtype="<u4").data)
+        block = encode_block(counter, words)
+        if self._faults is None:
+            return Output(deque([memoryview(block)]), entry)
+        spoilt = self._faults.spoil(block)
+        pieces = (memoryview(piece) if isinstance(piece, bytes) else piece for piece in spoilt.pieces)
+        return Output(deque(pieces), entry | {"fault": spoilt.note})
+
+    def tell(self, output: Output, fault: str = "") -> None:
+        """Write the line of a measurement into the log, at once, with what else has happened to it."""
+        if self._log is None or not output.entry:
+            return
+        faults = ", ".join(filter(None, (output.entry["fault"], fault)))
+        with _LOGGING:
+            self._log.write(json.dumps(output.entry | {"fault": faults, "time_ns": time.time_ns()}) + "\n")
+            self._log.flush()

@@ -1,0 +1,145 @@
+"""Which serial ports there are, and which of them is meant."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from serial.tools import list_ports
+
+from ertis_numba.devices.places import emulated_folder
+from ertis_numba.errors import SonarError
+
+__all__ = ["Port", "find_again", "find_ports", "resolve"]
+
+_BY_ID = Path("/dev/serial/by-id")
+_CDC_ACM = ("ttyACM", "cu.usbmodem", "tty.usbmodem", "COM")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Port:
+    """A serial port.
+
+    Attributes
+    ----------
+    path : str
+        What is opened, such as ``/dev/ttyACM0``; another one after the device was plugged in again.
+    link : str
+        A name that stays the same, such as one in ``/dev/serial/by-id``; empty if there is none.
+    serial_number : str
+        Of the USB device; the name of an emulated one. Empty if it is not known.
+    description : str
+    emulated : bool
+    """
+
+    path: str
+    link: str = ""
+    serial_number: str = ""
+    description: str = ""
+    emulated: bool = False
+
+    def __str__(self) -> str:
+        known = self.serial_number or self.description
+        return f"{self.path} ({known})" if known else self.path
+
+    @property
+    def may_be_sonar(self) -> bool:
+        """Whether it is of the kind that an eRTIS has: one that was not asked for may be spoken to."""
+        return self.emulated or Path(self.path).name.startswith(_CDC_ACM)
+
+    @property
+    def names(self) -> set[str]:
+        """What it may be called by."""
+        given = (self.path, self.link, Path(self.path).name, Path(self.link).name, self.serial_number)
+        return {name for name in given if name}
+
+
+def find_ports() -> list[Port]:
+    """Return the serial ports of USB devices, then those of emulated devices that run."""
+    return [*_usb_ports(), *_emulated_ports()]
+
+
+def resolve(port: str) -> Port:
+    """Return the port of this path, link, serial number, or name of an emulated device.
+
+    Raises
+    ------
+    SonarError
+        There is no such port, or several have this serial number.
+    """
+    found = find_ports()
+    named = [item for item in found if port in item.names]
+    if len({item.path for item in named}) > 1:
+        raise SonarError(f"{port!r} are {len(named)} ports: {_listed(named)}; give the path of one")
+    if named:
+        return named[0]
+    path = os.path.realpath(port)
+    if Path(path).exists() and _is_alive(Path(port)):
+        link = port if Path(port).is_symlink() else ""
+        same = [item for item in found if item.path == path]
+        return replace(same[0], link=link or same[0].link) if same else Port(path=path, link=link)
+    if any(info.device == port for info in list_ports.comports()):  # not of USB, and no file: as Windows has it
+        return Port(path=port)
+    there_are = (
+        f"give one of those that there are: {_listed(found)}"
+        if found
+        else "none is plugged in: look at its cable, or start an emulated one with 'ertis emulate'"
+    )
+    raise SonarError(f"there is no serial port {port!r}; {there_are}")
+
+
+def find_again(port: Port) -> Port:
+    """Return where a device is that was plugged in again: by its serial number, by its link, or at the same path.
+
+    Raises
+    ------
+    SonarError
+        It is not there.
+    """
+    if port.serial_number and not port.emulated:
+        return replace(resolve(port.serial_number), link=port.link)
+    return resolve(port.link or port.path)
+
+
+def _listed(found: list[Port]) -> str:
+    return ", ".join(str(item) for item in found)
+
+
+def _usb_ports() -> Iterator[Port]:
+    links = {os.path.realpath(link): str(link) for link in sorted(_BY_ID.iterdir())} if _BY_ID.is_dir() else {}
+    for info in sorted(list_ports.comports(), key=lambda info: info.device):
+        if info.vid is not None:
+            yield Port(
+                path=info.device,
+                link=links.get(info.device, ""),
+                serial_number=info.serial_number or "",
+                description=info.description or "",
+            )
+
+
+def _emulated_ports() -> Iterator[Port]:
+    folder = emulated_folder()
+    for link in sorted(folder.iterdir()) if folder.is_dir() else ():
+        path = os.path.realpath(link)
+        if link.is_symlink() and not link.name.startswith(".") and Path(path).exists() and _is_alive(link):
+            yield Port(path=path, link=str(link), serial_number=link.name, description="emulated eRTIS", emulated=True)
+
+
+def _is_alive(link: Path) -> bool:
+    """Whether a link leads to what it was made for, as all do but one that a killed emulator left.
+
+    Its pseudo terminal's number is soon that of somebody's shell. See `places.HeldLink`.
+    """
+    try:
+        lock = os.open(link.with_name(f".{link.name}.lock"), os.O_RDONLY)
+    except OSError:  # no link of an emulator
+        return True
+    import fcntl  # noqa: PLC0415  only POSIX has it, and pseudo terminals
+
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False

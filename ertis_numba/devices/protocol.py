@@ -1,0 +1,270 @@
+"""Measurements out of the bytes that a sensor sends: no input, no output and no clock in here."""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.devices.blocks import Block, Instant
+from ertis_numba.devices.commands import FOOTER, FRAME_BYTES, HEADER
+from ertis_numba.devices.counting import CounterCheck
+
+__all__ = ["Block", "BlockParser", "Instant", "Receiver"]
+
+_HEADER: Final = HEADER.to_bytes(4, "little")
+_FOOTER: Final = FOOTER.to_bytes(4, "little")
+_MOST_SKIPPED = 256  # numbers by which a block that cut another short is ahead of it; random bits look so once in 1e11
+
+
+class BlockParser:
+    """Finds blocks in a stream of bytes, however it is cut into pieces: framing only.
+
+    A block is header, counter, words, footer. What has a header but no footer is searched again from just behind
+    the header, so that damage costs no block but its own. The header of a block to come within a block means that
+    the sum of two damaged ones has the right length by chance.
+
+    ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time.
+
+    Parameters
+    ----------
+    n_samples : int
+        Words of a block.
+
+    Attributes
+    ----------
+    n_bytes : int
+        Of a whole block.
+    rejected : Counter of str
+        Bytes by reason: ``no header``, ``footer``, ``cut short``. Each is counted once, with the header that led
+        to it.
+    rejected_blocks : Counter of str
+        Headers by the reason for which no block was found behind them.
+    """
+
+    def __init__(self, n_samples: int) -> None:
+        self.n_bytes = 4 * n_samples + FRAME_BYTES
+        self.rejected: Counter[str] = Counter()
+        self.rejected_blocks: Counter[str] = Counter()
+        self._n_samples = n_samples
+        self._data = bytearray()  # begins with a header, or is the beginning of one
+        self._reason = "no header"  # for which bytes up to the next header are rejected
+        self._position = 0  # of the first of them in the stream
+        self._pieces: deque[tuple[int, Instant]] = deque()  # where each ends in the stream, and when it arrived
+
+    @property
+    def pending(self) -> int:
+        """Bytes of the block that has begun."""
+        return len(self._data)
+
+    @property
+    def missing(self) -> int:
+        """Bytes still wanted of the block that has begun, 0 between blocks."""
+        return self.n_bytes - len(self._data) if self._data else 0
+
+    def feed(self, data: bytes, arrived: Instant) -> list[Block]:
+        """Return the blocks that ``data``, which arrived all at once, completes."""
+        self.add(data, arrived)
+        return list(iter(self.take, None))
+
+    def expire(self) -> list[Block]:
+        """Give up the block that has begun, since its deadline has passed; what came after may have begun another.
+
+        Returns
+        -------
+        list of Block
+            Always empty: what came is shorter than a block.
+        """
+        if len(self._data) >= len(_HEADER):
+            self._give_up("cut short")
+        else:
+            self._drop(len(self._data), self._reason)
+        return []
+
+    def add(self, data: bytes, arrived: Instant) -> None:
+        """Take bytes in; `take` the blocks then until there is none."""
+        if data:
+            self._data += data
+            self._pieces.append((self._position + len(self._data), arrived))
+
+    def take(self) -> Block | None:
+        """Return the next whole block, or None where there is none yet."""
+        while True:
+            if not self._data.startswith(_HEADER):
+                self._search(0)
+            if len(self._data) < self.n_bytes:
+                return None
+            reason = self._fault()
+            if reason is None:
+                return self._accept()
+            self._give_up(reason)
+
+    def _fault(self) -> str | None:
+        """Return why what lies there is no block, None if it is one."""
+        footer = self.n_bytes - len(_FOOTER)
+        if self._data[footer : self.n_bytes] != _FOOTER:
+            return "footer"
+        counter = self._counter(0)
+        place = self._data.find(_HEADER, len(_HEADER), footer)
+        while place >= 0:
+            if (self._counter(place) - counter) % 2**32 <= _MOST_SKIPPED:
+                return "cut short"
+            place = self._data.find(_HEADER, place + 1, footer)
+        return None
+
+    def _counter(self, place: int) -> int:
+        """Return the counter behind the header at ``place``."""
+        return int.from_bytes(self._data[place + 4 : place + 8], "little")
+
+    def _accept(self) -> Block:
+        # A copy; the view is gone before the buffer changes its size, which it refuses while there is one.
+        words = np.frombuffer(self._data, "<u4", self._n_samples, 8).astype(np.uint32)
+        words.flags.writeable = False
+        block = Block(self._counter(0), words, self._pieces[0][1])
+        self._reason = "no header"
+        self._drop(self.n_bytes)
+        return block
+
+    def _give_up(self, reason: str) -> None:
+        """Reject the block that has begun and search behind its header."""
+        self.rejected_blocks[reason] += 1
+        self._reason = reason
+        self._search(len(_HEADER))
+
+    def _search(self, begin: int) -> None:
+        """Reject what comes before the next header from ``begin`` on; the end may be the beginning of one."""
+        place = self._data.find(_HEADER, begin)
+        if place < 0:
+            place = max(begin, len(self._data) - len(_HEADER) + 1)
+            while not _HEADER.startswith(self._data[place:]):
+                place += 1
+        self._drop(place, self._reason)
+
+    def _drop(self, count: int, reason: str | None = None) -> None:
+        """Forget the first ``count`` bytes, which a bytearray does without moving the others."""
+        if count and reason is not None:
+            self.rejected[reason] += count
+        del self._data[:count]
+        self._position += count
+        while self._pieces and self._pieces[0][0] <= self._position:
+            self._pieces.popleft()
+
+
+class Receiver:
+    """What can be trusted of a stream: framing, then the counter, then the bits.
+
+    A block whose number does not follow for certain is held until others decide (see `CounterCheck`), so that `feed`
+    may return several at once, in order. `expect` says which number comes next; call it before each commanded
+    measurement, and none is held.
+
+    ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time.
+
+    Parameters
+    ----------
+    n_samples : int
+        Words of a block.
+    expected : int, optional
+        Number of the first block; it or the one after is taken. Any by default.
+    shortest_s : float
+        Time from one measurement to the next at least.
+    bits : callable, optional
+        Returns for words, (sample,) uint32, why they cannot be what microphones gave, or None.
+
+    Attributes
+    ----------
+    n_bytes : int
+        Of a whole block.
+    """
+
+    def __init__(
+        self,
+        n_samples: int,
+        *,
+        expected: int | None = None,
+        shortest_s: float,
+        bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+    ) -> None:
+        self._parser = BlockParser(n_samples)
+        self._counters = CounterCheck(shortest_s=shortest_s, expected=expected)
+        self._bits = bits
+        self._rejected_blocks: Counter[str] = Counter()
+        self.n_bytes = self._parser.n_bytes
+
+    @property
+    def pending(self) -> int:
+        """Bytes of the block that has begun."""
+        return self._parser.pending
+
+    @property
+    def missing(self) -> int:
+        """Bytes still wanted of the block that has begun, 0 between blocks."""
+        return self._parser.missing
+
+    @property
+    def held(self) -> int:
+        """Blocks about whose number others will decide."""
+        return self._counters.held
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Bytes by reason: those of `BlockParser`, ``counter``, and what the check of the bits says."""
+        whole = Counter({reason: count * self.n_bytes for reason, count in self._rejected_blocks.items()})
+        return self._parser.rejected + whole
+
+    @property
+    def rejected_blocks(self) -> Counter[str]:
+        """Blocks by reason."""
+        return self._parser.rejected_blocks + self._rejected_blocks
+
+    @property
+    def lost(self) -> int:
+        """Numbers that the counter skipped."""
+        return self._counters.lost
+
+    def feed(self, data: bytes, arrived: Instant) -> list[Block]:
+        """Return the measurements that ``data``, which arrived all at once, completes."""
+        good: list[Block] = []
+        if data:
+            self._counters.heard(arrived.monotonic_ns)
+            self._parser.add(data, arrived)
+        while (block := self._parser.take()) is not None:
+            good += self._settle(self._counters.judge(block, self._parser.rejected.total() / self.n_bytes))
+        return good
+
+    def expire(self) -> list[Block]:
+        """Give up the block that has begun, since its deadline has passed.
+
+        Where none has begun, nothing more is waited for: what is held and fits the time is returned.
+        """
+        if self.missing:
+            return self._parser.expire()
+        return self._settle(self._counters.finish())
+
+    def finish(self) -> list[Block]:
+        """Return what is held and fits the time: the stream has ended."""
+        self._clear()
+        return self._settle(self._counters.finish())
+
+    def expect(self, counter: int) -> None:
+        """Say that ``counter``, or the number after it, comes next, as from a counter that was set.
+
+        What has begun and what is held is given up: it is of the time before.
+        """
+        self._clear()
+        self._settle(self._counters.expect(counter))
+
+    def _clear(self) -> None:
+        while self.missing:
+            self._parser.expire()
+
+    def _settle(self, decided: list[tuple[Block, bool]]) -> list[Block]:
+        """Return those that are good in every respect, and count the others."""
+        good = []
+        for block, follows in decided:
+            reason = (self._bits(block.words) if self._bits else None) if follows else "counter"
+            if reason is None:
+                good.append(block)
+            else:
+                self._rejected_blocks[reason] += 1
+        return good

@@ -1,0 +1,95 @@
+"""What an emulated device remembers of what it was told, and what it answers."""
+
+import numpy as np
+
+from ertis_numba.devices.commands import LENGTH_STEP, MOST_WORDS, PDM_RATES_HZ, Command
+
+__all__ = ["FIRMWARE", "Registers"]
+
+FIRMWARE = 0x00_01_00_00
+"""Version that emulated devices answer, 1.0.0: bytes 2, 1 and 0."""
+
+_DONE = 1
+_MOST_SAMPLES = 65_535
+_MOST_CODE = 4_095
+_NUMBERS = {  # by command: which register takes the first number, and from where to where
+    "G": ("n_bytes", 4 * LENGTH_STEP, 4 * MOST_WORDS),
+    "F": ("clock", 0, 1),
+    "D": ("dac_rate_hz", 160_000, 2_000_000),
+    "E": ("n_codes", 64, _MOST_SAMPLES),
+    "I": ("emissions", 1, 2**32 - 1),
+    "H": ("active", 0, 1),
+    "K": ("amplifier", 0, 1),
+    "B": ("counter", 0, 2**32 - 1),
+}
+
+
+class Registers:
+    """State of a device, at first as after power-up.
+
+    What a real device starts with is known of the amplifier (on) and the external trigger (off); the rest is a guess.
+    So is what settings answer: here 1; what the device refuses is not done, and answered by 0.
+
+    Attributes
+    ----------
+    n_bytes : int
+        Of the words of one measurement.
+    clock : int
+        0: 4.5 MHz, 1: 1.125 MHz.
+    dac_rate_hz, n_codes, emissions : int
+    codes : (65535,) uint16
+        Samples of the call; the first ``n_codes`` count.
+    active, amplifier : int
+    armed, pin : int
+        Whether SYNC pulses count, and at which input.
+    counter : int
+        Number of the next measurement.
+    """
+
+    def __init__(self) -> None:
+        self.n_bytes = 655_360
+        self.clock = 0
+        self.dac_rate_hz = 450_000
+        self.n_codes = 0
+        self.codes = np.zeros(_MOST_SAMPLES, dtype=np.uint16)
+        self.emissions = 1
+        self.active = 0
+        self.amplifier = 1
+        self.armed = 0
+        self.pin = 1
+        self.counter = 0
+
+    @property
+    def n_samples(self) -> int:
+        """Words of one measurement."""
+        return self.n_bytes // 4
+
+    @property
+    def duration_ns(self) -> int:
+        """How long a measurement takes."""
+        return self.n_samples * 1_000_000_000 // round(PDM_RATES_HZ[self.clock])
+
+    @property
+    def hash(self) -> int:
+        """XOR of the call's samples."""
+        return int(np.bitwise_xor.reduce(self.codes[: self.n_codes], initial=0))
+
+    def answer(self, command: Command) -> int | None:
+        """Do what a command says; return what the device answers, or None if it refuses."""
+        first, second = command.first, command.second
+        if command.code in {"Y", "L"}:
+            return FIRMWARE if command.code == "Y" else self.hash
+        if command.code == "C":
+            good = first < self.n_codes and second <= _MOST_CODE
+            if good:
+                self.codes[first] = second
+        elif command.code == "J":
+            good = first in {0, 1} and second in {1, 2}
+            if good:
+                self.armed, self.pin = first, second
+        else:
+            name, low, high = _NUMBERS[command.code]
+            good = low <= first <= high and (command.code != "G" or first % low == 0)
+            if good:
+                setattr(self, name, first)
+        return _DONE if good else None

@@ -1,0 +1,357 @@
+"""The driver: measurements out of a sensor on a serial port."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.devices.commands import FRAME_BYTES, Command, Setup, firmware_version
+from ertis_numba.devices.dialogue import Dialogue
+from ertis_numba.devices.ports import Port, find_again, resolve
+from ertis_numba.devices.protocol import Block, Receiver
+from ertis_numba.errors import SonarError, SonarGoneError
+
+__all__ = ["Sonar"]
+
+_COUNTS = 2**32
+_TRANSFER_BYTES_PER_S = 5e6  # at least
+_MARGIN_S = 0.5
+_RETRY_S = 0.05
+
+_log = logging.getLogger("ertis_numba")
+
+
+class Sonar:
+    """A sensor; make it by `Sonar.open`, and use it in a ``with`` statement or `close` it.
+
+    Only `close` may be called from another thread than the rest.
+
+    Attributes
+    ----------
+    firmware : str
+        Such as ``1.2.3``; empty where the sensor was opened to listen only.
+    """
+
+    def __init__(self, port: Port, *, timeout_s: float = 1.0, passive: bool = False) -> None:
+        self.firmware = ""
+        self._port = port
+        self._timeout_s = timeout_s
+        self._passive = passive
+        self._closing = threading.Event()
+        self._configured: tuple[Setup, Receiver] | None = None
+        self._next = 0  # number of the measurement that comes next
+        self._is_armed = False
+        self._is_late = False  # a measurement was given up and may still come
+        self._dropped = 0
+        self._line = self._opened(port, self._closing.is_set)
+
+    @classmethod
+    def open(cls, port: str, *, timeout_s: float = 1.0, passive: bool = False) -> Self:
+        """Open a sensor, end what an earlier program has left running, and ask for its firmware.
+
+        Parameters
+        ----------
+        port : str
+            Path, link, serial number, or name of an emulated device; see `ports.resolve`.
+        timeout_s : float
+            How long an answer may take.
+        passive : bool
+            Send nothing, ever: listen to a sensor that somebody else has set up.
+
+        Raises
+        ------
+        SonarError
+            The port is missing, in use, may not be used, is ambiguous, or no eRTIS is there. Its ``errno`` is ENOENT,
+            EBUSY, EACCES, ETIMEDOUT where nothing sensible is answered, or EINVAL where it is no serial port.
+        """
+        return cls(resolve(port), timeout_s=timeout_s, passive=passive)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def port(self) -> str:
+        """Path of the serial port; another one after `reconnect`, perhaps."""
+        return self._port.path
+
+    @property
+    def serial_number(self) -> str:
+        """Serial number of the USB device, or name of the emulated one; empty if there is none."""
+        return self._port.serial_number
+
+    @property
+    def receiver(self) -> Receiver:
+        """What was received, lost and rejected since `configure`."""
+        return self._state()[1]
+
+    @property
+    def dropped(self) -> int:
+        """Bytes that came when nothing was to come; the receiver has not seen them."""
+        return self._dropped + self._line.dropped
+
+    @property
+    def deadline_s(self) -> float:
+        """How long a measurement may take: to be recorded, to come at 5 MB/s, and half a second."""
+        setup = self._state()[0]
+        transfer_s = (setup.n_bytes + FRAME_BYTES) / _TRANSFER_BYTES_PER_S
+        return setup.n_samples / setup.pdm_rate_hz + transfer_s + _MARGIN_S
+
+    def call_hash(self) -> int:
+        """Return the hash of the call that the sensor holds."""
+        self._speak()
+        return self._line.ask(Command("L"))
+
+    def configure(
+        self, setup: Setup, *, counter: int = 0, bits: Callable[[NDArray[np.uint32]], str | None] | None = None
+    ) -> None:
+        """Tell the sensor all that it has to know; the trigger stays off.
+
+        The call is sent only if the sensor holds another one. To a sensor that was opened to listen nothing is sent:
+        then this says what will come.
+
+        Parameters
+        ----------
+        setup : Setup
+        counter : int
+            Number of the next measurement.
+        bits : callable, optional
+            Says of words why they cannot be true, as `bits.BitCheck.check` does.
+
+        Raises
+        ------
+        SonarError
+            The sensor does not answer, or holds another call than it was sent.
+        """
+        receiver = Receiver(
+            setup.n_samples,
+            expected=None if self._passive else counter,
+            shortest_s=setup.n_samples / setup.pdm_rate_hz,
+            bits=bits,
+        )
+        self._configured, self._next = (setup, receiver), counter
+        self._is_armed = self._is_late = False
+        if not self._passive:
+            self._line.tell(setup, counter=counter)
+
+    def measure(self, *, active: bool | None = None) -> Block:
+        """Measure now.
+
+        Parameters
+        ----------
+        active : bool, optional
+            Whether the call is emitted; by default what the setup says.
+
+        Raises
+        ------
+        SonarError
+            No whole measurement came in time; the next one may be tried at once.
+        SonarGoneError
+            The sensor was unplugged.
+        """
+        self._speak()
+        (setup, receiver), deadline_s = self._state(), self.deadline_s
+        if self._is_armed:
+            raise SonarError(
+                f"{self.port} is armed, and SYNC pulses measure; take what they do by listen(), or disarm()"
+            )
+        if self._line.waiting:
+            self._line.drain(within_s=deadline_s)
+        if self._is_late:  # should that measurement still come, its number tells
+            self._line.ask(Command("B", self._next))
+        receiver.expect(self._next)
+        self._line.send(Command("A", int(setup.active if active is None else active)).encode())
+        self._next, self._is_late = (self._next + 1) % _COUNTS, True  # whatever becomes of it, its number is used up
+        began, read = time.monotonic(), 0
+        while time.monotonic() - began <= deadline_s:
+            data, arrived = self._line.receive(receiver.missing)
+            read += len(data)
+            blocks = receiver.feed(data, arrived)
+            if receiver.held and not receiver.missing:
+                blocks += receiver.finish()  # no other block will come to decide
+            if blocks:
+                return self._counted(blocks[-1])
+        receiver.expire()
+        raise SonarError(
+            f"{self.port}: no whole measurement within {deadline_s:.2f} s; {read} of {setup.n_bytes + FRAME_BYTES} "
+            "bytes came: measure again, and look at the cable if that happens often"
+        )
+
+    def arm(self) -> None:
+        """Let SYNC pulses trigger measurements from now on; `listen` yields them."""
+        self._speak()
+        setup, receiver = self._state()
+        if self._line.waiting:
+            self._line.drain(within_s=self.deadline_s)
+        receiver.expect(self._next)
+        self._is_armed = True
+        self._line.ask(Command("J", 1, setup.pin), alone=False)
+
+    def disarm(self) -> None:
+        """Let SYNC pulses do nothing; a measurement that is still on its way is dropped."""
+        self._speak()
+        self._line.quieten(Command("J", 0, self._state()[0].pin), within_s=self.deadline_s)
+        self._is_armed = False
+
+    def listen(self, *, stop: Callable[[], bool], timeout_s: float) -> Iterator[Block]:
+        """Yield triggered measurements as they come.
+
+        Parameters
+        ----------
+        stop : callable
+            Asked some hundred times a second; once it is true, this ends.
+        timeout_s : float
+            How long to wait for a measurement; at least `deadline_s` whatever is given.
+
+        Raises
+        ------
+        SonarError
+            None came for so long.
+        SonarGoneError
+            The sensor was unplugged.
+        """
+        (setup, receiver), deadline_s = self._state(), self.deadline_s
+        if not (self._is_armed or self._passive):
+            raise SonarError(f"{self.port} is not armed; call arm() first")
+        timeout_s = max(timeout_s, deadline_s)
+        latest_ns = latest_byte_ns = time.monotonic_ns()
+        read = 0
+        try:
+            while not stop():
+                data, arrived = self._line.receive(receiver.missing)
+                now_ns = arrived.monotonic_ns
+                blocks: list[Block] = []
+                if data:
+                    read, latest_byte_ns = read + len(data), now_ns
+                    blocks = receiver.feed(data, arrived)
+                elif (receiver.missing or receiver.held) and now_ns - latest_byte_ns > 1e9 * deadline_s:
+                    blocks = receiver.expire()
+                if blocks:
+                    yield from map(self._counted, blocks)
+                    latest_ns, read = time.monotonic_ns(), 0
+                elif now_ns - latest_ns > 1e9 * timeout_s:
+                    raise self._nothing_whole(read, setup, timeout_s)
+        except SonarGoneError:
+            yield from map(self._counted, receiver.finish())
+            raise
+        except SonarError:
+            if not self._closing.is_set():
+                raise
+        yield from map(self._counted, receiver.finish())
+
+    def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False, missed: int = 0) -> bool:
+        """Wait for a sensor that was unplugged, and set it up again as it was.
+
+        It is found by its serial number, by its link, or else by its path. Its measurements are counted on.
+
+        Parameters
+        ----------
+        within_s : float
+        stop : callable
+            Once it is true, this gives up.
+        missed : int
+            SYNC pulses that it has missed, whose numbers are left out.
+
+        Returns
+        -------
+        bool
+            Whether it is back; if not, ``stop`` or `close` said so.
+
+        Raises
+        ------
+        SonarGoneError
+            It is not back within that time.
+        """
+        self._next = (self._next + missed) % _COUNTS
+        began = time.monotonic()
+        last: SonarError | None = None
+
+        def given_up() -> bool:
+            return self._closing.is_set() or stop()
+
+        self._hang_up()
+        while not given_up():
+            if time.monotonic() - began > within_s:
+                raise SonarGoneError(f"{self.port} did not come back within {within_s:g} s: {last}")
+            try:
+                port = find_again(self._port)
+                self._line, self._port = self._opened(port, given_up), port
+                self._go_on()
+            except SonarError as error:
+                last = error
+                self._hang_up()
+                self._closing.wait(_RETRY_S)
+            else:
+                self._line.stop = self._closing.is_set
+                _log.info("%s is back after %.2f s", self._port, time.monotonic() - began)
+                break
+        if self._closing.is_set():
+            self._hang_up()  # what close() has not seen
+        return not given_up()
+
+    def close(self) -> None:
+        """Switch the trigger off if it is on, and close the port; a `listen` in another thread ends."""
+        self._closing.set()
+        self._line.close(Command("J", 0, self._state()[0].pin).encode() if self._is_armed else b"")
+
+    def _opened(self, port: Port, stop: Callable[[], bool]) -> Dialogue:
+        """Return the line to a sensor that is quiet and has told its firmware."""
+        line = Dialogue(port.path, timeout_s=self._timeout_s, stop=stop)
+        if self._passive:
+            return line
+        try:
+            line.quieten(Command("J", 0, 1), within_s=self._timeout_s)
+            self.firmware = firmware_version(line.ask_twice(Command("Y")))
+        except BaseException:
+            line.close()
+            raise
+        _log.info("%s: eRTIS, firmware %s", port, self.firmware)
+        return line
+
+    def _hang_up(self) -> None:
+        self._line.close()
+        self._dropped += self._line.dropped
+        self._line.dropped = 0
+
+    def _go_on(self) -> None:
+        """Set up a sensor that has lost its power, as it was."""
+        if self._configured is None:
+            return
+        setup, receiver = self._configured
+        receiver.expire()
+        if not self._passive:
+            self._line.tell(setup, counter=self._next)
+            self._is_late = False
+        if self._is_armed:
+            self.arm()
+
+    def _speak(self) -> None:
+        if self._passive:
+            raise SonarError(f"{self.port} was opened to listen only; open it without passive")
+
+    def _state(self) -> tuple[Setup, Receiver]:
+        if self._configured is None:
+            raise SonarError(f"{self.port} is not configured; call configure() first")
+        return self._configured
+
+    def _counted(self, block: Block) -> Block:
+        """Return a block after it was noted that the next number is due."""
+        self._next, self._is_late = (block.counter + 1) % _COUNTS, False
+        return block
+
+    def _nothing_whole(self, read: int, setup: Setup, timeout_s: float) -> SonarError:
+        if not read:
+            return SonarError(f"{self.port}: nothing came within {timeout_s:g} s; look at the trigger and its cable")
+        return SonarError(
+            f"{self.port}: {read} bytes came within {timeout_s:g} s, but no whole measurement of "
+            f"{setup.n_samples} samples; give the length that it is set to"
+        )

@@ -1,0 +1,91 @@
+"""The SYNC line: pulses at a steady rate to emulated devices, one after the other."""
+
+import threading
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from ertis_numba import checks
+from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba.devices.emulator import Emulator
+
+__all__ = ["SyncChain"]
+
+_SECOND_NS = 1_000_000_000
+
+
+class SyncChain:
+    """Triggers emulated devices at a rate until it is stopped; use it in a ``with`` statement, or `start` it.
+
+    Deadlines are absolute, so the rate does not drift; a pulse that comes too late for the next is left out. Each
+    device gets a pulse `SYNC_STEP_S` after the one before it, which only shows in what it reckons with: the step is far
+    below what can be timed here. Where the words come from a scene, they carry it already.
+
+    Pulses are numbered from the first that a device took. All devices send the words of the same number.
+
+    Parameters
+    ----------
+    devices : sequence of Emulator
+        In the order of the chain.
+    rate_hz : float
+
+    Attributes
+    ----------
+    pulses : int
+        Pulses that some device took.
+
+    Raises
+    ------
+    ArgumentError
+        The rate is not within 0.001 and 1000 Hz.
+    """
+
+    def __init__(self, devices: Sequence[Emulator], rate_hz: float) -> None:
+        self._devices = tuple(devices)
+        self._period_ns = _SECOND_NS / checks.between("rate_hz", rate_hz, 1e-3, 1e3)
+        self._stopped = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.pulses = 0
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Send the first pulse a period from now; to start twice does no harm."""
+        if self._thread is None:
+            self._stopped.clear()
+            self._thread = threading.Thread(target=self._run, name="SYNC chain", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Send no more pulses."""
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self) -> None:
+        began_ns = time.monotonic_ns()
+        number = 1
+        while True:
+            due_ns = began_ns + round(number * self._period_ns)
+            if self._stopped.wait(max(0.0, (due_ns - time.monotonic_ns()) / _SECOND_NS)):
+                return
+            self._pulse(due_ns)
+            late = int((time.monotonic_ns() - due_ns) // self._period_ns)
+            number += 1 + late
+
+    def _pulse(self, due_ns: int) -> None:
+        steps_ns = (round(place * SYNC_STEP_S * _SECOND_NS) for place in range(len(self._devices)))
+        taken = [
+            device.trigger(self.pulses, at_ns=due_ns + step_ns)
+            for device, step_ns in zip(self._devices, steps_ns, strict=True)
+        ]
+        self.pulses += any(taken)

@@ -1,0 +1,130 @@
+"""What is in a journal."""
+
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Final, Self
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.journal._database import Database
+from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
+from ertis_numba.journal._tables import selection
+
+__all__ = ["Contents"]
+
+_SELECTION: Final = selection("measurements", "WHERE id = ?")
+
+
+class Contents:
+    """An open journal, as far as it is read."""
+
+    path: Path
+    target: Path
+    source: str
+
+    def __init__(self, path: Path, database: Database) -> None:
+        self.path = path
+        self._database = database
+        self._turn = threading.RLock()
+        self._sensors: dict[str, Sensor] = {}
+        self._ids: dict[str, int] = {}
+        self._last: dict[tuple[str, int], int] = {}
+        self._n_entries = self._held_bytes = 0
+
+    def _load(self) -> None:
+        rows = self._database.execute(selection("journal"))
+        if len(rows) != 1:
+            raise DataError(f"{self.path} is damaged, it has no header; copy it again if you can")
+        target, self.source, _ = checked(self.path, "the journal", rows[0])
+        self.target = self.path.parent / os.fsdecode(target)
+        for row in self._database.execute(selection("sensors", "ORDER BY id")):
+            self._know(row[0], Sensor.from_row(self.path, row))
+        names = {number: name for name, number in self._ids.items()}
+        counts = self._database.execute(
+            "SELECT sensor, epoch, max(sequence), count(*) FROM measurements INDEXED BY key GROUP BY sensor, epoch"
+        )
+        for number, epoch, last, count in counts:
+            if number not in names:
+                raise DataError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
+            self._last[names[number], epoch] = last
+            self._n_entries += count
+            self._held_bytes += count * self._sensors[names[number]].n_bytes
+
+    @property
+    def sensors(self) -> Mapping[str, Sensor]:
+        """Sensors by name, in the order in which they came."""
+        return MappingProxyType(self._sensors)
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """What was noted to be missing, in that order."""
+        with self._turn:
+            rows = self._database.execute(selection("gaps", "ORDER BY id"))
+        names = {number: name for name, number in self._ids.items()}
+        made = (checked(self.path, "a gap", row) for row in rows)
+        return tuple(Gap(names[number], *values) for number, *values in made)
+
+    def keys(self, sensor: str | None = None) -> list[Key]:
+        """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
+        number = None if sensor is None else self._ids[self._sensor(sensor).name]
+        with self._turn:
+            rows = self._database.execute(
+                "SELECT id, sensor, epoch, sequence FROM measurements INDEXED BY key WHERE sensor = ifnull(?, sensor)",
+                (number,),
+            )
+        names = {number: name for name, number in self._ids.items()}
+        return sorted(Key(place, names[number], *rest) for place, number, *rest in rows)
+
+    def entry(self, key: Key) -> Entry:
+        """Return a measurement, whose words are read-only.
+
+        Raises
+        ------
+        DataError
+            It is not what was written.
+        """
+        with self._turn:
+            rows = self._database.execute(_SELECTION, (key.place,))
+        if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.epoch, key.sequence):
+            raise DataError(
+                f"{self.path} has lost the record of measurement {key.sequence} of sensor {key.sensor}: it is "
+                "damaged; copy it again if you can"
+            )
+        return self._sensors[key.sensor].entry(self.path, rows[0])
+
+    def entries(self, sensor: str | None = None) -> Iterator[Entry]:
+        """Yield the measurements of one sensor or of all, in order of arrival; each is read when it is asked for.
+
+        Raises
+        ------
+        DataError
+            A measurement is damaged; `keys` and `entry` get at the others.
+        """
+        return (self.entry(key) for key in self.keys(sensor))
+
+    def _sensor(self, name: str) -> Sensor:
+        if name not in self._sensors:
+            raise ArgumentError(f"sensor {name!r} is not in {self.path}; add it first")
+        return self._sensors[name]
+
+    def _know(self, number: int, sensor: Sensor) -> None:
+        self._ids[sensor.name] = number
+        self._sensors[sensor.name] = sensor
+
+    def __len__(self) -> int:
+        return self._n_entries
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the journal; closing twice does no harm."""
+        with self._turn:
+            self._database.close()

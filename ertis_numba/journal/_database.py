@@ -1,0 +1,164 @@
+"""One SQLite file that belongs to one process, and what SQLite says in the words of this package."""
+
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.journal._tables import APPLICATION_ID, VERSION, layout
+
+__all__ = ["LOG_BYTES", "PAGE_BYTES", "Database", "InUseError"]
+
+PAGE_BYTES: Final = 32_768  # of 4 to 64 KiB, it takes the least time for measurements of 128 KiB to 1 MiB
+LOG_BYTES: Final = 4_194_304  # of the write-ahead log; then what is in it moves to the main file
+_CACHE_KIB: Final = 4096
+
+_SETUP: Final = (
+    "PRAGMA cell_size_check = ON",
+    "PRAGMA journal_mode = WAL",  # after locking_mode: then its index is in memory, and no -shm is made
+    # What a commit wrote has reached the disk when it returns. NORMAL would leave that to the next checkpoint.
+    "PRAGMA synchronous = FULL",
+    "PRAGMA fullfsync = ON",  # on macOS, where fsync leaves it in the disk's cache
+    f"PRAGMA wal_autocheckpoint = {LOG_BYTES // PAGE_BYTES}",
+    f"PRAGMA journal_size_limit = {LOG_BYTES}",
+    f"PRAGMA cache_size = -{_CACHE_KIB}",
+)
+
+_TOLD: Final = {
+    sqlite3.SQLITE_FULL: "has no room on its disk; free some space: what was committed before is safe",
+    sqlite3.SQLITE_IOERR: "cannot be written or read ({}); check the disk: what was committed before is safe",
+    sqlite3.SQLITE_READONLY: "cannot be written ({}); allow writing to the file and to its folder",
+    sqlite3.SQLITE_CANTOPEN: "cannot be opened ({}); allow reading and writing of the file and of its folder",
+    sqlite3.SQLITE_PERM: "cannot be opened ({}); allow reading and writing of the file and of its folder",
+    sqlite3.SQLITE_CORRUPT: "is damaged ({}); copy it again if you can",
+    sqlite3.SQLITE_NOTADB: "is not a journal ({}); give a file that 'ertis capture' left",
+}
+
+
+class InUseError(DataError):
+    """A journal belongs to another process: a capture that runs, or what seals it."""
+
+
+class Database:
+    """An SQLite file with the tables of a journal, which no other process can open meanwhile.
+
+    SQLite holds a lock of the operating system on the file, which ends with the process, however that ends.
+
+    Parameters
+    ----------
+    path : Path
+        It has to exist. An empty file gets its tables, if ``empty`` is set.
+    empty : bool
+
+    Attributes
+    ----------
+    is_new : bool
+        It was empty.
+    """
+
+    def __init__(self, path: Path, *, empty: bool) -> None:
+        self._path = path
+        with self._told():
+            before = path.stat()
+            uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
+            # Who uses a journal sees to it that two threads do not use it at once.
+            self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
+        try:
+            with self._told():
+                self.is_new = self._take(before, empty=empty)
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def _take(self, before: os.stat_result, *, empty: bool) -> bool:
+        """Lock the file, and make sure of what it is before anything in it changes."""
+        self.execute(f"PRAGMA page_size = {PAGE_BYTES}")
+        self.execute("PRAGMA locking_mode = EXCLUSIVE")
+        self.execute("BEGIN EXCLUSIVE")
+        self.execute("COMMIT")
+        now = self._path.stat()  # who locked it before may have sealed and removed it
+        if (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
+            raise InUseError(f"{self._path} was replaced by another process; try again")
+        ((application,),), ((version,),), ((n_tables,),) = map(
+            self.execute, ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_schema")
+        )
+        is_new = bool(empty and application == version == n_tables == 0)
+        if not is_new and application != APPLICATION_ID:
+            raise DataError(f"{self._path} is an SQLite file, but not a journal; give one that 'ertis capture' left")
+        if version > VERSION:
+            raise FormatVersionError(
+                f"{self._path} has format version {version}, this package reads up to {VERSION}; update ertis-numba"
+            )
+        for statement in _SETUP:
+            self.execute(statement)
+        return is_new
+
+    def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Run a statement and return its rows.
+
+        Raises
+        ------
+        InUseError
+            Another process has the journal.
+        DataError
+            The disk is full, fails or may not be written, the file is damaged or closed.
+        """
+        with self._told():
+            return self._connection.execute(statement, values).fetchall()
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Make what happens in the block durable when it ends, all or nothing."""
+        self.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self.execute("COMMIT")
+        except BaseException:  # Ctrl-C, too
+            with suppress(sqlite3.Error):  # the first error is the one to tell
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+            raise
+
+    def lay_out(self) -> None:
+        """Make the tables; to be called in a transaction."""
+        for statement in layout():
+            self.execute(statement)
+
+    def leave_log(self) -> None:
+        """Bring all to the main file, and remove the log: then closing touches no file by its name.
+
+        Where the disk is full, the log stays.
+        """
+        with suppress(DataError):
+            self.execute("PRAGMA journal_mode = MEMORY")
+
+    def close(self) -> None:
+        """Close the file; closing twice does no harm."""
+        self._connection.close()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Tell errors in the words of this package, in a line that names the file."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            code = getattr(error, "sqlite_errorcode", None)
+            if code is None:
+                raise DataError(f"{self._path} is closed or damaged ({_line(error)}); open it again") from error
+            code &= 0xFF  # without what SQLite adds to a code
+            if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+                raise InUseError(
+                    f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
+                ) from error
+            told = _TOLD.get(code, "cannot be used ({}); check the disk")
+            raise DataError(f"{self._path} {told.format(_line(error))}") from error
+        except OSError as error:
+            raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

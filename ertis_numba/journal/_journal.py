@@ -1,0 +1,255 @@
+"""Journals: measurements as they arrive, durable one commit at a time."""
+
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Self
+
+from ertis_numba.atomic import sync
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.journal import _room
+from ertis_numba.journal._contents import Contents
+from ertis_numba.journal._database import Database
+from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
+from ertis_numba.journal._tables import insertion, row_crc32
+from ertis_numba.settings import Settings
+
+__all__ = ["SUFFIX", "Journal"]
+
+SUFFIX: Final = ".journal"
+"""End of the name of a journal, after that of its recording."""
+
+_BESIDE: Final = ("-wal", "-shm", "-journal")  # what SQLite may leave when it is killed
+
+
+class Journal(Contents):
+    """Measurements that are durable, until they are sealed into a recording.
+
+    Make it by `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
+    open it meanwhile. Threads may share it.
+
+    Attributes
+    ----------
+    path : Path
+    target : Path
+        The recording to be made of it.
+    source : str
+        Where the measurements come from.
+    """
+
+    def __init__(self, path: Path, database: Database) -> None:
+        super().__init__(path, database)
+        self._accepted: dict[str, Settings] = {}
+
+    @classmethod
+    def create(cls, path: str | Path, *, target: str | Path, source: str = "") -> Self:
+        """Make a journal.
+
+        Parameters
+        ----------
+        path : str or Path
+            By convention the name of the recording and `SUFFIX`, beside it.
+        target : str or Path
+            The recording to be made of it; a relative path counts from the folder of the journal.
+        source : str
+            Where the measurements come from.
+
+        Raises
+        ------
+        ArgumentError
+            There is a journal already.
+        DataError
+            It cannot be written.
+        """
+        path = Path(path)
+        try:
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        except FileExistsError as error:
+            raise ArgumentError(
+                f"{path} exists, an interrupted capture left it; run 'ertis recover {path}', or give another name"
+            ) from error
+        except OSError as error:
+            raise DataError(f"{path}: {error.strerror}; give a place that can be written") from error
+        try:
+            made = cls(path, Database(path, empty=True))
+            try:
+                made._begin(Path(target), source)
+            except BaseException:
+                made.close()
+                raise
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return made
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open a journal, whatever ended the process that wrote it.
+
+        Raises
+        ------
+        InUseError
+            Another process has it open.
+        DataError
+            There is none, it is damaged, or cannot be written.
+        FormatVersionError
+            A newer version wrote it.
+        """
+        path = Path(path)
+        # A process that is killed right after it made the file leaves an empty one, or one without tables.
+        opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
+        try:
+            if opened._database.is_new:
+                opened._begin(Path(path.name.removesuffix(SUFFIX)), "")
+            else:
+                opened._load()
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+    def _begin(self, target: Path, source: str) -> None:
+        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        with self._database.transaction():
+            self._database.lay_out()
+            self._insert("journal", (os.fsencode(target), source, now))
+        sync(self.path.parent)
+        self._load()
+
+    def add_sensor(
+        self,
+        name: str,
+        settings: Settings,
+        *,
+        firmware: str = "",
+        translation_m: Sequence[float] = (0.0, 0.0, 0.0),
+        rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        """Say of what sensor measurements will come; at any time before its first one.
+
+        Parameters
+        ----------
+        name : str
+        settings : Settings
+            Those of its measurements, whose air may differ. Layout files are written out.
+        firmware : str
+        translation_m : sequence of 3 float
+            Where it is: x, y, z.
+        rotation_xyzw : sequence of 4 float
+            The unit quaternion that turns the sensor frame into that of the surroundings.
+
+        Raises
+        ------
+        ArgumentError
+            The journal has it, or no recording could hold this.
+        DataError
+            The journal cannot be written.
+        """
+        made = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
+        with self._turn:
+            if name in self._sensors:
+                raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor a name of its own")
+            with self._database.transaction():
+                self._insert("sensors", made.row())
+            self._know(len(self._ids) + 1, made)
+
+    def append(self, entries: Sequence[Entry]) -> None:
+        """Make measurements durable: when this returns they are, all of them; when it raises, none is there.
+
+        Parameters
+        ----------
+        entries : sequence of Entry
+            Of any sensors in any order. The sequence numbers of a sensor rise within an epoch. Their
+            ``crc32`` is filled in where it is None.
+
+        Raises
+        ------
+        ArgumentError
+            A measurement does not fit to its sensor, or its number does not rise.
+        DataError
+            The disk is full, nearly so, or fails. What was appended before is still there, and more can be
+            appended once there is room.
+        """
+        with self._turn:
+            last = dict(self._last)
+            rows = [self._row(entry, last) for entry in entries]
+            sizes_bytes = [row[-1].nbytes for row in rows]
+            _room.require(self.path, self.target, held_bytes=self._held_bytes, sizes_bytes=sizes_bytes)
+            with self._database.transaction():
+                for row in rows:
+                    self._database.execute(_INSERTION, row)
+            self._last = last
+            self._n_entries += len(rows)
+            self._held_bytes += sum(sizes_bytes)
+
+    def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
+        """Return the row of a measurement, whose number is to be above the one in ``last``."""
+        stamp, settings = entry.measurement.stamp, entry.measurement.settings
+        sensor = self._sensor(stamp.sensor)
+        if settings is not self._accepted.get(sensor.name):
+            require_same(sensor, settings)
+            self._accepted[sensor.name] = settings
+        row = sensor.entry_row(entry, self._ids[sensor.name])
+        key = (sensor.name, entry.epoch)
+        if stamp.sequence <= last.get(key, -1):
+            raise ArgumentError(
+                f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in order, or "
+                "with another epoch"
+            )
+        last[key] = stamp.sequence
+        return row
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str) -> None:
+        """Say durably why sequence numbers of a sensor are missing, ``first`` and ``last`` included.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such sensor, ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
+        DataError
+            The journal cannot be written.
+        """
+        Gap(self._sensor(sensor).name, first, last, reason)
+        with self._turn, self._database.transaction():
+            self._insert("gaps", (self._ids[sensor], first, last, reason))
+
+    def _insert(self, table: str, values: tuple[Any, ...]) -> None:
+        self._database.execute(insertion(table), (*values, row_crc32(values)))
+
+    def room(self) -> int:
+        """Return how many more bytes of words can be appended such that all can still be sealed, about.
+
+        Raises
+        ------
+        DataError
+            The folder of the recording is not there.
+        """
+        return _room.left(self.path, self.target, held_bytes=self._held_bytes)
+
+    def remove(self) -> None:
+        """Close the journal and remove it: what is in it is in a recording, or is nothing."""
+        self._database.leave_log()
+        self.path.unlink(missing_ok=True)
+        # Only where the disk was too full to take the log in; without the main file it means nothing.
+        for end in _BESIDE:
+            self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+        self.close()
+        sync(self.path.parent)
+
+    def set_aside(self) -> Path:
+        """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that."""
+        self._database.leave_log()
+        if self.path.with_name(f"{self.path.name}-wal").exists():
+            raise DataError(f"{self.path} cannot be set aside, its disk is full; free some space")
+        number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
+        while aside.exists():
+            number += 1
+            aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
+        self.path.rename(aside)
+        self.close()
+        sync(self.path.parent)
+        return aside
+
+
+_INSERTION: Final = insertion("measurements")

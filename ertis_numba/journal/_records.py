@@ -1,0 +1,222 @@
+"""What goes into a journal and comes out of it: sensors, measurements and gaps, and the rows they are."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError, SettingsError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import microphones, mounting, self_contained, storable
+from ertis_numba.journal._tables import row_crc32
+from ertis_numba.settings import Air, Settings
+
+__all__ = ["Entry", "Gap", "Key", "Sensor", "checked", "require_same"]
+
+_INT64 = (-(2**63), 2**63 - 1)
+_MOST_BYTES = 999_000_000  # of one measurement: SQLite's limit, less the rest of the row
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """A measurement in a journal.
+
+    Attributes
+    ----------
+    measurement : Measurement
+    epoch : int
+        Chosen at random whenever sequence numbers start again: sensor, epoch and sequence number are the key.
+    monotonic_ns : int
+        When it arrived, by a clock that nobody sets.
+    crc32 : int, optional
+        Of the words, little-endian; `Journal.append` fills it in where it is not given.
+    """
+
+    measurement: Measurement
+    epoch: int
+    monotonic_ns: int
+    crc32: int | None = None
+
+
+class Key(NamedTuple):
+    """Which measurement a row is; ``place`` counts all of a journal in order of arrival, from 1."""
+
+    place: int
+    sensor: str
+    epoch: int
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Sequence numbers of a sensor that are missing, ``first`` and ``last`` included, and why."""
+
+    sensor: str
+    first: int
+    last: int
+    reason: str
+
+    def __post_init__(self) -> None:
+        checks.gap(self.first, self.last, self.reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """A sensor whose measurements a journal takes.
+
+    Attributes
+    ----------
+    name : str
+    settings : Settings
+        They depend on no file.
+    firmware : str
+    translation_m : (x, y, z)
+        Where it is.
+    rotation_xyzw : (x, y, z, w)
+        The unit quaternion that turns the sensor frame into that of the surroundings.
+    shape : tuple of int
+        Of the words of a measurement.
+    dtype : dtype
+        Of the words, little-endian.
+    """
+
+    name: str
+    settings: Settings
+    firmware: str
+    translation_m: tuple[float, ...]
+    rotation_xyzw: tuple[float, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        settings: Settings,
+        *,
+        firmware: str = "",
+        translation_m: Sequence[float] = (0.0, 0.0, 0.0),
+        rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+    ) -> Self:
+        """Return a sensor, or refuse what no recording could hold."""
+        settings = storable(settings)
+        layout = microphones(settings.array)
+        place = mounting(checks.sensor_name(name), translation_m, rotation_xyzw)
+        made = cls(
+            name=name,
+            settings=settings,
+            firmware=firmware,
+            translation_m=tuple(place["translation_m"].tolist()),
+            rotation_xyzw=tuple(place["rotation_xyzw"].tolist()),
+            shape=(settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)],
+            dtype=np.dtype(f"<u{layout.word_bits // 8}"),
+        )
+        if made.n_bytes > _MOST_BYTES:
+            raise ArgumentError(
+                f"a measurement of sensor {name} has {made.n_bytes / 1e6:.0f} MB, which a journal cannot hold; give "
+                f"fewer samples, {_MOST_BYTES / 1e6:.0f} MB at most"
+            )
+        return made
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of one measurement's words."""
+        return int(np.prod(self.shape)) * self.dtype.itemsize
+
+    def row(self) -> tuple[Any, ...]:
+        """Return what stands in the table."""
+        return (self.name, self.settings.to_toml(), self.firmware, *self.translation_m, *self.rotation_xyzw)
+
+    @classmethod
+    def from_row(cls, path: Path, row: Sequence[Any]) -> Self:
+        """Return what stands in the table of a journal."""
+        name, text, firmware, *place = checked(path, "a sensor", row)
+        try:
+            settings = Settings.from_toml(text, f"{path}: settings of sensor {name}")
+        except SettingsError as error:
+            raise DataError(str(error)) from error
+        return cls.of(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])
+
+    def entry_row(self, entry: Entry, sensor_id: int) -> tuple[Any, ...]:
+        """Return what stands in the table of measurements; refuse words that are not those of this sensor."""
+        stamp, air = entry.measurement.stamp, entry.measurement.settings.air
+        words = self._words(entry.measurement.words)
+        if entry.crc32 is None:
+            entry.crc32 = zlib.crc32(words.data)
+        values = (
+            sensor_id,
+            checks.whole("epoch", entry.epoch, 0, _INT64[1]),
+            checks.whole("sequence", stamp.sequence, 0, _INT64[1]),
+            checks.whole("sync_count", stamp.sync_count, *_INT64),
+            checks.whole("timestamp_ns", stamp.timestamp_ns, *_INT64),
+            checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1),
+            checks.whole("monotonic_ns", entry.monotonic_ns, *_INT64),
+            float(air.temperature_c),
+            float(air.humidity_percent),
+            float(air.pressure_pa),
+            checks.whole("crc32", entry.crc32, 0, 2**32 - 1),
+        )
+        return (*values, row_crc32(values), words)
+
+    def _words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
+        checks.shape(f"a measurement of sensor {self.name}", words.shape, self.shape)
+        if words.dtype.newbyteorder("<") != self.dtype:
+            raise ArgumentError(f"a measurement of sensor {self.name} holds {words.dtype}; give {self.dtype.name}")
+        return np.ascontiguousarray(words, dtype=self.dtype)
+
+    def entry(self, path: Path, row: Sequence[Any]) -> Entry:
+        """Return what stands in the table of measurements of a journal.
+
+        Raises
+        ------
+        DataError
+            It is not what was written.
+        """
+        *values, words = row
+        what = f"measurement {row[3]} of sensor {self.name}"
+        _, epoch, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(path, what, values)
+        got = zlib.crc32(words)
+        if got != crc32 or len(words) != self.n_bytes:
+            raise DataError(
+                f"{path}: {what} has CRC-32 {got:08x}, its record says {crc32:08x}: the journal is damaged; copy it "
+                "again if you can"
+            )
+        settings = self.settings
+        if (given := Air(temperature_c=air[0], humidity_percent=air[1], pressure_pa=air[2])) != settings.air:
+            settings = settings.replace(air=given)
+        stamp = Stamp(
+            sensor=self.name,
+            sequence=sequence,
+            sync_count=sync_count,
+            timestamp_ns=time_ns,
+            timestamp_uncertainty_ns=uncertainty_ns,
+        )
+        array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
+        return Entry(Measurement(array, settings, stamp), epoch, monotonic_ns, crc32)
+
+
+def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
+    """Return the values of a row without its number and its CRC-32, once that has been compared."""
+    _, *values, wanted = row
+    got = row_crc32(values)
+    if got != wanted:
+        raise DataError(
+            f"{path}: the record of {what} has CRC-32 {got:08x}, wanted {wanted:08x}: the journal is damaged; copy it "
+            "again if you can"
+        )
+    return values
+
+
+def require_same(sensor: Sensor, settings: Settings) -> None:
+    """Refuse what the settings of a sensor do not describe: all but the air must be equal."""
+    came = self_contained(settings)
+    for name in ("array", "call", "recording"):
+        if getattr(came, name) != getattr(sensor.settings, name):
+            raise ArgumentError(
+                f"a measurement has other {name} settings than sensor {sensor.name}; add a sensor for it"
+            )

@@ -1,0 +1,114 @@
+"""What a journal holds: its tables and their version."""
+
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["APPLICATION_ID", "TABLES", "VERSION", "Column", "insertion", "layout", "row_crc32", "selection"]
+
+APPLICATION_ID: Final = 0x6552544A
+"""``eRTJ``: what SQLite keeps in the header of the file, beside the version."""
+
+VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a table.
+
+    Attributes
+    ----------
+    name : str
+    kind : str
+        As SQLite names it.
+    about : str
+    units : str
+        As UDUNITS writes it; empty for numbers without a unit.
+    """
+
+    name: str
+    kind: str
+    about: str
+    units: str = ""
+
+
+_ID = Column("id", "INTEGER", "order of arrival, from 1")
+_CHECK = Column("row_crc32", "INTEGER", "CRC-32 over the columns before it without id")
+_SENSOR = Column("sensor", "INTEGER", "id of the sensor")
+
+TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
+    "journal": (
+        _ID,
+        Column("target", "BLOB", "recording to be made, from the folder of the journal; bytes of a path"),
+        Column("source", "TEXT", "where the measurements come from"),
+        Column("created", "TEXT", "when the journal was made, ISO 8601"),
+        _CHECK,
+    ),
+    "sensors": (
+        _ID,
+        Column("name", "TEXT", "name or serial number"),
+        Column("settings", "TEXT", "settings as TOML; they hold the array itself"),
+        Column("firmware", "TEXT", "version of the sensor's firmware"),
+        Column("x_m", "REAL", "where the sensor is", "m"),
+        Column("y_m", "REAL", "the same", "m"),
+        Column("z_m", "REAL", "the same", "m"),
+        Column("rotation_x", "REAL", "unit quaternion that turns the sensor frame into that of the surroundings"),
+        Column("rotation_y", "REAL", "the same"),
+        Column("rotation_z", "REAL", "the same"),
+        Column("rotation_w", "REAL", "the same"),
+        _CHECK,
+    ),
+    "measurements": (
+        _ID,
+        _SENSOR,
+        Column("epoch", "INTEGER", "chosen at random whenever sequence numbers start again"),
+        Column("sequence", "INTEGER", "number given at capture; it rises within an epoch of a sensor"),
+        Column("sync_count", "INTEGER", "pulse of the SYNC chain, equal for sensors that emitted together"),
+        Column("timestamp_ns", "INTEGER", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
+        Column("timestamp_uncertainty_ns", "INTEGER", "uncertainty of timestamp_ns", "ns"),
+        Column("monotonic_ns", "INTEGER", "when it arrived, by a clock that nobody sets", "ns"),
+        Column("temperature_c", "REAL", "air temperature", "degree_Celsius"),
+        Column("humidity_percent", "REAL", "relative humidity", "percent"),
+        Column("pressure_pa", "REAL", "air pressure", "Pa"),
+        Column("crc32", "INTEGER", "CRC-32 of words"),
+        _CHECK,
+        Column("words", "BLOB", "PDM words, little-endian, as they lie in a recording"),
+    ),
+    "gaps": (
+        _ID,
+        _SENSOR,
+        Column("first", "INTEGER", "first missing sequence number"),
+        Column("last", "INTEGER", "last missing sequence number"),
+        Column("reason", "TEXT", "why they are missing"),
+        _CHECK,
+    ),
+}
+
+
+def layout() -> Iterable[str]:
+    """Yield the statements that make the tables, and one that finds a measurement by its key."""
+    for table, columns in TABLES.items():
+        kinds = ", ".join(
+            f"{column.name} {column.kind} {'PRIMARY KEY' if column is _ID else 'NOT NULL'}" for column in columns
+        )
+        yield f"CREATE TABLE {table} ({kinds})"
+    yield "CREATE UNIQUE INDEX key ON measurements (sensor, epoch, sequence)"
+    yield f"PRAGMA application_id = {APPLICATION_ID}"
+    yield f"PRAGMA user_version = {VERSION}"
+
+
+def insertion(table: str) -> str:
+    """Return the statement that adds a row, given all its columns but ``id``."""
+    names = [column.name for column in TABLES[table] if column is not _ID]
+    return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join('?' * len(names))})"  # noqa: S608  our own
+
+
+def selection(table: str, where: str = "") -> str:
+    """Return the statement that reads rows with all their columns."""
+    return f"SELECT {', '.join(column.name for column in TABLES[table])} FROM {table} {where}"  # noqa: S608  our own
+
+
+def row_crc32(values: Iterable[int | float | str | bytes]) -> int:
+    """Return the CRC-32 of a row: over its values as Python writes them, a line for each."""
+    return zlib.crc32("".join(f"{value!r}\n" for value in values).encode())

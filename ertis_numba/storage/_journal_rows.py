@@ -1,0 +1,61 @@
+"""A journal as a recording would hold it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ertis_numba.errors import DataError
+from ertis_numba.journal import Entry, Journal
+from ertis_numba.storage._gaps import Missing, Numbers
+
+__all__ = ["Damage", "JournalRows"]
+
+_DAMAGED = "damaged in the journal"
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A measurement that cannot be read: its place among those of its sensor, its number, and what is wrong."""
+
+    index: int
+    sequence: int
+    reason: str
+
+
+class JournalRows:
+    """The measurements of one sensor of a journal, without those that are damaged.
+
+    What it says beside them counts once all have been read.
+
+    Attributes
+    ----------
+    keys : list of Key
+    damaged : list of Damage
+    """
+
+    def __init__(self, journal: Journal, sensor: str) -> None:
+        self._journal = journal
+        self.keys = journal.keys(sensor)
+        self._noted = [(gap.first, gap.last, gap.reason) for gap in journal.gaps if gap.sensor == sensor]
+        self._numbers = Numbers()
+        self.damaged: list[Damage] = []
+
+    def __len__(self) -> int:
+        """Return how many there are, with those that are damaged."""
+        return len(self.keys)
+
+    def __iter__(self) -> Iterator[Entry]:
+        self._numbers, self.damaged = Numbers(), []
+        for index, key in enumerate(self.keys):
+            try:
+                entry = self._journal.entry(key)
+            except DataError as error:
+                self.damaged.append(Damage(index, key.sequence, str(error)))
+                continue
+            self._numbers.add(key.sequence)
+            yield entry
+
+    @property
+    def missing(self) -> list[Missing]:
+        """First, last and reason of what is missing, in order; with what is damaged."""
+        lost = [(item.sequence, item.sequence, _DAMAGED) for item in self.damaged]
+        return self._numbers.missing([*lost, *self._noted])

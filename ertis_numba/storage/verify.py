@@ -1,0 +1,136 @@
+"""What is missing in a recording or a journal, and what is damaged."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Stamp
+from ertis_numba.journal import Journal
+from ertis_numba.storage._journal_rows import Damage, JournalRows
+from ertis_numba.storage._reader import sensor_names
+from ertis_numba.storage.recording import Gap, open_recording
+
+__all__ = ["Damage", "SensorReport", "verify"]
+
+_SQLITE = b"SQLite format 3\0"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorReport:
+    """What was found of one sensor.
+
+    Attributes
+    ----------
+    sensor : str
+    measurements : int
+        Those that are damaged included.
+    gaps : tuple of Gap
+        Sequence numbers that are missing, and why.
+    damaged : tuple of Damage
+    disordered : tuple of int
+        Places, counted from 0, of measurements whose sequence number is not above the one before, although they do
+        not start again.
+    fault : str
+        Why nothing of this sensor can be read; empty elsewhere.
+    """
+
+    sensor: str
+    measurements: int = 0
+    gaps: tuple[Gap, ...] = ()
+    damaged: tuple[Damage, ...] = ()
+    disordered: tuple[int, ...] = ()
+    fault: str = ""
+
+    @property
+    def missing(self) -> int:
+        """Sequence numbers that are missing."""
+        return sum(gap.last - gap.first + 1 for gap in self.gaps)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all is there and as it was written."""
+        return not (self.gaps or self.damaged or self.disordered or self.fault)
+
+
+def verify(path: str | Path) -> list[SensorReport]:
+    """Read all of a recording or a journal, and return what is missing or damaged, for each sensor.
+
+    In a recording, that is the hash over the content of each sensor, the CRC-32 of each measurement, and the order
+    of the sequence numbers; in a journal, the CRC-32 of each record and each measurement.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read at all, or another process has the journal.
+    """
+    path = Path(path)
+    if _is_journal(path):
+        with Journal.open(path) as journal:
+            return [_of_journal(journal, name) for name in journal.sensors]
+    reports = [_of_recording(path, name) for name in sensor_names(path)]
+    if all(report.fault for report in reports):
+        raise DataError(reports[0].fault if reports else f"{path} holds no sensor; copy it again")
+    return reports
+
+
+def _is_journal(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_SQLITE)) == _SQLITE
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; give a recording or a journal") from error
+
+
+def _of_recording(path: Path, sensor: str) -> SensorReport:
+    try:
+        recording = open_recording(path, sensor=sensor)
+    except (ArgumentError, DataError) as error:
+        return SensorReport(sensor=sensor, fault=str(error))
+    damaged: list[Damage] = []
+    with recording:
+        stamps = recording.stamps()
+        for index, stamp in enumerate(stamps):
+            try:
+                recording[index]
+            except DataError as error:
+                damaged.append(Damage(index, stamp.sequence, str(error)))
+        return SensorReport(
+            sensor=sensor,
+            measurements=len(recording),
+            gaps=recording.gaps,
+            damaged=tuple(damaged),
+            disordered=_disordered(_starts(stamps)),
+        )
+
+
+def _starts(stamps: Iterable[Stamp]) -> Iterator[tuple[int, int]]:
+    """Yield how often the numbers have started again, as far as the SYNC count shows, and the number."""
+    last, starts = None, 0
+    for stamp in stamps:
+        starts += last is not None and stamp.sync_count < last
+        last = stamp.sync_count
+        yield starts, stamp.sequence
+
+
+def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
+    """Return the places of the numbers that do not rise, although they did not start again."""
+    return tuple(
+        index
+        for index, (before, (start, number)) in enumerate(pairwise(numbers), 1)
+        if start == before[0] and number <= before[1]
+    )
+
+
+def _of_journal(journal: Journal, sensor: str) -> SensorReport:
+    rows = JournalRows(journal, sensor)
+    for _ in rows:
+        pass
+    return SensorReport(
+        sensor=sensor,
+        measurements=len(rows),
+        gaps=tuple(Gap(*item) for item in rows.missing),
+        damaged=tuple(rows.damaged),
+        disordered=_disordered((key.epoch, key.sequence) for key in rows.keys),
+    )

@@ -1,0 +1,332 @@
+"""Captures from emulated sensors on real pseudo terminals: what is stored is what was sent, whatever happens."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.capture import Session
+from ertis_numba.devices.commands import Setup
+from ertis_numba.devices.emulator import Emulator, Quirks
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sync_chain import SyncChain
+from ertis_numba.errors import ArgumentError, SonarError
+from ertis_numba.journal import Journal
+from ertis_numba.settings import Recording, Settings
+from ertis_numba.storage import open_recording
+from ertis_numba.storage.sealing import seal
+
+ROOT = Path(__file__).parents[1]
+ERTIS = (sys.executable, "-m", "ertis_cli")
+SHORT = 32_768  # the shortest measurement that a sensor can
+SETTINGS = Settings(recording=Recording(n_samples=SHORT)).replace(
+    processing=Settings().processing.replace(range_m=(0.1, 0.5))
+)
+
+
+@pytest.fixture(scope="module")
+def words():
+    """Four measurements, different parts of a simulated one."""
+    whole = open_recording(ROOT / "data" / "synthetic" / "reflectors.h5")[0].words
+    return [np.ascontiguousarray(whole[start : start + SHORT]) for start in range(0, 4 * SHORT, SHORT)]
+
+
+class Capture:
+    """Emulated sensors, the driver, a journal, and what became of it."""
+
+    def __init__(self, stack, folder, words, *, trigger="command", names=("one",), rotated=0, **options):
+        self.log = io.StringIO()
+        self.emulators = [
+            stack.enter_context(
+                Emulator([*words[rotated:], *words[:rotated]], name=name, link=folder / name, log=self.log)
+            )
+            for name in names
+        ]
+        sonars = {name: stack.enter_context(Sonar.open(str(folder / name))) for name in names}
+        setup = Setup.of(SETTINGS, trigger=trigger)
+        for sonar in sonars.values():
+            sonar.configure(setup)
+        self.sonars = sonars
+        self.journal = stack.enter_context(Journal.create(folder / "rec.h5.journal", target="rec.h5"))
+        self.notes, self.stored = [], []
+        self.many = threading.Event()
+        self._wanted = 0
+        self.session = Session(
+            sonars,
+            SETTINGS,
+            trigger=trigger,
+            on_stored=self._store,
+            on_note=lambda sensor, text: self.notes.append((sensor, text)),
+            on_back=lambda sensor, away_s: self.notes.append((sensor, away_s)),
+            **options,
+        )
+
+    def _store(self, entries):
+        self.stored += [entry.measurement.stamp for entry in entries]
+        if len(self.stored) >= self._wanted:
+            self.many.set()
+
+    def wait_for(self, count):
+        self.many.clear()
+        self._wanted = count
+        if len(self.stored) < count:
+            assert self.many.wait(20), f"{len(self.stored)} stored, wanted {count}: {self.notes}"
+
+    def recording(self, sensor="one"):
+        self.journal.close()
+        path = self.journal.path.with_name("rec.h5")
+        if not path.exists():
+            assert seal(self.journal.path).recording == path
+        return open_recording(path, sensor=sensor)
+
+
+@pytest.fixture
+def captures(tmp_path, words):
+    with ExitStack() as stack:
+        yield lambda **options: Capture(stack, tmp_path, words, **options)
+
+
+def test_what_is_stored_is_what_was_sent(captures, words):
+    capture = captures(n=6, rate_hz=20.0)
+    capture.session.run(capture.journal)
+    with capture.recording() as recording:
+        assert len(recording) == 6
+        for number, measurement in enumerate(recording):
+            np.testing.assert_array_equal(measurement.words, words[number % 4])
+            assert (measurement.stamp.sequence, measurement.stamp.sync_count) == (number, number)
+        times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
+        assert np.all(np.abs(np.diff(times_ns) / 1e6 - 50) < 45)
+        assert all(0 < stamp.timestamp_uncertainty_ns < 1e8 for stamp in recording.stamps())
+        assert recording.settings.recording == SETTINGS.recording
+        assert not recording.gaps
+    assert capture.session.counts["one"].stored == len(capture.stored) == 6
+    assert capture.session.counts["one"].lost == 0
+
+
+def test_groups_of_a_sync_chain(captures, words):
+    """Sensors are armed while pulses come, so their own counters differ."""
+    names = ("a", "b", "c")
+    capture = captures(trigger="sync", names=names, n=8)
+    with SyncChain(capture.emulators, rate_hz=20.0):
+        capture.session.run(capture.journal)
+    assert (capture.session.complete, capture.session.incomplete) in {(8, 0), (7, 1)}  # the first pulse may be torn
+    rows = {}
+    for name in names:
+        with capture.recording(name) as recording:
+            for measurement in recording:
+                index = next(i for i in range(4) if np.array_equal(words[i], measurement.words))
+                rows.setdefault(measurement.stamp.sync_count, set()).add(index)
+    assert sorted(rows) == list(range(8))
+    assert all(len(indices) == 1 for indices in rows.values())
+
+
+@pytest.mark.parametrize("trigger", ["command", "sync"])
+def test_an_unplugged_sensor_comes_back(captures, words, trigger):
+    capture = captures(trigger=trigger, rate_hz=20.0)
+    runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
+    with ExitStack() as stack:
+        if trigger == "sync":
+            stack.enter_context(SyncChain(capture.emulators, rate_hz=20.0))
+        runner.start()
+        capture.wait_for(4)
+        capture.emulators[0].unplug()
+        assert not (capture.journal.path.parent / "one").exists()
+        before = len(capture.stored)
+        capture.emulators[0].replug()
+        capture.wait_for(before + 6)
+        capture.session.stop()
+        runner.join(10)
+    assert capture.session.counts["one"].unplugged == 1
+    (away_s,) = [what for _, what in capture.notes if isinstance(what, float)]
+    assert away_s < 3
+    with capture.recording() as recording:
+        sequences = [stamp.sequence for stamp in recording.stamps()]
+        assert sequences == sorted(set(sequences))
+        gaps = [number for gap in recording.gaps for number in range(gap.first, gap.last + 1)]
+        assert sorted([*sequences, *gaps]) == list(range(sequences[-1] + 1))
+        assert all(gap.reason == "the sensor was unplugged" for gap in recording.gaps)
+        sent = {zlib.crc32(each.tobytes()) for each in words}
+        assert all(zlib.crc32(measurement.words.tobytes()) in sent for measurement in recording)
+
+
+def test_a_sensor_that_stays_away_ends_the_capture(captures):
+    capture = captures(rate_hz=20.0, patience_s=0.5)
+    runner_error = []
+
+    def run():
+        try:
+            capture.session.run(capture.journal)
+        except SonarError as error:
+            runner_error.append(error)
+
+    runner = threading.Thread(target=run)
+    runner.start()
+    capture.wait_for(3)
+    capture.emulators[0].unplug()
+    runner.join(10)
+    assert str(runner_error[0]).startswith("one: ")
+    with capture.recording() as recording:
+        assert len(recording) >= 3  # what was stored stays
+
+
+def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
+    capture = captures(names=("one", "two"), n=12, rate_hz=20.0)
+    capture.emulators[1].unplug()
+    with pytest.raises(SonarError, match="two: "):
+        Session(capture.sonars, SETTINGS, trigger="command", rate_hz=20.0, n=12, patience_s=0.4).run(capture.journal)
+    with capture.recording("one") as recording:
+        assert len(recording) == 12
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trigger": "whistle"}, "trigger 'whistle' is unknown; known are command, sync"),
+        ({"rate_hz": 0.0}, "rate is 0; give a number from"),
+        ({"n": 0}, "n is 0; give a whole number"),
+        ({"duration_s": 0.0}, "duration is 0; give a number above 0"),
+        ({"patience_s": -1.0}, "patience is -1; give a number above 0"),
+    ],
+)
+def test_refused(captures, options, message):
+    capture = captures()
+    with pytest.raises(ArgumentError, match=message):
+        Session(capture.sonars, SETTINGS, **{"trigger": "command", **options})
+
+
+def test_without_a_sensor():
+    with pytest.raises(ArgumentError, match="no sensor is given to capture from; give at least one"):
+        Session({}, SETTINGS, trigger="command")
+
+
+# The command, as users run it.
+
+
+@pytest.fixture
+def sensor(tmp_path, words):
+    """The link to an emulated sensor."""
+    with Emulator(words, name="eRTIS-7", link=tmp_path / "eRTIS-7") as emulator:
+        yield emulator
+
+
+def settings_file(tmp_path):
+    path = tmp_path / "settings.toml"
+    path.write_text(SETTINGS.to_toml())
+    return path
+
+
+def start(tmp_path, *arguments):
+    command = [*ERTIS, "capture", "--settings", str(settings_file(tmp_path)), *arguments]
+    return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def run(tmp_path, *arguments):
+    process = start(tmp_path, *arguments)
+    out, err = process.communicate(timeout=60)
+    return process.returncode, [json.loads(line) for line in out.splitlines()], err
+
+
+def test_the_command(tmp_path, sensor, words):
+    code, lines, err = run(tmp_path, "--port", str(sensor.link), "-n", "3", "--rate", "20", "--json")
+    assert code == 0, err
+    *stored, final = lines
+    assert [line["crc32"] for line in stored] == [zlib.crc32(each.tobytes()) for each in words[:3]]
+    assert (final["event"], final["stored"], final["lost"]) == ("captured", 3, 0)
+    assert Path(final["output"]).name.startswith("eRTIS-7_")
+    with open_recording(tmp_path / final["output"]) as recording:
+        assert [measurement.stamp.sensor for measurement in recording] == ["eRTIS-7"] * 3
+    assert "3 measurements, 0 lost" in err
+    assert not list(tmp_path.glob("*.journal*"))
+
+
+@pytest.mark.parametrize(
+    ("number", "arguments", "code"),
+    [(signal.SIGINT, (), 0), (signal.SIGTERM, (), 0), (signal.SIGINT, ("-n", "1000"), 130)],
+)
+def test_a_signal_ends_it_with_a_complete_file(tmp_path, sensor, number, arguments, code):
+    process = start(
+        tmp_path, "--port", str(sensor.link), "--rate", "20", "--json", "-o", "rec.h5", "--quiet", *arguments
+    )
+    first = [process.stdout.readline() for _ in range(3)]
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == code, err
+    lines = [json.loads(line) for line in [*first, *out.splitlines()]]
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert len(recording) == lines[-1]["stored"] == len(lines) - 1 >= 3
+    assert err == ""
+
+
+def test_what_takes_measurements_in_never_loads_hdf5(tmp_path, sensor):
+    arguments = ["capture", "--port", str(sensor.link), "-n", "2", "-o", "rec.h5", "--quiet", "--settings"]
+    code = (
+        "import sys; from ertis_cli.main import cli\n"
+        "try: cli.main(sys.argv[1:])\n"
+        "except SystemExit as end: assert not end.code, end.code\n"
+        "print('h5py' in sys.modules, 'ertis_numba.journal' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, *arguments, str(settings_file(tmp_path))]
+    paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench"))
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "False True\n", done.stderr
+
+
+def test_commands_are_printed_and_nothing_is_opened(tmp_path):
+    done = subprocess.run(
+        [*ERTIS, "capture", "--port", "none", "--dry-run", "--trigger", "sync", "--pin", "2"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "!G,655360,0,0         measurement length: 655360 bytes\n" in done.stdout
+    assert "!C,0… to 1125         samples of the call, unless they are loaded already\n" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "code"),
+    [
+        (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one for each", 2),
+        (["--port", "nowhere"], "there is no serial port 'nowhere'", 1),
+        (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings both say how to record", 2),
+        (["--port", "{link}", "-o", "settings.toml"], "output settings.toml exists; give another name, or ask", 1),
+        (["--port", "{link}", "--port", "{link}"], "is given 2 times; give each sensor once", 2),
+        (["--port", "{link}", "--rate", "0"], "rate is 0; give a number from", 1),
+        (["--port", "{link}", "--temperature", "99"], "air.temperature_c is 99; give a number from -40 to 60", 1),
+        ([], "Missing option '--port'", 2),
+    ],
+)
+def test_errors_are_one_line(tmp_path, sensor, arguments, message, code):
+    found, lines, err = run(tmp_path, *(each.replace("{link}", str(sensor.link)) for each in arguments))
+    assert (found, lines) == (code, [])
+    assert message in err
+    assert len(err.splitlines()) == 1, err
+    assert not list(tmp_path.glob("*.h5*"))
+
+
+def test_a_journal_that_was_left_is_not_overwritten(tmp_path, sensor):
+    left = tmp_path / "rec.h5.journal"
+    left.write_bytes(b"anything")
+    code, _, err = run(tmp_path, "--port", str(sensor.link), "-n", "1", "-o", "rec.h5", "--force")
+    assert code == 1
+    assert "ertis recover" in err
+    assert left.read_bytes() == b"anything"
+
+
+def test_a_dead_sensor_is_told(tmp_path, sensor):
+    sensor.quirks = Quirks(silent=True)
+    code, _, err = run(tmp_path, "--port", str(sensor.link), "-n", "1")
+    assert code == 1
+    assert len(err.splitlines()) == 1

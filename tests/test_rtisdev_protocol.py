@@ -1,0 +1,172 @@
+"""The authors' own driver, rtisdev 2.16.0, drives an emulated device, by its code for Windows and by that for Linux.
+
+It is run in a process of its own, since importing it changes warning filters. For Linux it needs the closed module
+``rtisserial``, for which a small one on pyserial stands in here.
+
+What differs between its two ways:
+
+- ``A``: for Linux 1 is active; for Windows 0 is, so that an active measurement is asked for as a passive one. The
+  device believes the number, as its protocol says.
+- ``A`` has no end of the line for Windows. It does not wait for an answer either way.
+- ``J`` has four numbers for Linux, three for Windows.
+- For Windows the port is opened and closed for every command; for Linux it stays open.
+"""
+
+import json
+import subprocess
+import sys
+import zlib
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from ertis_numba.devices.commands import call_codes, call_hash
+from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.registers import Registers
+from ertis_numba.devices.sync_chain import SyncChain
+from ertis_numba.settings import Call
+
+N_SAMPLES = 65_536
+WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
+PASSIVE = [words[::-1].copy() for words in WORDS]
+PULSES_HZ = 2.0  # the first is half a second after the driver has begun to listen
+
+DRIVER = """
+import json, os, sys, types, zlib
+import serial
+
+way, port = sys.argv[1:]
+
+class RtisSerial(types.ModuleType):
+    def connect(self, port, baud):
+        self.port = serial.Serial(port, baud, timeout=10)
+    def flush(self):
+        self.port.reset_input_buffer()
+    def command(self, line, answered):
+        self.port.write(line.encode())
+        return int.from_bytes(self.port.read(4), "little") if answered else 0
+    def getdata(self, count):
+        return numpy.frombuffer(self.port.read(count), numpy.uint8)
+    def close(self):
+        self.port.close()
+
+class Windows:
+    name = "nt"
+    def __getattr__(self, name):
+        return getattr(os, name)
+
+if way == "linux":
+    sys.modules["rtisserial"] = RtisSerial("rtisserial")
+
+import numpy
+import rtisdev
+from rtisdev import RTISDev
+
+if way == "windows":
+    RTISDev.serial, RTISDev.os = serial, Windows()
+
+def told(measurement):
+    return int(measurement.index), zlib.crc32(measurement.rawData.tobytes())
+
+report = {"opened": rtisdev.open_connection(port), "firmware": rtisdev.get_firmware_version()}
+config = rtisdev.set_recording_settings(
+    microphoneSamples=65536, callSampleFrequency=480000, callDuration=1.25, callMinimumFrequency=20000,
+    callMaximumFrequency=80000, callEmissions=3, configName="test",
+)
+signal = rtisdev.get_current_settings(config).dacSignal
+report["hash"] = RTISDev.__dict__["__get_this_pulse_hash"](signal)
+report["active"] = told(rtisdev.get_raw_measurement(True))
+report["passive"] = told(rtisdev.get_raw_measurement(False))
+rtisdev.set_counter(77)
+rtisdev.set_behaviour(True)
+rtisdev.toggle_external_triggers(1, 2)
+report["triggered"] = []
+
+def came(measurement):
+    report["triggered"].append(told(measurement))
+    if len(report["triggered"]) == 2:
+        listener.stop_thread()
+
+listener = rtisdev.create_measure_external_trigger_callback(came, config)
+print("listening", flush=True)
+listener.run()
+rtisdev.toggle_amplifier(0)
+rtisdev.close_connection()
+report = {key: int(value) if key == "hash" else value for key, value in report.items()}
+print(json.dumps(report), flush=True)
+"""
+
+
+@dataclass
+class Driven:
+    report: dict
+    registers: Registers
+    refused: int
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """What each way reported, and what the device had been told."""
+    with ExitStack() as stack:
+        devices = {way: stack.enter_context(Emulator(WORDS, passive=PASSIVE)) for way in ("windows", "linux")}
+        drivers = {
+            way: stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", DRIVER, way, device.port],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            )
+            for way, device in devices.items()
+        }
+        results = {}
+        for way, driver in drivers.items():
+            assert driver.stdout.readline() == "listening\n", driver.communicate(timeout=10)
+            with SyncChain([devices[way]], PULSES_HZ):
+                out, errors = driver.communicate(timeout=30)
+            assert driver.returncode == 0, errors
+            results[way] = Driven(json.loads(out), devices[way].registers, devices[way].refused)
+        return results
+
+
+def crc(words):
+    return zlib.crc32(words.tobytes())
+
+
+@pytest.mark.parametrize("way", ["windows", "linux"])
+class TestBothWays:
+    def test_it_finds_the_device(self, driven, way):
+        assert driven[way].report["opened"] is True
+        assert driven[way].report["firmware"] == "v1.0.0"
+
+    def test_what_it_configures_arrives(self, driven, way):
+        told = driven[way].registers
+        assert (told.n_bytes, told.clock, told.emissions) == (4 * N_SAMPLES, 0, 3)
+        assert (told.dac_rate_hz, told.n_codes) == (480_000, 601)
+        assert (told.armed, told.pin, told.active, told.amplifier) == (1, 2, 1, 0)
+        assert driven[way].refused == 0
+
+    def test_its_call_is_the_one_that_settings_describe(self, driven, way):
+        told = driven[way].registers
+        call = Call(start_frequency_hz=80e3, stop_frequency_hz=20e3, duration_s=1.25e-3, sample_rate_hz=480e3)
+        assert told.hash == driven[way].report["hash"] == call_hash(told.codes[:601])
+        error = np.abs(told.codes[:601].astype(int) - call_codes(call))
+        assert error[62:-62].max() <= 1
+        assert error.max() <= 0.02 * 2047  # its ramps are those of a Hann window of another length
+
+    def test_triggered_measurements_are_those_of_the_pulses(self, driven, way):
+        # 77 is the counter that was set; the chain numbers its pulses from 0.
+        assert driven[way].report["triggered"] == [[77, crc(WORDS[0])], [78, crc(WORDS[1])]]
+
+
+def test_measurements_have_the_words_of_the_device(driven):
+    assert driven["linux"].report["active"] == [0, crc(WORDS[0])]
+    assert driven["linux"].report["passive"] == [1, crc(PASSIVE[1])]
+
+
+def test_for_windows_active_and_passive_are_swapped(driven):
+    assert driven["windows"].report["active"] == [0, crc(PASSIVE[0])]
+    assert driven["windows"].report["passive"] == [1, crc(WORDS[1])]
