@@ -6,11 +6,16 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ertis_numba.devices.bits import BitCheck
+
 from ertis_bench import captures, kills, machine, wire_faults
+from ertis_numba.constants import ERTIS_PDM_RATE_HZ
+from ertis_numba.devices.commands import LENGTH_STEP
+from ertis_numba.storage import open_recording
 
 __all__ = ["LONG", "SHORT", "Extent", "run"]
 
@@ -63,7 +68,7 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
         say(f"{extent.n_groups} pulses to four sensors")
         report["chain"] = captures.chain(platform, _new(folder, "chain"), n_groups=extent.n_groups, rate_hz=10.0)
         say(f"{extent.n_blocks} faulty blocks")
-        report["wire"] = wire_faults.run(n_blocks=extent.n_blocks, seed=seed)
+        report["wire"] = _wire(extent.n_blocks, seed)
         say(f"{extent.n_unplugs} times without its plug")
         report["unplugs"] = captures.unplugs(_ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
         say(f"{extent.n_kills} captures killed")
@@ -74,6 +79,14 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
         with small_disk(_new(folder, "disk")) as disk:
             report["disk_full"] = None if disk is None else captures.disk_full(_ONE_SENSOR, folder, disk)
     return report
+
+
+def _wire(n_blocks: int, seed: int) -> dict[str, Any]:
+    """Send blocks of the least length, with the words of a sensor, over a line with faults."""
+    with open_recording(_ONE_SENSOR) as recording:
+        words = recording[0].words
+    check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ)
+    return asdict(wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check))
 
 
 @contextmanager

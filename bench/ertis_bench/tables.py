@@ -12,6 +12,7 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.ptx_tables import ptx
+from ertis_bench.reliability_tables import reliability
 from ertis_numba.errors import ArgumentError
 from ertis_numba.verification import PEAKS
 
@@ -26,6 +27,7 @@ __all__ = [
     "paper",
     "place",
     "ptx",
+    "reliability",
     "scaling",
     "simulation",
     "update",
@@ -314,6 +316,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "simulation": {"simulation": simulation},
     "factorisation": {"factorisation": factorisation},
     "ptx": {"ptx": ptx},
+    "reliability": {"reliability": reliability},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }

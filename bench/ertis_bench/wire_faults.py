@@ -54,8 +54,9 @@ class Report:
         Accepted under a number that is not theirs.
     twice : int
         Accepted again.
-    altered, altered_accepted : int
-        Blocks of which some of the words were replaced by others in place, and how many of them were accepted.
+    altered : int
+        Accepted under their number with words of their own, but not all as they were sent: flipped in place, or as
+        many bytes lost as were added. Nothing in the frame tells; the check of the bits may.
     lost, pending : int
         As the receiver counts them; ``pending`` with the bytes of what it holds.
     fed : int
@@ -73,7 +74,6 @@ class Report:
     wrong_counter: int = 0
     twice: int = 0
     altered: int = 0
-    altered_accepted: int = 0
     lost: int = 0
     fed: int = 0
     pending: int = 0
@@ -165,8 +165,6 @@ class Line:
         report.sent += 1
         report.spoilt += bool(spoilt.faults)
         report.untouched += data == block
-        whole = len(data) == len(block) and data[:8] == block[:8] and data[-4:] == block[-4:]
-        report.altered += whole and data != block
         if len(self._sent) > _KEPT:
             self._forget(next(iter(self._sent)))
 
@@ -186,8 +184,8 @@ class Line:
                 report.twice += sent.delivered
                 sent.delivered = True
             elif sent is not None and words in sent.data:
-                report.altered_accepted += 1
-            elif any(crc32 == other.crc32 or words in other.data for other in self._sent.values()):
+                report.altered += 1
+            elif any(crc32 == other.crc32 or words == other.data[8:-4] for other in self._sent.values()):
                 report.wrong_counter += 1
             else:
                 report.mixed += 1

@@ -125,6 +125,19 @@ def ptx(**given: Any) -> None:
 
 
 @bench.command()
+@click.option("--long", is_flag=True, help="An hour rather than a minute.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")
+@_update
+@options.quiet
+@options.as_json
+def reliability(**given: Any) -> None:
+    """Try what goes wrong: faults on the wire, pulled plugs, kill -9, full disks; nothing is timed."""
+    from ertis_bench import reliability as benchmark
+
+    _run("reliability", benchmark, **given)
+
+
+@bench.command()
 @click.option(
     "--results",
     type=click.Path(path_type=Path, file_okay=False),

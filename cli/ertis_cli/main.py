@@ -15,10 +15,10 @@ COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
     "capture": ("ertis_cli.capture:capture", "Take measurements of sensors into a recording."),
     "compare": ("ertis_cli.compare:compare", "Say how far an energyscape file is from the truth."),
-    "devices": ("ertis_cli.devices:devices", "List the sensors that are plugged in."),
+    "devices": ("ertis_cli.devices:devices", "List the eRTIS devices that are plugged in or emulated."),
     "emulate": (
         "ertis_cli.emulate:emulate",
-        "Be a sensor: on a port, with the measurements of a scene or a recording.",
+        "Be the sensors of a scene or of a recording, until interrupted.",
     ),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),

@@ -1,7 +1,9 @@
 """``ertis recover``: recordings from what an interrupted capture left."""
 
+import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 

@@ -25,8 +25,9 @@ _FAILED, _INCOMPLETE = 1, 3
 def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
     """Check every measurement of a file, and what is missing.
 
-    In recordings and in journals, each measurement is read and compared with its checksum. The exit code is 0 if all is there and as it
-    was written; 3 if measurements are missing, damaged or out of order; 1 if a file cannot be read at all.
+    In recordings and in journals, each measurement is read and compared with its checksum. The exit code is 0 if all is
+    there and as it was written; 3 if measurements are missing, damaged or out of order; 1 if a file cannot be read
+    at all.
     """
     from ertis_numba.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified

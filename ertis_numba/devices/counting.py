@@ -14,6 +14,7 @@ _NUMBERS: Final = 2**32
 _MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
 _BURST = 0.75  # of the shortest interval: what comes later than this after a block's first byte is of another trigger
 _AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
+_UNHEARD = 2  # triggers in a row of which nothing may have come, where no later block tells
 _INTERVALS = 8  # remembered; of these …
 _ALIKE = 6  # … so many …
 _REGULAR = 0.03  # … are so near their median, as a share of it, where triggers are regular
@@ -40,8 +41,9 @@ class CounterCheck:
     2. So is a number that is ahead by as many as there were triggers since. Where these are regular they are counted by
        the clock, else by the bursts in which bytes came, damaged ones included: a sensor that is triggered
        sends at once and then is silent.
-    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2 are right,
-       whatever was taken before them; so the count is found again after any loss, and after a sensor began anew.
+    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2, or of which one
+       is the next of the other, are right whatever was taken before them; so the count is found again after
+       any loss, and after a sensor began anew.
     4. A number between the last right one and a later one is right if the time between them has room for it.
 
     A block is held for three others at most, and a number that is the last one's again is a copy.
@@ -110,8 +112,14 @@ class CounterCheck:
         return self._results()
 
     def finish(self) -> list[tuple[Block, bool]]:
-        """Decide what is held: what fits the time is right."""
-        self._accept_fitting(self._held)
+        """Decide what is held, now that no other block will: what is ahead by few more than the triggers is right."""
+        for entry in self._held:
+            last = self._last
+            if last is None or _ahead(last, entry) == 1 or (self._fits(last, entry) and self._is_near(last, entry)):
+                self._accept(entry)
+            else:
+                self._reject(entry)
+        self._held.clear()
         return self._results()
 
     def _results(self) -> list[tuple[Block, bool]]:
@@ -123,25 +131,29 @@ class CounterCheck:
         if before is not last and _directly(before, entry):
             self._agree(before, entry)
         elif (before is last and _directly(last, entry)) or self._as_triggered(last, entry):
-            self._reject_held()
+            self._accept_fitting(self._held, entry)
             self._accept(entry)
         elif agreeing := [held for held in self._held if self._as_triggered(held, entry)]:
             self._agree(agreeing[-1], entry)
         elif any(self._fits(last, held) and self._fits(held, entry) for held in self._held):
             self._accept_fitting(self._held, entry)
             self._held.append(entry)
+        elif before is not last and _ahead(before, entry) == 1:
+            self._agree(before, entry)
         else:
             if len(self._held) == _MOST_HELD:
-                self._reject(self._held.pop(0))
+                unlikely = [held for held in self._held if not self._fits(last, held)]
+                self._held.remove(worst := [*unlikely, *self._held][0])
+                self._reject(worst)
             self._held.append(entry)
 
     def _agree(self, held: _Entry, entry: _Entry) -> None:
-        """Take two that agree, and what fits in before them."""
+        """Take two that agree, and what fits in before and between them."""
         place = self._held.index(held)
         earlier, self._held = self._held[:place], self._held[place + 1 :]
         self._accept_fitting(earlier, held)
         self._accept(held)
-        self._reject_held()
+        self._accept_fitting(self._held, entry)
         self._accept(entry)
 
     def _accept_fitting(self, entries: list[_Entry], end: _Entry | None = None) -> None:
@@ -162,7 +174,7 @@ class CounterCheck:
             return
         ahead = _ahead(last, entry)
         if last.block is None:  # whether a sensor that is set to n counts from n or n + 1 is its own affair
-            self.lost += ahead - 1 - (ahead != entry.burst - last.burst)
+            self.lost += max(0, ahead - 1 - (ahead != entry.burst - last.burst))
         else:
             self.lost += ahead - 1
             self._intervals_ns.append(_elapsed_ns(last, entry) / ahead)
@@ -180,7 +192,7 @@ class CounterCheck:
         """Whether numbers went on by as many as there were triggers."""
         ahead = _ahead(first, second)
         if first.block is None:
-            return 0 <= ahead - max(1, second.burst - first.burst) <= 1
+            return 1 <= ahead <= 2 or 0 <= ahead - (second.burst - first.burst) <= 1
         return ahead == self._n_triggers(first, second)
 
     def _n_triggers(self, first: _Entry, second: _Entry) -> int:
@@ -202,10 +214,17 @@ class CounterCheck:
         """Whether nothing speaks against two numbers both being right."""
         return self._has_room(first, second) and self._by_clock(first, second) in {None, _ahead(first, second)}
 
+    def _is_near(self, first: _Entry, second: _Entry) -> bool:
+        """Whether few triggers have to have left no trace."""
+        traces = max(self._n_triggers(first, second), second.rejected - first.rejected)
+        return _ahead(first, second) - traces <= _UNHEARD
+
     def _has_room(self, first: _Entry, second: _Entry) -> bool:
         """Whether so many triggers may have come between two blocks, of which all that sent anything were heard."""
         bursts = max(1, second.burst - first.burst)
-        time = bursts if first.block is None else _elapsed_ns(first, second) / self._shortest_ns
+        if first.block is None:
+            return 1 <= _ahead(first, second) <= _AHEAD + bursts
+        time = _elapsed_ns(first, second) / self._shortest_ns
         return bursts <= _ahead(first, second) <= _AHEAD + max(time, second.rejected - first.rejected)
 
 

@@ -63,7 +63,7 @@ class Emulator:
     quirks : Quirks
         May be replaced at any time.
     on_port : callable, optional
-        Is called with the port when the device is there again, by another thread.
+        Is called with the port when the device is there again, by the device's thread, for which it must not wait.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class Emulator:
 
     def _forget(self) -> None:
         self._board = Mainboard(self._measurements)
-        self._sent = Output(deque())  # the latest
+        self._sent = Output(deque())  # the latest measurement
         self._pause_ns = 0  # nothing is sent before
 
     def _plug_in(self) -> None:
@@ -208,8 +208,9 @@ class Emulator:
             self._live()
         except Exception as error:  # noqa: BLE001  it is for those who look after the device
             self.error = error
-            self._forget()  # to log what is lost may be what has failed
         with self._changed:
+            if self.error is not None:
+                self._forget()  # to log what is lost may be what has failed
             self._pull_out()
             self._ended = True
             os.close(self._woken)
@@ -264,7 +265,8 @@ class Emulator:
         while outputs and now_ns >= self._pause_ns:
             pieces = outputs[0].pieces
             if not pieces:
-                self._sent = outputs.popleft()
+                sent = outputs.popleft()
+                self._sent = sent if sent.entry else self._sent
                 continue
             piece = pieces.popleft()
             if isinstance(piece, Unplug):

@@ -75,7 +75,7 @@ def resolve(port: str) -> Port:
         return named[0]
     path = os.path.realpath(port)
     if Path(path).exists() and _is_alive(Path(port)):
-        link = port if Path(port).is_symlink() else ""
+        link = os.path.abspath(port) if Path(port).is_symlink() else ""  # noqa: PTH100  which follows no link
         same = [item for item in found if item.path == path]
         return replace(same[0], link=link or same[0].link) if same else Port(path=path, link=link)
     if any(info.device == port for info in list_ports.comports()):  # not of USB, and no file: as Windows has it

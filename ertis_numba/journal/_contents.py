@@ -66,7 +66,7 @@ class Contents:
         made = (checked(self.path, "a gap", row) for row in rows)
         return tuple(Gap(names[number], *values) for number, *values in made)
 
-    def keys(self, sensor: str | None = None) -> list[Key]:
+    def index(self, sensor: str | None = None) -> list[Key]:
         """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
         number = None if sensor is None else self._ids[self._sensor(sensor).name]
         with self._turn:
@@ -100,9 +100,9 @@ class Contents:
         Raises
         ------
         DataError
-            A measurement is damaged; `keys` and `entry` get at the others.
+            A measurement is damaged; `index` and `entry` get at the others.
         """
-        return (self.entry(key) for key in self.keys(sensor))
+        return (self.entry(key) for key in self.index(sensor))
 
     def _sensor(self, name: str) -> Sensor:
         if name not in self._sensors:

@@ -175,7 +175,8 @@ class Journal(Contents):
             last = dict(self._last)
             rows = [self._row(entry, last) for entry in entries]
             sizes_bytes = [row[-1].nbytes for row in rows]
-            _room.require(self.path, self.target, held_bytes=self._held_bytes, sizes_bytes=sizes_bytes)
+            seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
+            _room.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
             with self._database.transaction():
                 for row in rows:
                     self._database.execute(_INSERTION, row)
@@ -225,7 +226,14 @@ class Journal(Contents):
         DataError
             The folder of the recording is not there.
         """
-        return _room.left(self.path, self.target, held_bytes=self._held_bytes)
+        with self._turn:
+            return _room.left(self.path, self.target, seals_bytes=self._seals_bytes())
+
+    def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
+        """Return about how long the recording will be, with some measurements more."""
+        return _room.recording_bytes(
+            self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
+        )
 
     def remove(self) -> None:
         """Close the journal and remove it: what is in it is in a recording, or is nothing."""

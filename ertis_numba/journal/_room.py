@@ -1,60 +1,69 @@
 """How much a journal may take of a disk, so that it can be sealed there."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import DataError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
-__all__ = ["left", "require"]
+__all__ = ["left", "recording_bytes", "require"]
 
-# What sealing wants to keep free while it writes, its tables, and what others write meanwhile.
-_SPARE_BYTES: Final = 12_000_000
+_SPARE_BYTES: Final = 9_000_000  # what sealing wants to keep free while it writes, and a little more
+_SENSOR_BYTES: Final = 150_000  # a recording's tables: 90 kB were measured, and the settings may be longer
+_ROW_BYTES: Final = 150  # in these tables
 
 
-def require(path: Path, target: Path, *, held_bytes: int, sizes_bytes: list[int]) -> None:
+def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
+    """Return about how long a recording will be."""
+    return words_bytes + n_rows * _ROW_BYTES + n_sensors * _SENSOR_BYTES
+
+
+def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
     """Refuse measurements after which a journal could no longer be sealed.
 
-    A recording needs as much as the words in the journal. So the disk of ``target`` has to have room for all
-    words, and a fixed amount to spare; that of the journal for the new ones, first in the log and then in the
-    main file, and for what the log may still hold.
+    The disk of ``target`` has to have room for the recording of all that is in the journal, and some to spare;
+    that of the journal for what is in the log now, which moves to the main file, and for the new measurements,
+    first in the log and then in the main file.
 
     Parameters
     ----------
     path, target : Path
         The journal and the recording to be made of it.
-    held_bytes : int
-        Words in the journal.
-    sizes_bytes : list of int
-        Words that are to be added, of each measurement.
+    sizes_bytes : sequence of int
+        Words of each measurement that is to be added.
+    seals_bytes : int
+        Length of the recording with them.
 
     Raises
     ------
     DataError
         There is too little room.
     """
+    log = path.with_name(f"{path.name}-wal")
+    log_bytes = log.stat().st_size if log.exists() else 0
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)
-    seals_bytes = held_bytes + sum(sizes_bytes) + _SPARE_BYTES
-    for folder, wanted_bytes in _wanted(path, target, 2 * grows_bytes + LOG_BYTES, seals_bytes).items():
-        free_bytes = _free(folder)
+    for folder, wanted_bytes in _wanted(path, target, log_bytes + 2 * grows_bytes, seals_bytes).items():
+        free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
             raise DataError(
-                f"{folder} has {free_bytes / 1e6:.1f} MB free, wanted {wanted_bytes / 1e6:.1f} MB so that {path.name}, "
-                f"which holds {held_bytes / 1e6:.1f} MB, can be sealed; free some space or capture elsewhere"
+                f"{folder} has {free_bytes / 1e6:.1f} MB free, wanted {wanted_bytes / 1e6:.1f} MB so that {path.name} "
+                "can be sealed with more in it; what it holds is safe: end the capture, or free some space"
             )
 
 
-def left(path: Path, target: Path, *, held_bytes: int) -> int:
-    """Return how many more bytes of words a journal can take, in pieces that are small beside it."""
-    wanted = _wanted(path, target, LOG_BYTES, held_bytes + _SPARE_BYTES)
-    rooms = [_free(folder) - wanted_bytes for folder, wanted_bytes in wanted.items()]
-    return max(0, min(rooms) // (3 - len(rooms)))
+def left(path: Path, target: Path, *, seals_bytes: int) -> int:
+    """Return how many more bytes of words a journal can take, whose recording would be ``seals_bytes`` long by now."""
+    wanted = _wanted(path, target, LOG_BYTES, seals_bytes)
+    rooms = [shutil.disk_usage(folder).free - wanted_bytes for folder, wanted_bytes in wanted.items()]
+    return max(0, min(rooms) // (3 - len(rooms)))  # on one disk, each byte needs room twice
 
 
-def _wanted(path: Path, target: Path, journal_bytes: int, target_bytes: int) -> dict[Path, int]:
+def _wanted(path: Path, target: Path, journal_bytes: int, seals_bytes: int) -> dict[Path, int]:
     """Return what is wanted in each folder, or in one of them for both if they are on the same disk."""
     folders = path.absolute().parent, target.absolute().parent
+    target_bytes = seals_bytes + _SPARE_BYTES
     try:
         same = folders[0].stat().st_dev == folders[1].stat().st_dev
     except OSError as error:
@@ -62,7 +71,3 @@ def _wanted(path: Path, target: Path, journal_bytes: int, target_bytes: int) -> 
     if same:
         return {folders[0]: journal_bytes + target_bytes}
     return dict(zip(folders, (journal_bytes, target_bytes), strict=True))
-
-
-def _free(folder: Path) -> int:
-    return shutil.disk_usage(folder).free

@@ -34,7 +34,7 @@ class JournalRows:
 
     def __init__(self, journal: Journal, sensor: str) -> None:
         self._journal = journal
-        self.keys = journal.keys(sensor)
+        self.keys = journal.index(sensor)
         self._noted = [(gap.first, gap.last, gap.reason) for gap in journal.gaps if gap.sensor == sensor]
         self._numbers = Numbers()
         self.damaged: list[Damage] = []

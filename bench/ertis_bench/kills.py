@@ -1,0 +1,321 @@
+"""Processes that are killed while they write a journal, and while they seal one: nothing that was told may be lost.
+
+A nursery, ``python -m ertis_bench.kills``, loads all that is needed once, and makes each process to be killed as a
+copy of itself. That takes milliseconds, so that hundreds can be killed. Half of them are killed after a random time,
+the others before a random line of this package's own code, as most time goes by inside of few calls.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import IO, Any, NoReturn, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ertis_numba
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.journal import Entry, Journal
+from ertis_numba.settings import Recording, Settings
+
+__all__ = ["appending", "sealing"]
+
+_SETTINGS = Settings(recording=Recording(n_samples=32_768))
+_SENSORS = ("left", "right")
+_EPOCH = 7
+_LATE = 3  # measurements of the first sensor after which the second one comes
+_MOST_TOLD = 12  # commits until a process is killed
+_LINES_OF_A_COMMIT = 170  # about
+_JITTER_S = 0.004
+_SAME_JOURNAL = 3  # processes that are killed one after the other over the same journal
+_LIFE_S = 60  # of a process that nobody kills
+_PACKAGE = Path(ertis_numba.__file__).parent
+_OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "atomic.py"))
+
+
+def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
+    """Kill ``count`` processes that append to journals, and say what was lost of that which they told to be stored.
+
+    Returns
+    -------
+    dict of str to int
+        ``kills``, measurements ``told``; of them ``lost`` and ``wrong``; ``untold``, which are there although nobody
+        told of them any more; and ``unexpected``, which are no such measurements.
+    """
+    rng = random.Random(seed)  # noqa: S311  nothing is secret
+    found = dict.fromkeys(("kills", "told", "lost", "wrong", "untold", "unexpected"), 0)
+    path = folder / "rec.h5.journal"
+    with _Nursery() as nursery:
+        while found["kills"] < count:
+            told: set[tuple[str, int]] = set()
+            for _ in range(min(_SAME_JOURNAL, count - found["kills"])):
+                told |= _killed_appending(nursery, path, rng, seed)
+                found["kills"] += 1
+            _look_into(path, told, seed, found)
+    return found
+
+
+def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed: int) -> set[tuple[str, int]]:
+    """Kill a process while it appends, and return the keys that it told."""
+    lines = rng.randrange(_MOST_TOLD * _LINES_OF_A_COMMIT) if rng.random() < 0.5 else None
+    nursery.begin("append", path=str(path), seed=seed, dies_after_lines=lines)
+    told: list[str] = []
+    if lines is None:
+        wanted = rng.randrange(_MOST_TOLD)
+        while len(told) < wanted:
+            told.append(nursery.line())
+        time.sleep(rng.uniform(0.0, _JITTER_S))
+        nursery.kill()
+    told += nursery.end()
+    return {(sensor, int(sequence)) for sensor, sequence in map(str.split, told)}
+
+
+def _look_into(path: Path, told: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
+    """Count what is in a journal, and remove it."""
+    found["told"] += len(told)
+    if not path.exists():  # killed before it was made
+        found["lost"] += len(told)
+        return
+    with Journal.open(path) as journal:
+        keys = {(key.sensor, key.sequence): key for key in journal.index()}
+        found["lost"] += len(told - keys.keys())
+        found["untold"] += len(keys.keys() - told)
+        for (sensor, sequence), key in keys.items():
+            entry = journal.entry(key)
+            same = np.array_equal(entry.measurement.words, _words(seed, sensor, sequence))
+            found["wrong"] += not (same and entry.monotonic_ns == sequence and key.epoch == _EPOCH)
+        for sensor in journal.sensors:
+            numbers = [key.sequence for key in journal.index(sensor)]
+            found["unexpected"] += numbers != list(range(len(numbers)))
+        journal.remove()
+    found["unexpected"] += len(list(path.parent.iterdir()))
+
+
+def _append(*, path: str, seed: int) -> None:
+    """Append to a journal for ever, and tell the keys that are durable."""
+    place = Path(path)
+    journal = Journal.open(place) if place.exists() else Journal.create(place, target="rec.h5", source="kills")
+    rng = random.Random(f"{seed} {len(journal)}")  # noqa: S311  nothing is secret
+    counts = {sensor: len(journal.index(sensor)) if sensor in journal.sensors else 0 for sensor in _SENSORS}
+    while True:
+        entries = []
+        for _ in range(rng.randint(1, 3)):
+            sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _LATE)])
+            if sensor not in journal.sensors:
+                journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
+            stamp = Stamp(sensor=sensor, sequence=counts[sensor])
+            measurement = Measurement(_words(seed, sensor, counts[sensor]), _SETTINGS, stamp)
+            entries.append(Entry(measurement, epoch=_EPOCH, monotonic_ns=counts[sensor]))
+            counts[sensor] += 1
+        journal.append(entries)
+        for entry in entries:
+            _tell(f"{entry.measurement.stamp.sensor} {entry.measurement.stamp.sequence}")
+
+
+def _words(seed: int, sensor: str, sequence: int) -> NDArray[np.uint32]:
+    """Return the words of a measurement, which nobody has to remember."""
+    rng = np.random.default_rng([seed, _SENSORS.index(sensor), sequence])
+    return rng.integers(0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32)
+
+
+def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
+    """Kill ``count`` processes that seal a journal, and say what came of it when it was sealed again at last.
+
+    Returns
+    -------
+    dict of str to int
+        ``kills``; of them ``late``, where it had ended already. Recordings under their final name that were ``broken``
+        at any time; ``different`` from the one that is made when nobody is killed; and files ``left_over``.
+    """
+    rng = random.Random(seed)  # noqa: S311  nothing is secret
+    found = dict.fromkeys(("kills", "late", "broken", "different", "left_over"), 0)
+    crashed, work = folder / "crashed", folder / "work"
+    _crash(crashed, seed)
+    with _Nursery() as nursery:
+        n_lines, lasts_s, wanted = _undisturbed(nursery, crashed, work)
+        while found["kills"] < count:
+            path = shutil.copytree(crashed, work) / "rec.h5.journal"
+            for _ in range(min(rng.randint(1, _SAME_JOURNAL), count - found["kills"])):
+                found["late"] += not _killed_sealing(nursery, path, rng, n_lines, lasts_s)
+                found["kills"] += 1
+                found["broken"] += (work / "rec.h5").exists() and (work / "rec.h5").read_bytes() != wanted
+            nursery.begin("seal", path=str(path))
+            nursery.end()
+            found["different"] += (work / "rec.h5").read_bytes() != wanted
+            found["left_over"] += len(list(work.iterdir())) - 1
+            shutil.rmtree(work)
+    return found
+
+
+def _crash(folder: Path, seed: int) -> None:
+    """Make the journal of a process that was killed: with a log, gaps and a sensor that nothing came of."""
+    made = folder.with_name("making")
+    made.mkdir()
+    with Journal.create(made / "rec.h5.journal", target="rec.h5", source="kills") as journal:
+        for sensor in (*_SENSORS, "absent"):
+            journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3", translation_m=(1.0, 2.0, 3.0))
+        for sequence in (1, 2, 3, 5, 6):
+            for sensor in _SENSORS:
+                stamp = Stamp(sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence)
+                words = _words(seed, sensor, sequence)
+                journal.append([Entry(Measurement(words, _SETTINGS, stamp), epoch=_EPOCH, monotonic_ns=sequence)])
+        journal.note_gap("left", 4, 4, "footer")
+        journal.note_gap("absent", 0, 6, "it was silent")
+        shutil.copytree(made, folder)  # nothing is written now: to the files, it is as if this process was killed
+    shutil.rmtree(made)
+
+
+def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
+    """Seal without a kill, and return how many lines and how long that took, and what it made."""
+    n_lines, lasts_s, made = 0, 0.0, b""
+    for counts in (True, False):
+        path = shutil.copytree(crashed, work) / "rec.h5.journal"
+        nursery.begin("seal", path=str(path), counts_lines=counts)
+        begin_s = time.monotonic()
+        told = nursery.end()
+        lasts_s = time.monotonic() - begin_s
+        n_lines = int(told[-1]) if counts else n_lines
+        made = (work / "rec.h5").read_bytes()
+        shutil.rmtree(work)
+    return n_lines, lasts_s, made
+
+
+def _killed_sealing(nursery: "_Nursery", path: Path, rng: random.Random, n_lines: int, lasts_s: float) -> bool:
+    """Kill a process while it seals, and return whether it came in time."""
+    if rng.random() < 0.5:
+        nursery.begin("seal", path=str(path), dies_after_lines=rng.randrange(n_lines))
+    else:
+        nursery.begin("seal", path=str(path))
+        time.sleep(rng.uniform(0.0, lasts_s))
+        nursery.kill()
+    return "sealed" not in nursery.end()
+
+
+def _seal(*, path: str) -> None:
+    from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes that only append do without HDF5
+
+    seal(path)
+    _tell("sealed")
+
+
+class _Nursery:
+    """Makes processes that have loaded everything already."""
+
+    def __enter__(self) -> Self:
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+            "SOURCE_DATE_EPOCH": "1700000000",  # files are compared byte by byte
+        }
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "ertis_bench.kills"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        if self._process.stdin is None or self._process.stdout is None:
+            raise RuntimeError("the nursery has no pipes")
+        self._input: IO[str] = self._process.stdin
+        self._output: IO[str] = self._process.stdout
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate()
+
+    def begin(
+        self, job: str, *, dies_after_lines: int | None = None, counts_lines: bool = False, **arguments: Any
+    ) -> None:
+        """Begin a process, which may kill itself before a line of code, or tell at its end how many it ran."""
+        self._ask({"job": job, "lines": dies_after_lines, "counts": counts_lines, "arguments": arguments})
+        self._pid = int(self.line())
+
+    def kill(self) -> None:
+        """Kill the process; it is not forgotten before `end`, so nobody else can have its number."""
+        os.kill(self._pid, signal.SIGKILL)
+
+    def end(self) -> list[str]:
+        """Wait until the process has ended, and return what else it told."""
+        self._ask({"job": None})
+        return list(iter(self.line, "ended"))
+
+    def line(self) -> str:
+        """Return what the process tells next."""
+        line = self._output.readline().rstrip("\n")
+        if not line or line.startswith("failed"):
+            raise RuntimeError(f"a process to be killed {line or 'was lost'}")
+        return line
+
+    def _ask(self, request: dict[str, Any]) -> None:
+        self._input.write(json.dumps(request) + "\n")
+        self._input.flush()
+
+
+def _nurse() -> None:
+    """Begin and end processes, as asked on stdin."""
+    pid = 0
+    for line in sys.stdin:
+        request = json.loads(line)
+        if request["job"] is None:
+            os.waitpid(pid, 0)
+            _tell("ended")
+            continue
+        if request["job"] == "seal":
+            import ertis_numba.storage.sealing  # noqa: F401, PLC0415  so that the copies need not
+        pid = os.fork()
+        if not pid:
+            _live(request)
+
+
+def _live(request: dict[str, Any]) -> NoReturn:
+    """Do a job, unless something ends this process before."""
+    signal.alarm(_LIFE_S)
+    _tell(str(os.getpid()))
+    try:
+        counter = _LineCounter(request["lines"])
+        if request["lines"] is not None or request["counts"]:
+            sys.settrace(counter)
+        jobs: dict[str, Callable[..., None]] = {"append": _append, "seal": _seal}
+        jobs[request["job"]](**request["arguments"])
+        sys.settrace(None)
+        if request["counts"]:
+            _tell(str(counter.count))
+    except BaseException as error:  # noqa: BLE001  whatever it is, the one who asked has to hear of it
+        traceback.print_exc()
+        _tell(f"failed: {' '.join(str(error).split())}")
+    finally:
+        os._exit(0)
+
+
+class _LineCounter:
+    """Counts the lines of this package's code that run, and kills the process before one."""
+
+    def __init__(self, most: int | None) -> None:
+        self.count = 0
+        self._most = most
+
+    def __call__(self, frame: FrameType, _event: str, _argument: object) -> Callable[..., Any] | None:
+        """Look into a function that is called, if it is one of ours."""
+        return self._line if frame.f_code.co_filename.startswith(_OURS) else None
+
+    def _line(self, _frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
+        self.count += event == "line"
+        if self._most is not None and self.count > self._most:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self._line
+
+
+def _tell(line: str) -> None:
+    os.write(1, f"{line}\n".encode())  # at once, and in one piece
+
+
+if __name__ == "__main__":
+    _nurse()

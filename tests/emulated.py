@@ -1,0 +1,55 @@
+"""What tests say to emulated devices, and what they take from them."""
+
+import json
+import queue
+
+import numpy as np
+import serial
+
+from ertis_numba.devices.commands import FOOTER, HEADER
+
+N_SAMPLES = 32_768
+WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
+TIMEOUT_S = 20.0
+
+
+class Log(queue.Queue):
+    """A log whose lines can be waited for."""
+
+    def write(self, text):
+        self.put(json.loads(text))
+
+    def flush(self):
+        pass
+
+    def lines(self, count):
+        return [self.get(timeout=TIMEOUT_S) for _ in range(count)]
+
+
+class Numbered:
+    """Measurements whose words tell their number."""
+
+    def __len__(self):
+        return 1_000_000
+
+    def __getitem__(self, index):
+        return np.full(N_SAMPLES, index, np.uint32)
+
+
+def opened(device):
+    return serial.Serial(device.port, 115_200, timeout=TIMEOUT_S)
+
+
+def ask(port, line):
+    port.write(line)
+    return int.from_bytes(port.read(4), "little")
+
+
+def block(port, n_samples=N_SAMPLES):
+    data = np.frombuffer(port.read(4 * n_samples + 12), "<u4")
+    assert (data[0], data[-1], len(data)) == (HEADER, FOOTER, n_samples + 3)
+    return int(data[1]), data[2:-1]
+
+
+def is_block(came, counter, words):
+    return came[0] == counter and np.array_equal(came[1], words)

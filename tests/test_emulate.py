@@ -1,0 +1,166 @@
+"""``ertis emulate``, as a process of its own: what it prints, what its devices measure, and what it leaves."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import pytest
+import serial
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.simulation import Scene
+from ertis_numba.simulation.render import render
+from ertis_numba.storage import write_recording
+from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
+from tests.files import noise
+
+MODULE = [sys.executable, "-m", "ertis_cli", "emulate"]
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Two sensors, with two measurements and with one."""
+    settings = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
+    given = [("left", WORDS[0]), ("right", WORDS[1]), ("left", WORDS[2])]
+    return write_recording(
+        tmp_path / "rec.h5",
+        [Measurement(words, settings, Stamp(sensor=name, sequence=index)) for index, (name, words) in enumerate(given)],
+    )
+
+
+@pytest.fixture
+def emulate(tmp_path):
+    """Start the command as a process of its own; what still runs is ended."""
+    with ExitStack() as stack:
+
+        def start(*arguments):
+            process = stack.enter_context(
+                subprocess.Popen(
+                    [*MODULE, *(str(argument) for argument in arguments)],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                    env=ENVIRONMENT | {"ERTIS_EMULATED_DIR": str(tmp_path / "links")},
+                )
+            )
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def ended(process, number):
+    process.send_signal(number)
+    out, errors = process.communicate(timeout=TIMEOUT_S)
+    return process.returncode, out, errors
+
+
+def test_the_command_replays_a_recording(emulate, recording, tmp_path):
+    log = tmp_path / "log"
+    process = emulate(recording, "--sync-rate", 50, "--log", log, "--fault", "short_reads=1", "--quiet")
+    paths = [process.stdout.readline().rstrip() for _ in range(2)]
+    links = [tmp_path / "links" / name for name in ("left", "right")]
+    assert [str(link.readlink()) for link in links] == paths
+    for path, given in zip(paths, ([WORDS[0], WORDS[2]], [WORDS[1]]), strict=True):
+        with serial.Serial(path, timeout=TIMEOUT_S) as port:
+            ask(port, b"!G,131072,0,0\n")
+            for counter in range(3):
+                port.write(b"!A,1,0,0\n")
+                assert is_block(block(port), counter, given[counter % len(given)])
+    with serial.Serial(paths[1], timeout=TIMEOUT_S) as port:
+        ask(port, b"!J,1,1,0\n")
+        assert [is_block(block(port), counter, WORDS[1]) for counter in (3, 4)] == [True, True]
+    assert ended(process, signal.SIGTERM) == (143, "", "")
+    assert not list((tmp_path / "links").iterdir())
+    entries = [json.loads(line) for line in log.read_text().splitlines()][:8]
+    assert [entry["name"] for entry in entries] == 3 * ["left"] + 5 * ["right"]
+
+
+def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
+    link = tmp_path / "mine"
+    process = emulate(recording, "--sensor", "left", "--link", link, "--unplug", "0:0.05", "--json")
+    told = json.loads(process.stdout.readline())
+    assert (told["sensor"], told["link"], told["port"][:5]) == ("left", str(link), "/dev/")
+    assert process.stderr.readline().startswith("left is back: /dev/")
+    with serial.Serial(str(link), timeout=TIMEOUT_S) as port:
+        assert ask(port, b"!Y,0,0,0\n") == 0x010000
+    second = emulate(recording, "--sensor", "left", "--link", link)
+    assert second.communicate(timeout=TIMEOUT_S)[1] == (
+        f"ertis: error: link {link} belongs to an emulated device that runs; end that one, or give another name\n"
+    )
+    assert second.returncode == 1
+    code, out, errors = ended(process, signal.SIGINT)
+    assert (code, out) == (130, "")
+    assert errors.strip() == "ertis: error: interrupted"
+    assert not link.is_symlink()
+
+
+def test_a_killed_emulator_leaves_a_link_that_the_next_replaces(emulate, recording, tmp_path):
+    link = tmp_path / "links" / "left"
+    process = emulate(recording, "--sensor", "left")
+    process.stdout.readline()
+    ended(process, signal.SIGKILL)
+    assert link.is_symlink()
+    process = emulate(recording, "--sensor", "left")
+    assert process.stdout.readline().rstrip() == str(link.readlink())
+    assert ended(process, signal.SIGTERM)[0] == 143
+
+
+SCENE = """
+seed = 3
+count = 2
+[[sensors]]
+name = "only"
+recording.n_samples = 32768
+processing.range_m = [0.3, 0.5]
+electronics.noise_dbfs = -40.0
+[[points]]
+range_m = 0.4
+"""
+
+
+def test_the_command_renders_a_scene(emulate, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    process = emulate(tmp_path / "scene.toml", "--seed", 4, "--quiet")
+    scene = Scene.from_toml(SCENE).replace(seed=4)
+    (sensor,) = scene.sensors
+    silent = scene.replace(sensors=(sensor.replace(emitter=sensor.emitter.replace(silent=True)),))
+    with serial.Serial(process.stdout.readline().rstrip(), timeout=TIMEOUT_S) as port:
+        ask(port, b"!G,131072,0,0\n")
+        for counter, active in enumerate((1, 1, 0, 1)):
+            port.write(b"!A,%d,0,0\n" % active)
+            words = render(scene if active else silent, counter % 2).words
+            assert is_block(block(port), counter, words)
+    assert ended(process, signal.SIGTERM) == (143, "", "")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--fault", "lose"], 2, "'lose' is no fault, give a kind and a probability as in lose=0.01"),
+        (["--fault", "loose=1"], 1, "kind of fault 'loose' is unknown (did you mean 'lose'?)"),
+        (["--count", "3"], 2, "--count is of scenes; a recording has its own"),
+        (["--link", "here"], 2, "--link is of one device, but rec.h5 has 2 sensors; choose one with --sensor"),
+        (["--sensor", "middle"], 1, "rec.h5 has no sensor 'middle'; choose one of left, right"),
+        (["--sync-rate", "0"], 2, "0.0 is not in the range 0.001<=x<=1000.0"),
+        (["--unplug", "3"], 2, "'3' is no interval"),
+    ],
+)
+def test_the_command_refuses_what_it_cannot_do(recording, options, code, message):
+    done = CliRunner().invoke(cli, ["emulate", str(recording), *options])
+    assert (done.exit_code, done.stdout) == (code, "")
+    assert message in done.stderr
+
+
+def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    done = CliRunner().invoke(cli, ["emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "recording.n_samples is 40960; a sensor measures multiples of 32768 up to 16777216" in done.stderr

@@ -1,0 +1,211 @@
+"""Which serial ports are found, which one a name means, and what sensors say when they are asked."""
+
+import json
+import os
+import re
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.devices import devices
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from ertis_numba.devices import ports
+from ertis_numba.devices.emulator import Emulator, Quirks
+from ertis_numba.devices.ports import Port, find_again, find_ports, resolve
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.survey import survey
+from ertis_numba.errors import SonarError
+
+WORDS = [np.zeros(32_768, dtype=np.uint32)]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """The folder of emulated devices, and a machine without others."""
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
+    monkeypatch.setattr(ports, "_BY_ID", tmp_path / "by-id")
+    monkeypatch.setattr(list_ports, "comports", list)
+    return tmp_path / "emulated"
+
+
+def plug_in(monkeypatch, **serial_numbers):
+    """Let there be USB devices: name=serial number."""
+
+    def info(name, serial_number):
+        port = ListPortInfo(f"/dev/{name}")
+        port.vid, port.serial_number, port.description = 0x0483, serial_number, "eRTIS"
+        return port
+
+    found = [info(*item) for item in serial_numbers.items()]
+    monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("/dev/ttyS0"), *found])
+
+
+def test_an_emulated_device_by_all_its_names(folder, tmp_path):
+    assert find_ports() == []
+    link = folder / "left"
+    with Emulator(WORDS, link=link) as device, Emulator(WORDS, link=folder / "right"):
+        left, right = find_ports()
+        assert left == Port(
+            path=device.port, link=str(link), serial_number="left", description="emulated eRTIS", emulated=True
+        )
+        assert (right.serial_number, left.may_be_sonar) == ("right", True)
+        for name in ("left", device.port, str(link), os.path.relpath(link)):
+            assert resolve(name) == left
+        (tmp_path / "mine").symlink_to(device.port)
+        assert resolve(str(tmp_path / "mine")) == Port(
+            path=device.port,
+            link=str(tmp_path / "mine"),
+            serial_number="left",
+            description="emulated eRTIS",
+            emulated=True,
+        )
+        device.unplug()
+        assert find_ports() == [right]
+        with pytest.raises(SonarError, match=re.escape(f"there is no serial port '{link}'; give one")):
+            find_again(left)
+        device.replug()
+        assert find_again(left).path == device.port
+    assert find_ports() == []
+
+
+def test_what_a_killed_emulator_left_leads_nowhere(folder):
+    """Its number is soon that of somebody's shell."""
+    with Emulator(WORDS) as device:
+        folder.mkdir()
+        (folder / "left").symlink_to(device.port)
+        (folder / ".left.lock").touch()
+        assert find_ports() == []
+        for name in ("left", str(folder / "left")):
+            with pytest.raises(SonarError, match="there is no serial port"):
+                resolve(name)
+
+
+def test_usb_devices_by_all_their_names(monkeypatch, tmp_path):
+    plug_in(monkeypatch, ttyACM1="SN7", ttyACM0="SN8", ttyUSB0=None)
+    (tmp_path / "by-id").mkdir()
+    link = tmp_path / "by-id" / "usb-CoSys_eRTIS_SN7-if00"
+    link.symlink_to("/dev/ttyACM1")
+    first, seventh, adapter = find_ports()
+    assert seventh == Port(path="/dev/ttyACM1", link=str(link), serial_number="SN7", description="eRTIS")
+    assert [port.may_be_sonar for port in (first, seventh, adapter)] == [True, True, False]
+    for name in ("SN7", "/dev/ttyACM1", "ttyACM1", link.name, str(link)):
+        assert resolve(name) == seventh
+    assert [str(port) for port in (first, adapter)] == ["/dev/ttyACM0 (SN8)", "/dev/ttyUSB0 (eRTIS)"]
+
+
+def test_the_same_usb_device_under_another_number(monkeypatch):
+    plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN8")
+    seventh = resolve("/dev/ttyACM0")
+    plug_in(monkeypatch, ttyACM0="SN8", ttyACM5="SN7")
+    assert find_again(seventh).path == "/dev/ttyACM5"
+
+
+def test_a_port_without_a_file_and_one_that_is_not_of_usb(monkeypatch):
+    monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM7")])
+    assert resolve("COM7") == Port(path="COM7")
+    with Emulator(WORDS) as device:
+        assert resolve(device.port) == Port(path=device.port)
+        assert not resolve(device.port).may_be_sonar
+
+
+def test_several_ports_of_one_serial_number(monkeypatch):
+    plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN7")
+    wanted = re.escape("'SN7' are 2 ports: /dev/ttyACM0 (SN7), /dev/ttyACM1 (SN7); give the path of one")
+    with pytest.raises(SonarError, match=wanted):
+        resolve("SN7")
+
+
+def test_a_port_that_is_not_there(monkeypatch):
+    with pytest.raises(SonarError, match=r"no serial port 'SN7'; none is plugged in: .* 'ertis emulate'"):
+        resolve("SN7")
+    plug_in(monkeypatch, ttyACM0="SN8")
+    with pytest.raises(SonarError, match=r"no serial port '/dev/ttyACM7'; give one .* are: /dev/ttyACM0 \(SN8\)$"):
+        resolve("/dev/ttyACM7")
+
+
+@pytest.fixture
+def four(folder):
+    """Devices of which one is ready, one has a call, one is in use and one is silent."""
+    with ExitStack() as stack:
+        emulators = {
+            name: stack.enter_context(Emulator(WORDS, link=folder / name)) for name in ("call", "mute", "new", "used")
+        }
+        registers = emulators["call"].registers
+        registers.n_codes, registers.codes[:3] = 3, (0x120, 0x003, 0x400)
+        emulators["mute"].quirks = Quirks(silent=True)
+        stack.enter_context(Sonar.open("used"))
+        yield emulators
+
+
+def listed(*arguments, code=0):
+    done = CliRunner().invoke(devices, arguments)
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+@pytest.mark.usefixtures("four")
+def test_all_ports_are_asked_at_once():
+    before = time.monotonic()
+    answers = {answer.port.serial_number: answer for answer in survey(find_ports())}
+    assert time.monotonic() - before < 1
+    assert {name: answer.state for name, answer in answers.items()} == {
+        "call": "ready",
+        "mute": "no answer",
+        "new": "ready",
+        "used": "in use",
+    }
+    assert (answers["call"].firmware, answers["call"].call_hash) == ("1.0.0", 0x523)
+    assert (answers["mute"].firmware, answers["mute"].call_hash) == ("", None)
+    assert "does not answer" in str(answers["mute"].error)
+
+
+def test_the_list_of_devices(four):
+    done = listed()
+    assert [re.split("  +", line) for line in done.stdout.splitlines()] == [
+        ["port", "serial number", "state", "firmware", "call", "what"],
+        [four["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
+        [four["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
+        [four["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],
+    ]
+    assert done.stderr.count("\n") == 1
+    assert f"{four['mute'].port} does not answer" in done.stderr
+
+
+def test_the_list_of_devices_for_programs(four):
+    done = listed("--json", "--port", "call", "-p", four["used"].port)
+    assert (done.stdout.count("\n"), done.stderr) == (1, "")
+    ready, used = json.loads(done.stdout)["devices"]
+    assert ready == {
+        "port": four["call"].port,
+        "link": str(four["call"].link),
+        "serial_number": "call",
+        "description": "emulated eRTIS",
+        "emulated": True,
+        "state": "ready",
+        "firmware": "1.0.0",
+        "call_hash": 0x523,
+    }
+    assert (used["state"], used["call_hash"]) == ("in use", None)
+
+
+@pytest.mark.usefixtures("four")
+def test_a_port_that_was_asked_for_and_has_no_sensor():
+    done = listed("-p", "mute", "-p", "new", code=1)
+    assert [re.split("  +", line)[2] for line in done.stdout.splitlines()[1:]] == ["no answer", "ready"]
+    assert "does not answer 'firmware version?'" in str(done.exception)
+    assert "there is no serial port 'moot'" in str(listed("-p", "moot", code=1).exception)
+
+
+def test_no_devices_at_all(monkeypatch):
+    assert survey([]) == []
+    plug_in(monkeypatch, ttyUSB0="FTDI")  # it is no CDC-ACM port, so that nothing is said to it
+    done = listed()
+    assert (done.stdout, done.stderr) == (
+        "",
+        "no eRTIS was found; plug one in, or start an emulated one with 'ertis emulate'\n",
+    )
+    assert json.loads(listed("--json").stdout) == {"devices": []}

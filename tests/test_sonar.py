@@ -1,0 +1,515 @@
+"""The driver on real pseudo terminals: what it tells a device, what it takes from it, and what it says of trouble."""
+
+import errno
+import itertools
+import os
+import select
+import threading
+import time
+import tty
+
+import numpy as np
+import pytest
+import serial
+
+from ertis_numba.devices.commands import Setup, call_hash, encode_answer, encode_block
+from ertis_numba.devices.emulator import Emulator, Quirks
+from ertis_numba.devices.line import Line
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sync_chain import SyncChain
+from ertis_numba.errors import SonarError, SonarGoneError
+from ertis_numba.settings import Call, Recording, Settings
+from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS
+
+SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES))
+BLOCK_BYTES = 4 * N_SAMPLES + 12
+PASSIVE = [words[::-1].copy() for words in WORDS]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def device(folder):
+    with Emulator(WORDS, passive=PASSIVE, link=folder / "left") as device:
+        yield device
+
+
+@pytest.fixture
+def sonar(device):
+    with Sonar.open("left") as sonar:
+        sonar.configure(Setup.of(SETTINGS))
+        yield sonar
+    assert device.refused == 0
+
+
+@pytest.fixture
+def armed(device):
+    with Sonar.open(device.port) as sonar:
+        sonar.configure(Setup.of(SETTINGS, trigger="sync"))
+        sonar.arm()
+        yield sonar
+
+
+class Fake:
+    """A device that answers what a test wants: ``answer`` gets each line and a function that writes."""
+
+    def __init__(self, answer):
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._answer = answer
+        self._ended, self._end = os.pipe()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        os.write(self._end, b"!")
+        self._thread.join()
+        for number in (self.master, self._slave, self._ended, self._end):
+            os.close(number)
+
+    def write(self, data):
+        os.write(self.master, data)
+
+    def _run(self):
+        rest = b""
+        while self._ended not in select.select([self.master, self._ended], [], [])[0]:
+            *lines, rest = (rest + os.read(self.master, 65_536)).split(b"\n")
+            for line in lines:
+                self._answer(line, self.write)
+
+
+def obedient(line, write):
+    if not line.startswith(b"!A"):
+        write(encode_answer(call_hash(Setup.of(SETTINGS).codes) if line.startswith(b"!L") else 1))
+
+
+def wait_for_bytes(device):
+    """Wait until something lies there that the host could read, and let it lie."""
+    port = os.open(device.port, os.O_RDONLY | os.O_NOCTTY)
+    assert select.select([port], [], [], TIMEOUT_S)[0]
+    os.close(port)
+
+
+def is_block(block, counter, words):
+    return block.counter == counter and np.array_equal(block.words, words)
+
+
+def taken(sonar, count):
+    return list(itertools.islice(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S), count))
+
+
+def refusal(device, *, timeout_s=0.2):
+    """Return the error of opening a fake device."""
+    with device, pytest.raises(SonarError) as caught:
+        Sonar.open(device.port, timeout_s=timeout_s)
+    return caught.value
+
+
+# Opening
+
+
+def test_open(device):
+    with Sonar.open(device.port) as sonar:
+        assert (sonar.port, sonar.serial_number, sonar.firmware) == (device.port, "left", "1.0.0")
+        assert sonar.call_hash() == 0
+        assert sonar.dropped == 0
+
+
+def test_a_port_that_another_program_has_open(device):
+    with serial.Serial(device.port, exclusive=True), pytest.raises(SonarError, match="is in use by another") as caught:
+        Sonar.open("left")
+    assert caught.value.errno == errno.EBUSY
+    Sonar.open("left").close()
+    Sonar.open("left").close()
+
+
+def test_what_is_no_serial_port(tmp_path):
+    (tmp_path / "file.txt").touch()
+    with pytest.raises(SonarError, match=r"file\.txt is no serial port that can be used \(.*; give another"):
+        Sonar.open(str(tmp_path / "file.txt"))
+
+
+@pytest.mark.parametrize(
+    ("code", "text"), [(errno.EACCES, "may not be used by this user; .*dialout"), (errno.EIO, "is not there any more")]
+)
+def test_a_port_that_the_system_refuses(device, monkeypatch, code, text):
+    def refuse(*_, **__):
+        raise serial.SerialException(code, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(SonarError, match=text) as caught:
+        Sonar.open(device.port)
+    assert caught.value.errno == (errno.ENOENT if code == errno.EIO else code)
+
+
+def test_a_silent_device(device):
+    device.quirks = Quirks(silent=True)
+    wanted = r"does not answer 'firmware version\?' within 0.2 s; is it an eRTIS"
+    with pytest.raises(SonarError, match=wanted) as caught:
+        Sonar.open("left", timeout_s=0.2)
+    assert caught.value.errno == errno.ETIMEDOUT
+
+
+def test_a_device_of_another_kind():
+    error = refusal(Fake(lambda _, write: write(b"OK")))
+    assert "does not answer 'firmware version?' within 0.2 s, but sends b'OK'" in str(error)
+    error = refusal(Fake(lambda _, write: write(b"unknown command\r\n")))
+    assert "answers 'firmware version?' with more than a number, first b'unkn'" in str(error)
+    numbers = itertools.count()
+    error = refusal(Fake(lambda _, write: write(encode_answer(next(numbers)))))
+    assert "answers 'firmware version?' with 1 and then with 2" in str(error)
+
+
+def test_a_device_that_never_stops_sending():
+    ended = threading.Event()
+    with Fake(obedient) as device:
+
+        def talk():
+            while not ended.wait(0.01):
+                device.write(b"$GPGGA,")
+
+        talker = threading.Thread(target=talk)
+        talker.start()
+        try:
+            with pytest.raises(SonarError, match="keeps sending whatever it is told; is it an eRTIS"):
+                Sonar.open(device.port, timeout_s=0.2)
+        finally:
+            ended.set()
+            talker.join()
+
+
+def test_a_stream_that_a_crashed_program_left(device):
+    registers = device.registers
+    registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
+    with SyncChain([device], 50.0):
+        wait_for_bytes(device)
+        with Sonar.open("left") as sonar:
+            assert registers.armed == 0
+            assert 0 < sonar.dropped < 20 * BLOCK_BYTES
+            sonar.configure(Setup.of(SETTINGS), counter=7)
+            assert is_block(sonar.measure(), 7, WORDS[7 % len(WORDS)])
+            assert not sonar.receiver.rejected
+
+
+def test_half_a_command_that_a_crashed_program_left(device):
+    with serial.Serial(device.port) as port:
+        port.write(b"!C,12")
+    Sonar.open("left").close()
+
+
+# Setting up
+
+
+def test_everything_is_told(device, caplog):
+    setup = Setup.of(SETTINGS.replace(recording=Recording(n_samples=65_536, pdm_rate_hz=1_125_000.0)), emissions=3)
+    with Sonar.open("left") as sonar:
+        assert device.registers.armed == 0
+        caplog.set_level("INFO", "ertis_numba")
+        sonar.configure(setup, counter=11)
+        told = device.registers
+        assert (told.n_bytes, told.clock, told.dac_rate_hz, told.n_codes) == (262_144, 1, 450_000, len(setup.codes))
+        assert (told.emissions, told.active, told.amplifier, told.counter) == (3, 1, 1, 11)
+        assert np.array_equal(told.codes[: told.n_codes], setup.codes)
+        assert sonar.call_hash() == call_hash(setup.codes)
+        assert "a call of 1126 samples was sent" in caplog.text
+        caplog.clear()
+        sonar.configure(setup, counter=12)
+        assert (told.counter, caplog.text) == (12, "")
+
+
+def test_a_slow_device_gets_its_call(device):
+    device.quirks = Quirks(answer_delay_s=2e-3)
+    setup = Setup.of(SETTINGS.replace(call=Call(duration_s=2e-4)))
+    with Sonar.open("left", timeout_s=0.2) as sonar:
+        sonar.configure(setup)
+        assert np.array_equal(device.registers.codes[: len(setup.codes)], setup.codes)
+
+
+def test_a_call_that_did_not_arrive(device):
+    device.quirks = Quirks(wrong_hash=True)
+    setup = Setup.of(SETTINGS)
+    wanted, held = f"{call_hash(setup.codes):#06x}", f"{call_hash(setup.codes) ^ 1:#06x}"
+    with (
+        Sonar.open("left") as sonar,
+        pytest.raises(SonarError, match=f"sent a call with hash {wanted} and holds one with {held}; plug"),
+    ):
+        sonar.configure(setup)
+
+
+def test_a_device_that_falls_silent(device):
+    with Sonar.open("left", timeout_s=0.1) as sonar:
+        device.quirks = Quirks(silent=True)
+        with pytest.raises(SonarError, match=r"does not answer 'SYNC input 1: off' within 0\.1 s"):
+            sonar.configure(Setup.of(SETTINGS))
+
+
+def test_answers_that_are_missing_name_their_command():
+    def forgetful(line, write):
+        if not line.startswith((b"!C,21,", b"!L")):
+            obedient(line, write)
+        elif line.startswith(b"!L"):
+            write(encode_answer(0))
+
+    with (
+        Fake(forgetful) as device,
+        Sonar.open(device.port, timeout_s=0.1) as sonar,
+        pytest.raises(SonarError, match=r"does not answer 'sample 31 of the call: \d+' within 0\.1 s"),
+    ):
+        sonar.configure(Setup.of(SETTINGS))  # nobody can tell which of sixteen is missing: the last
+
+
+# Measuring
+
+
+def test_measurements_on_command(sonar):
+    before = time.monotonic_ns(), time.time_ns()
+    blocks = [sonar.measure() for _ in range(4)]
+    assert all(is_block(block, index, WORDS[index % 3]) for index, block in enumerate(blocks))
+    times_ns = [block.arrived.monotonic_ns for block in blocks]
+    assert sorted({before[0], *times_ns, time.monotonic_ns()})[1:-1] == times_ns
+    assert before[1] < blocks[0].arrived.realtime_ns < time.time_ns()
+    assert all(1_000_000 <= block.arrived.uncertainty_ns < 1_000_000_000 for block in blocks)
+    assert is_block(sonar.measure(active=False), 4, PASSIVE[1])
+    assert (sonar.dropped, sonar.receiver.lost, sonar.receiver.rejected.total()) == (0, 0, 0)
+
+
+def test_what_lay_there_is_dropped(sonar, device):
+    device.registers.armed = 1
+    assert device.trigger()
+    wait_for_bytes(device)
+    assert is_block(sonar.measure(), 1, WORDS[1])
+    assert sonar.dropped == BLOCK_BYTES
+
+
+def test_a_measurement_that_comes_too_late(sonar, device):
+    device.quirks = Quirks(bytes_per_s=200_000)
+    with pytest.raises(SonarError, match=r"no whole measurement within 0\.53 s; \d+ of 131084 bytes came: measure"):
+        sonar.measure()
+    device.quirks = Quirks()
+    assert is_block(sonar.measure(), 1, WORDS[1])
+    assert is_block(sonar.measure(), 2, WORDS[2])
+    n_answers, rest = divmod(sonar.dropped + sonar.receiver.rejected.total() - BLOCK_BYTES, 4)
+    assert (n_answers < 3, rest) == (True, 0)  # those to the counter's command, which was asked again
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.02])
+def test_a_measurement_that_comes_in_the_next_one_s_place(pause_s):
+    """It is wholly there, but its number tells."""
+    asked = []
+
+    def slow(line, write):
+        obedient(line, write)
+        asked.extend([line] * line.startswith(b"!A"))
+        if len(asked) == 2:
+            asked.append(b"")
+            write(encode_block(0, WORDS[0]))
+            time.sleep(pause_s)  # it measures
+            write(encode_block(1, WORDS[1]))
+
+    with Fake(slow) as device, Sonar.open(device.port) as sonar:
+        sonar.configure(Setup.of(SETTINGS))
+        with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
+            sonar.measure()
+        assert is_block(sonar.measure(), 1, WORDS[1])
+        assert sonar.receiver.rejected == {"counter": BLOCK_BYTES}
+
+
+def test_a_byte_that_is_lost_costs_one_measurement():
+    counters = itertools.count()
+
+    def lossy(line, write):
+        obedient(line, write)
+        if line.startswith(b"!A"):
+            counter = next(counters)
+            data = encode_block(counter, WORDS[counter])
+            write(data[:5_000] + data[5_001:] if counter == 0 else data)
+
+    with Fake(lossy) as device, Sonar.open(device.port) as sonar:
+        sonar.configure(Setup.of(SETTINGS))
+        with pytest.raises(SonarError, match="; 131083 of 131084 bytes came"):
+            sonar.measure()
+        assert is_block(sonar.measure(), 1, WORDS[1])
+        assert sonar.receiver.rejected == {"cut short": BLOCK_BYTES - 1}
+
+
+@pytest.mark.usefixtures("device")
+def test_bits_that_cannot_be_true():
+    with Sonar.open("left") as sonar:
+        sonar.configure(Setup.of(SETTINGS), bits=lambda words: "odd" if np.array_equal(words, WORDS[0]) else None)
+        with pytest.raises(SonarError, match="no whole measurement"):
+            sonar.measure()
+        assert sonar.receiver.rejected_blocks == {"odd": 1}
+        assert is_block(sonar.measure(), 1, WORDS[1])
+
+
+# Listening
+
+
+def test_twenty_pulses_a_second(armed, device):
+    with SyncChain([device], 20.0):
+        blocks = taken(armed, 20)
+    assert all(is_block(block, index, WORDS[index % 3]) for index, block in enumerate(blocks))
+    assert (armed.dropped, armed.receiver.lost, armed.receiver.rejected.total()) == (0, 0, 0)
+    armed.disarm()
+    assert device.registers.armed == 0
+
+
+def test_listening_stops_at_once(armed):
+    stop, stopped = threading.Event(), []
+
+    def end():
+        stop.set()
+        stopped.append(time.monotonic())
+
+    timer = threading.Timer(0.1, end)
+    timer.start()
+    assert list(armed.listen(stop=stop.is_set, timeout_s=TIMEOUT_S)) == []
+    assert time.monotonic() - stopped[0] < 0.2
+    timer.join()
+
+
+def test_closing_ends_listening_and_disarms(armed, device):
+    timer = threading.Timer(0.1, armed.close)
+    timer.start()
+    assert list(armed.listen(stop=lambda: False, timeout_s=TIMEOUT_S)) == []
+    timer.join()
+    with Sonar.open("left"):
+        assert device.registers.armed == 0
+    with pytest.raises(SonarError, match="was closed; open it again"):
+        armed.disarm()
+
+
+def test_nothing_to_listen_to(armed):
+    with pytest.raises(SonarError, match=r"nothing came within 0\.\d+ s; look at the trigger"):
+        list(armed.listen(stop=lambda: False, timeout_s=0.1))
+
+
+def test_listening_without_a_byte_sent(device):
+    """Somebody else has set the device up; the counter may stand anywhere."""
+    registers = device.registers
+    registers.n_bytes, registers.armed, registers.counter = 4 * N_SAMPLES, 1, 40
+    with Sonar.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+        assert sonar.firmware == ""
+        sonar.configure(Setup.of(SETTINGS, trigger="sync"))
+        assert [block.counter for block in taken(sonar, 3)] == [40, 41, 42]
+        with pytest.raises(SonarError, match="was opened to listen only"):
+            sonar.measure()
+    assert registers.armed == 1
+    assert device.registers.n_codes == 0
+
+
+def test_listening_for_another_length(device):
+    registers = device.registers
+    registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
+    with Sonar.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+        sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
+        with pytest.raises(SonarError, match=r"\d+ bytes came within .* no whole measurement of 65536 samples; give"):
+            list(sonar.listen(stop=lambda: False, timeout_s=0.1))
+
+
+def test_a_pause_within_a_measurement(monkeypatch):
+    """What began is given up, and the next one is whole."""
+    monkeypatch.setattr("ertis_numba.devices.sonar._MARGIN_S", 0.1)
+
+    def stalling(line, write):
+        obedient(line, write)
+        if line.startswith(b"!J,1"):
+            write(encode_block(0, WORDS[0])[:1_000])
+
+    with Fake(stalling) as device, Sonar.open(device.port) as sonar:
+        sonar.configure(Setup.of(SETTINGS, trigger="sync"))
+        sonar.arm()
+        writer = threading.Thread(target=device.write, args=[encode_block(1, WORDS[1])])
+
+        def go_on():
+            if sonar.receiver.rejected and writer.ident is None:
+                writer.start()
+            return False
+
+        [block] = itertools.islice(sonar.listen(stop=go_on, timeout_s=TIMEOUT_S), 1)
+        assert is_block(block, 1, WORDS[1])
+        assert sonar.receiver.rejected == {"cut short": 1_000}
+        writer.join()
+
+
+@pytest.mark.usefixtures("device")
+def test_what_needs_something_else_first():
+    with Sonar.open("left") as sonar:
+        with pytest.raises(SonarError, match=r"is not configured; call configure\(\) first"):
+            sonar.measure()
+        sonar.configure(Setup.of(SETTINGS))
+        with pytest.raises(SonarError, match=r"is not armed; call arm\(\) first"):
+            taken(sonar, 1)
+        sonar.arm()
+        with pytest.raises(SonarError, match=r"is armed, and SYNC pulses measure"):
+            sonar.measure()
+
+
+# Unplugged
+
+
+def test_unplugged_within_a_measurement(sonar, device):
+    first = sonar.port
+    assert is_block(sonar.measure(), 0, WORDS[0])
+    device.quirks = Quirks(bytes_per_s=400_000)
+    timer = threading.Timer(0.15, device.unplug)
+    timer.start()
+    with pytest.raises(SonarGoneError, match=f"{first} was unplugged; plug it in again"):
+        sonar.measure()
+    timer.join()
+    with pytest.raises(SonarGoneError, match="was unplugged"):
+        sonar.measure()
+    device.quirks = Quirks()
+    device.replug()
+    assert sonar.reconnect(within_s=TIMEOUT_S)
+    assert sonar.port == device.port != first  # that number is taken until the driver lets go of it
+    assert is_block(sonar.measure(), 2, WORDS[2])
+
+
+def test_unplugged_while_listening(armed, device):
+    with SyncChain([device], 50.0):
+        blocks = taken(armed, 3)
+        device.unplug()
+        with pytest.raises(SonarGoneError):
+            blocks += taken(armed, 100)
+        device.replug()
+        before = time.monotonic()
+        assert armed.reconnect(within_s=TIMEOUT_S, missed=10)
+        [back] = taken(armed, 1)
+    assert time.monotonic() - before < 3
+    # A busy machine may read too late for some, which the device then drops.
+    counters = [block.counter for block in blocks]
+    assert counters == sorted(set(counters))
+    assert counters[-1] + 11 <= back.counter < counters[-1] + 20
+
+
+def test_a_device_that_does_not_come_back(sonar, device):
+    device.unplug()
+    with pytest.raises(SonarGoneError, match=r"did not come back within 0\.1 s: there is no serial port"):
+        sonar.reconnect(within_s=0.1)
+    assert not sonar.reconnect(within_s=TIMEOUT_S, stop=lambda: True)
+    timer = threading.Timer(0.1, sonar.close)
+    timer.start()
+    assert not sonar.reconnect(within_s=TIMEOUT_S)
+    timer.join()
+
+
+def test_a_device_that_takes_nothing(monkeypatch):
+    """Its side of the line is full, since it does not read."""
+    monkeypatch.setattr("ertis_numba.devices.line._WRITE_S", 0.05)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    line = Line(os.ttyname(slave), stop=lambda: False)
+    with pytest.raises(SonarError, match="takes no commands; plug it out and in"):
+        line.send(bytes(1_000_000))
+    line.close()
+    os.close(master)
+    os.close(slave)

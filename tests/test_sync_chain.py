@@ -1,0 +1,103 @@
+"""Pulses to emulated devices: at a steady rate, to all of them, and the same ones."""
+
+import queue
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.sync_chain import SyncChain
+from ertis_numba.errors import ArgumentError
+from tests.emulated import TIMEOUT_S, Numbered, ask, block, opened
+
+
+class Listener:
+    """Stands in a chain and notes its pulses."""
+
+    def __init__(self, *, takes):
+        self.takes = takes
+        self.came = queue.Queue()
+
+    def trigger(self, pulse, *, at_ns):
+        self.came.put((pulse, at_ns))
+        return self.takes
+
+
+def test_pulses_are_steady_and_pass_from_device_to_device():
+    devices = [Listener(takes=False), Listener(takes=True)]
+    with SyncChain(devices, 200.0):
+        first, second = ([device.came.get(timeout=TIMEOUT_S) for _ in range(10)] for device in devices)
+    assert [pulse for pulse, _ in first] == [pulse for pulse, _ in second] == list(range(10))
+    assert {late - early for (_, early), (_, late) in zip(first, second, strict=True)} == {400}
+    periods = np.diff([at_ns for _, at_ns in first]) / 5e6
+    assert np.all(periods == np.rint(periods))  # one that is missed is left out, and none is moved
+    assert np.median(periods) == 1
+
+
+def test_pulses_that_are_missed_are_left_out():
+    class Slow(Listener):
+        """Holds the chain up at its first pulse, for some periods."""
+
+        def trigger(self, pulse, *, at_ns):
+            if not pulse:
+                threading.Event().wait((at_ns + 3.5e8 - time.monotonic_ns()) / 1e9)
+            return super().trigger(pulse, at_ns=at_ns)
+
+    device = Slow(takes=True)
+    with SyncChain([device], 10.0):
+        (_, first_ns), (pulse, second_ns) = (device.came.get(timeout=TIMEOUT_S) for _ in range(2))
+    assert pulse == 1
+    assert second_ns - first_ns >= 4e8
+    assert (second_ns - first_ns) % 1e8 == 0
+
+
+def test_pulses_are_numbered_from_the_first_that_counts():
+    device = Listener(takes=False)
+    with SyncChain([device], 500.0) as chain:
+        assert [device.came.get(timeout=TIMEOUT_S)[0] for _ in range(3)] == [0, 0, 0]
+        device.takes = True
+        pulses = [device.came.get(timeout=TIMEOUT_S)[0] for _ in range(20)]
+        chain.start()  # it runs already
+    assert pulses[-1] > 10
+    assert set(np.diff(pulses)) == {0, 1} or set(np.diff(pulses)) == {1}
+
+
+def test_a_rate_that_is_none_is_refused():
+    with pytest.raises(ArgumentError, match=r"rate_hz is 0; give a number from 0\.001 to 1000"):
+        SyncChain([], 0.0)
+
+
+def test_four_devices_on_a_chain_hear_the_same_moments():
+    begun = [threading.Event() for _ in range(5)]
+    begun[0].set()
+
+    def listen(place, port):
+        """Begin when the one before has: the later ones miss pulses."""
+        assert begun[place].wait(TIMEOUT_S)
+        ask(port, b"!J,1,1,0\n")
+        for _ in range(6):
+            yield block(port)
+            begun[place + 1].set()
+
+    with ExitStack() as stack:
+        devices = [stack.enter_context(Emulator(Numbered())) for _ in range(4)]
+        ports = [stack.enter_context(opened(device)) for device in devices]
+        for place, port in enumerate(ports):
+            ask(port, b"!G,131072,0,0\n")
+            ask(port, b"!B,%d,0,0\n" % (100 * place))
+        stack.enter_context(SyncChain(devices, 20.0))
+        hosts = stack.enter_context(ThreadPoolExecutor(4))
+        came = list(hosts.map(lambda place, port: list(listen(place, port)), range(4), ports))
+    assert [[counter for counter, _ in blocks] for blocks in came] == [
+        list(range(100 * place, 100 * place + 6)) for place in range(4)
+    ]
+    assert all(np.all(words == words[0]) for blocks in came for _, words in blocks)
+    pulses = [[int(words[0]) for _, words in blocks] for blocks in came]
+    assert all(np.all(np.diff(row) == 1) for row in pulses)
+    firsts = [row[0] for row in pulses]
+    assert firsts[0] == 0
+    assert firsts == sorted(set(firsts))  # each hears what the others hear then
