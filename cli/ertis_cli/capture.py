@@ -111,7 +111,7 @@ def capture(
         check_target(target, overwrite=force)
     watch = Watch(quiet=quiet, as_json=as_json)
     with stopped_by_signals() as signals, ExitStack() as stack:
-        sonars = _named([stack.enter_context(Sonar.open(port)) for port in ports], names)
+        sonars = _named(ports, names, [stack.enter_context(Sonar.open(port)) for port in ports])
         target = target or Path(_default_name(list(sonars)))
         check_target(target, overwrite=force)
         session = Session(
@@ -130,7 +130,9 @@ def capture(
         for name, sonar in sonars.items():
             sonar.configure(setup, bits=checks[name].check if check_bits else None)
         path = target.with_name(f"{target.name}{SUFFIX}")
-        journal = stack.enter_context(Journal.create(path, target=target.name, source=", ".join(ports)))
+        journal = stack.enter_context(
+            Journal.create(path, target=target.name, source=f"capture of {', '.join(sonars)}")
+        )
         signals.stop = session.stop
         failure = watch.run(session, journal, checks)
         stack.close()
@@ -194,9 +196,10 @@ def _print_commands(setup: "Setup", *, as_json: bool) -> None:
         click.echo(f"{line:20}  {about}")
 
 
-def _named(opened: "list[Sonar]", names: tuple[str, ...]) -> "dict[str, Sonar]":
-    """Return sensors by the names that they are to have, their serial numbers by default."""
-    chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", sonar.serial_number) or "sensor" for sonar in opened]
+def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[Sonar]") -> "dict[str, Sonar]":
+    """Return sensors by the names that they are to have: their serial numbers, or else those of the ports."""
+    known = [sonar.serial_number or Path(port).name for port, sonar in zip(ports, opened, strict=True)]
+    chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]
     for name in chosen:
         if chosen.count(name) > 1:
             raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; name each differently by --name")

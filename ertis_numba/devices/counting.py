@@ -41,9 +41,9 @@ class CounterCheck:
     2. So is a number that is ahead by as many as there were triggers since. Where these are regular they are counted by
        the clock, else by the bursts in which bytes came, damaged ones included: a sensor that is triggered
        sends at once and then is silent.
-    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2, or of which one
-       is the next of the other, are right whatever was taken before them; so the count is found again after
-       any loss, and after a sensor began anew.
+    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2 are right, and so
+       are three that follow each other, whatever was taken before them. So the count is found again after any loss,
+       and after a sensor began anew.
     4. A number between the last right one and a later one is right if the time between them has room for it.
 
     A block is held for three others at most, and a number that is the last one's again is a copy.
@@ -115,7 +115,7 @@ class CounterCheck:
         """Decide what is held, now that no other block will: what is ahead by few more than the triggers is right."""
         for entry in self._held:
             last = self._last
-            if last is None or _ahead(last, entry) == 1 or (self._fits(last, entry) and self._is_near(last, entry)):
+            if last is None or self._is_near(last, entry):
                 self._accept(entry)
             else:
                 self._reject(entry)
@@ -127,44 +127,37 @@ class CounterCheck:
         return decided
 
     def _decide(self, entry: _Entry, last: _Entry) -> None:
-        *_, before = [last, *self._held]
-        if before is not last and _directly(before, entry):
-            self._agree(before, entry)
-        elif (before is last and _directly(last, entry)) or self._as_triggered(last, entry):
-            self._accept_fitting(self._held, entry)
+        held = self._held
+        before = held[-1] if held else last
+        agreeing = [each for each in held if self._as_triggered(each, entry)][-1:]
+        if _directly(before, entry):
+            self._settle([before], entry)
             self._accept(entry)
-        elif agreeing := [held for held in self._held if self._as_triggered(held, entry)]:
-            self._agree(agreeing[-1], entry)
-        elif any(self._fits(last, held) and self._fits(held, entry) for held in self._held):
-            self._accept_fitting(self._held, entry)
-            self._held.append(entry)
-        elif before is not last and _ahead(before, entry) == 1:
-            self._agree(before, entry)
+        elif self._as_triggered(last, entry) or agreeing:
+            self._settle([] if self._as_triggered(last, entry) else agreeing, entry)
+            self._accept(entry)
+        elif len(held) > 1 and _ahead(held[-2], before) == 1 == _ahead(before, entry):
+            self._settle(held[-2:], entry)
+            self._accept(entry)
         else:
-            if len(self._held) == _MOST_HELD:
-                unlikely = [held for held in self._held if not self._fits(last, held)]
-                self._held.remove(worst := [*unlikely, *self._held][0])
+            if any(self._fits(last, each) and self._fits(each, entry) for each in held):
+                self._settle([], entry)
+            elif len(held) == _MOST_HELD:
+                unlikely = [each for each in held if not self._fits(last, each)]
+                held.remove(worst := [*unlikely, *held][0])
                 self._reject(worst)
             self._held.append(entry)
 
-    def _agree(self, held: _Entry, entry: _Entry) -> None:
-        """Take two that agree, and what fits in before and between them."""
-        place = self._held.index(held)
-        earlier, self._held = self._held[:place], self._held[place + 1 :]
-        self._accept_fitting(earlier, held)
-        self._accept(held)
-        self._accept_fitting(self._held, entry)
-        self._accept(entry)
-
-    def _accept_fitting(self, entries: list[_Entry], end: _Entry | None = None) -> None:
-        """Take those of the held ones that the time has room for after the last right one and before ``end``."""
-        for entry in [*entries]:
+    def _settle(self, sure: list[_Entry], end: _Entry) -> None:
+        """Decide what is held: right is what is ``sure``, and what fits before that, or before ``end``."""
+        held, self._held = self._held, []
+        for index, entry in enumerate(held):
+            following = next((later for later in held[index:] if later in sure), end)
             before = self._last is None or self._fits(self._last, entry)
-            if before and (end is None or self._fits(entry, end)):
+            if entry in sure or (before and self._fits(entry, following)):
                 self._accept(entry)
             else:
                 self._reject(entry)
-        entries.clear()
 
     def _accept(self, entry: _Entry) -> None:
         last, self._last = self._last, entry
@@ -215,9 +208,12 @@ class CounterCheck:
         return self._has_room(first, second) and self._by_clock(first, second) in {None, _ahead(first, second)}
 
     def _is_near(self, first: _Entry, second: _Entry) -> bool:
-        """Whether few triggers have to have left no trace."""
+        """Whether it is the next number, or few triggers left no trace."""
+        ahead = _ahead(first, second)
+        if ahead == 1:
+            return self._by_clock(first, second) in {None, 1}
         traces = max(self._n_triggers(first, second), second.rejected - first.rejected)
-        return _ahead(first, second) - traces <= _UNHEARD
+        return self._fits(first, second) and ahead - traces <= _UNHEARD
 
     def _has_room(self, first: _Entry, second: _Entry) -> bool:
         """Whether so many triggers may have come between two blocks, of which all that sent anything were heard."""

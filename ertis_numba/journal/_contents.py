@@ -51,6 +51,12 @@ class Contents:
             self._last[names[number], epoch] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
+        ((n_rows,),) = self._database.execute("SELECT ifnull(max(id), 0) FROM measurements")
+        if n_rows != self._n_entries:
+            raise DataError(
+                f"{self.path} is damaged, it lists {self._n_entries} measurements and has {n_rows}; copy it again if "
+                "you can"
+            )
 
     @property
     def sensors(self) -> Mapping[str, Sensor]:
