@@ -147,8 +147,12 @@ class Database:
             yield
         except sqlite3.Error as error:
             code = getattr(error, "sqlite_errorcode", None)
-            if code is None:
-                raise DataError(f"{self._path} is closed or damaged ({_line(error)}); open it again") from error
+            if code is None:  # what Python's own module has to say
+                if "closed" in str(error):
+                    raise DataError(f"{self._path} is closed; open it again") from error
+                if isinstance(error, sqlite3.ProgrammingError | sqlite3.InterfaceError):
+                    raise
+                code = sqlite3.SQLITE_CORRUPT
             code &= 0xFF  # without what SQLite adds to a code
             if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
                 raise InUseError(

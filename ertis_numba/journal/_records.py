@@ -206,7 +206,7 @@ def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
     got = row_crc32(values)
     if got != wanted:
         raise DataError(
-            f"{path}: the record of {what} has CRC-32 {got:08x}, wanted {wanted:08x}: the journal is damaged; copy it "
+            f"{path}: the record of {what} has CRC-32 {got}, wanted {wanted!r}: the journal is damaged; copy it "
             "again if you can"
         )
     return values
