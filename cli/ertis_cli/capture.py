@@ -5,7 +5,7 @@ import sys
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -69,7 +69,7 @@ def capture(
     target: Path | None,
     n: int | None,
     duration: float | None,
-    trigger: str,
+    trigger: Literal["command", "sync"],
     rate: float,
     pin: int,
     passive: bool,

@@ -59,7 +59,8 @@ class Emulator:
         Gets a line of JSON per measurement before its first byte leaves: name, index of the words, counter, active or
         not, CRC-32 of the words as little-endian bytes, fault (empty if nothing was done to it, "dropped", or in the
         words of `Faults`) and time_ns since 1970. Those that may not have been read when the device is unplugged get
-        another line, whose fault is "unplugged"; the last line about a measurement holds.
+        another line, whose fault is "unplugged"; the last line about a measurement holds. Lines about the device itself
+        have an event instead, "unplugged" or "plugged in".
     quirks : Quirks
         May be replaced at any time.
     on_port : callable, optional
@@ -256,6 +257,7 @@ class Emulator:
             self._plug_in()
         else:
             self._pull_out()
+        self._measurements.note("plugged in" if self._wish_plugged else "unplugged")
         self._changed.notify_all()
         return self._wish_plugged
 

@@ -78,6 +78,15 @@ class Measurements:
         if self._log is None or not output.entry:
             return
         faults = ", ".join(filter(None, (output.entry["fault"], fault)))
-        with _LOGGING:
-            self._log.write(json.dumps(output.entry | {"fault": faults, "time_ns": time.time_ns()}) + "\n")
-            self._log.flush()
+        _write(self._log, output.entry | {"fault": faults})
+
+    def note(self, event: str) -> None:
+        """Write a line about the device itself into the log."""
+        if self._log is not None:
+            _write(self._log, {"name": self._name, "event": event})
+
+
+def _write(log: TextIO, entry: dict[str, Any]) -> None:
+    with _LOGGING:
+        log.write(json.dumps(entry | {"time_ns": time.time_ns()}) + "\n")
+        log.flush()

@@ -64,6 +64,8 @@ class Database:
         self._path = path
         with self._told():
             before = path.stat()
+            if not before.st_size and not empty:  # to lock it would make a database of it
+                raise DataError(f"{path} is empty; give a journal that 'ertis capture' left")
             uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
             # Who uses a journal sees to it that two threads do not use it at once.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
@@ -160,6 +162,8 @@ class Database:
                 ) from error
             told = _TOLD.get(code, "cannot be used ({}); check the disk")
             raise DataError(f"{self._path} {told.format(_line(error))}") from error
+        except UnicodeError as error:  # from texts that are damaged
+            raise DataError(f"{self._path} {_TOLD[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
 

@@ -226,7 +226,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if sealed.recording is None:
         _say(f"{sealed.journal}: no measurement was captured", sys.stderr)
     elif sealed.set_aside is not None:
-        _say(f"{sealed.damaged} measurements are damaged; the journal is kept as {sealed.set_aside}", sys.stderr)
+        number = "1 measurement is" if sealed.damaged == 1 else f"{sealed.damaged} measurements are"
+        _say(f"{number} damaged; the journal is kept as {sealed.set_aside}", sys.stderr)
     return _FAILED if sealed.recording is None else 0
 
 

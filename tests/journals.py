@@ -1,0 +1,67 @@
+"""Journals that the tests of storing and sealing share."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+
+import numpy as np
+
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.settings import Recording
+from tests.files import line, noise
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+TINY = line(8, 8).replace(recording=Recording(n_samples=4096))
+EPOCH = 5
+
+
+def entries(count=3, *, sensor="left", first=10, settings=TINY, epoch=EPOCH, seed=1):
+    """Measurements of noise whose stamps all differ, as they would arrive."""
+    made = []
+    for number, measurement in enumerate(noise(settings, count, seed)):
+        stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number)
+        made.append(Entry(replace(measurement, stamp=stamp), epoch=epoch, monotonic_ns=1_000 + number))
+    return made
+
+
+def create(folder, given=None, *, name="rec.h5", settings=TINY):
+    """An open journal of ``rec.h5`` with measurements, each in a commit of its own."""
+    journal = Journal.create(folder / f"{name}{SUFFIX}", target=name, source="test")
+    for entry in entries() if given is None else given:
+        sensor = entry.measurement.stamp.sensor
+        if sensor not in journal.sensors:
+            journal.add_sensor(sensor, settings, firmware="1.2.3")
+        journal.append([entry])
+    return journal
+
+
+def crashed(folder, given=None, **options):
+    """The path of a journal as a process leaves it that is killed: its log is not yet in the main file."""
+    (folder / "running").mkdir()
+    with create(folder / "running", given, **options) as journal:
+        for path in (folder / "running").iterdir():
+            shutil.copy(path, folder)
+    shutil.rmtree(folder / "running")
+    return folder / journal.path.name
+
+
+def same(came, wanted):
+    """Whether an entry that was read is another one to the last bit, and has its CRC-32."""
+    words = [np.ascontiguousarray(entry.measurement.words) for entry in (came, wanted)]
+    return (
+        (came.epoch, came.monotonic_ns, came.measurement.stamp)
+        == (wanted.epoch, wanted.monotonic_ns, wanted.measurement.stamp)
+        and came.measurement.settings.air == wanted.measurement.settings.air
+        and words[0].dtype == words[1].dtype
+        and words[0].tobytes() == words[1].tobytes()
+        and came.crc32 == zlib.crc32(words[1].data)
+    )
+
+
+def python(code, *arguments, **options):
+    """Run Python in a process of its own."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, **options)

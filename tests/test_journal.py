@@ -1,0 +1,354 @@
+"""What a journal says it stored is there, bit by bit, whatever ends the process that stored it."""
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ertis_bench import kills
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.journal import TABLES, VERSION, Gap, InUseError, Journal
+from ertis_numba.journal._database import LOG_BYTES
+from ertis_numba.settings import Air, Array, Recording, Settings
+from tests.files import line
+from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python, same
+
+
+def both():
+    """Measurements of two sensors in turn, the first one in changing air."""
+    left, right = entries(), entries(2, sensor="right", first=0, seed=2)
+    warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
+    left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
+    return [left[0], right[0], left[1], left[2], right[1]]
+
+
+def test_measurements_come_back(tmp_path):
+    given = both()
+    with create(tmp_path, given) as journal:
+        assert all(entry.crc32 is not None for entry in given)
+    with Journal.open(journal.path) as journal:
+        assert len(journal) == 5
+        assert (journal.target, journal.source) == (tmp_path / "rec.h5", "test")
+        assert list(journal.sensors) == ["left", "right"]
+        assert all(same(*pair) for pair in zip(journal.entries(), given, strict=True))
+        right = [given[1], given[4]]
+        assert all(same(*pair) for pair in zip(journal.entries("right"), right, strict=True))
+        assert [key[1:] for key in journal.index("right")] == [("right", EPOCH, 0), ("right", EPOCH, 1)]
+        assert not next(journal.entries()).measurement.words.flags.writeable
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5.journal"]
+
+
+@pytest.mark.parametrize("settings", [line(40, 8), line(4, 16), line(70, 64), TINY.replace(array=Array())])
+def test_all_kinds_of_words(tmp_path, settings):
+    settings = settings.replace(recording=Recording(n_samples=2048))
+    given = entries(2, settings=settings)
+    with create(tmp_path, given, settings=settings) as journal:
+        back = list(journal.entries())
+    for came, wanted in zip(back, given, strict=True):
+        assert came.measurement.words.dtype == wanted.measurement.words.dtype
+        assert np.array_equal(came.measurement.words, wanted.measurement.words)
+
+
+def test_a_layout_file_is_not_needed_any_more(tmp_path):
+    layout = tmp_path / "layout.csv"
+    layout.write_text("0, 0\n10, 0\n0, 10\n")
+    settings = TINY.replace(array=Array(layout=str(layout)))
+    with create(tmp_path, [], settings=settings) as journal:
+        journal.add_sensor("left", settings, firmware="3.1.4", translation_m=(1, -2, 0.1), rotation_xyzw=(1, 0, 0, 0))
+    layout.unlink()
+    with Journal.open(journal.path) as journal:
+        sensor = journal.sensors["left"]
+    assert sensor.settings.array.positions_m[1][1] - sensor.settings.array.positions_m[0][1] == pytest.approx(0.01)
+    assert (sensor.translation_m, sensor.rotation_xyzw) == ((1.0, -2.0, 0.1), (1.0, 0.0, 0.0, 0.0))
+    assert sensor.firmware == "3.1.4"
+
+
+def test_gaps_are_kept(tmp_path):
+    with create(tmp_path) as journal:
+        journal.note_gap("left", 3, 3, "footer")
+        journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged")
+    with Journal.open(journal.path) as journal:
+        assert journal.gaps == (Gap("left", 3, 3, "footer"), Gap("left", 0, 2**63 - 1, "the sensor was unplugged"))
+
+
+def test_numbers_rise_within_an_epoch(tmp_path):
+    given = entries(3)
+    with create(tmp_path, given) as journal:
+        for late in (given[2], given[0]):
+            with pytest.raises(
+                ArgumentError, match=r"measurement \d+ of sensor left comes after 12; give them in order"
+            ):
+                journal.append([late])
+        journal.append(entries(1, first=0, epoch=9))
+        journal.append(entries(1, first=13))
+    with Journal.open(journal.path) as journal:
+        with pytest.raises(ArgumentError, match="measurement 13 of sensor left comes after 13"):
+            journal.append(entries(1, first=13))
+        assert [key.sequence for key in journal.index()] == [10, 11, 12, 0, 13]
+
+
+def test_all_of_an_append_or_nothing(tmp_path, monkeypatch):
+    with create(tmp_path) as journal:
+        with pytest.raises(ArgumentError, match="comes after"):
+            journal.append([*entries(2, first=20), *entries(1, first=5)])
+        execute = journal._database.execute  # noqa: SLF001  nobody else can ask
+
+        def fail_at_21(statement, values=()):
+            if values and values[2:3] == (21,):
+                raise DataError("the disk fails")
+            return execute(statement, values)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(journal._database, "execute", fail_at_21)  # noqa: SLF001  nobody else can ask
+            with pytest.raises(DataError, match="the disk fails"):
+                journal.append(entries(3, first=20))
+        journal.append([])
+        journal.append(entries(2, first=20))
+        assert [key.sequence for key in journal.index()] == [10, 11, 12, 20, 21]
+        assert len(journal) == 5
+
+
+BAD = {
+    "unknown sensor": (
+        lambda journal: journal.append(entries(1, sensor="right")),
+        "sensor 'right' is not in .*rec.h5.journal; add it first",
+    ),
+    "gap of it": (lambda journal: journal.note_gap("right", 1, 2, "x"), "sensor 'right' is not in .*; add it first"),
+    "entries of it": (lambda journal: list(journal.entries("right")), "sensor 'right' is not in .*; add it first"),
+    "gap backwards": (lambda journal: journal.note_gap("left", 2, 1, "x"), "last missing sequence number is 1; give"),
+    "no reason": (lambda journal: journal.note_gap("left", 1, 2, ""), "reason of a gap is ''; give a line of 1 to 64"),
+    "two lines": (lambda journal: journal.note_gap("left", 1, 2, "a\nb"), "reason of a gap is .*; give a line"),
+    "long reason": (lambda journal: journal.note_gap("left", 1, 2, "é" * 33), "reason of a gap is .*; give a line"),
+    "sensor twice": (
+        lambda journal: journal.add_sensor("left", TINY),
+        "sensor 'left' is in .* already; give each sensor a name of its own",
+    ),
+    "name": (lambda journal: journal.add_sensor("a/b", TINY), "sensor name 'a/b' cannot stand in a file"),
+    "mounting": (
+        lambda journal: journal.add_sensor("b", TINY, rotation_xyzw=(0, 0, 1, 1)),
+        "rotation_xyzw of sensor b has length 1.41421; give a unit quaternion",
+    ),
+    "directions": (
+        lambda journal: journal.add_sensor("b", TINY.replace(processing=TINY.processing.replace(directions="x.csv"))),
+        "processing.directions is the file x.csv, which a recording cannot hold",
+    ),
+    "size": (
+        lambda journal: journal.add_sensor("b", Settings(recording=Recording(n_samples=2**28))),
+        "a measurement of sensor b has 1074 MB, which a journal cannot hold; give fewer samples, 999 MB at most",
+    ),
+    "settings": (
+        lambda journal: journal.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),
+        "a measurement has other recording settings than sensor left; add a sensor for it",
+    ),
+    "shape": (
+        lambda journal: journal.append([spoilt(words=np.zeros(7, np.uint8))]),
+        r"a measurement of sensor left has shape \(7,\); give shape \(4096,\)",
+    ),
+    "type": (
+        lambda journal: journal.append([spoilt(words=np.zeros(4096, np.int16))]),
+        "a measurement of sensor left holds int16; give uint8",
+    ),
+    "stamp": (
+        lambda journal: journal.append([spoilt(timestamp_uncertainty_ns=2**32)]),
+        "timestamp_uncertainty_ns is 4294967296; give a whole number from 0",
+    ),
+}
+
+
+def spoilt(words=None, **changes):
+    """A measurement that does not fit to the others."""
+    (entry,) = entries(1, first=99)
+    measurement = entry.measurement
+    stamp = replace(measurement.stamp, **changes)
+    return replace(entry, measurement=Measurement(measurement.words if words is None else words, TINY, stamp))
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_does_not_fit_is_refused(tmp_path, name):
+    act, message = BAD[name]
+    with create(tmp_path) as journal:
+        with pytest.raises(ArgumentError, match=message):
+            act(journal)
+        assert (len(journal.index()), list(journal.sensors), journal.gaps) == (3, ["left"], ())
+
+
+def test_a_crc_of_the_sender_is_kept_and_compared(tmp_path):
+    (entry,) = entries(1)
+    entry.crc32 = 0x1234
+    with create(tmp_path, [entry]) as journal, pytest.raises(DataError, match=r"its record says 00001234: the journal"):
+        next(journal.entries())
+
+
+def test_threads_may_share_a_journal(tmp_path):
+    names = ["left", "right", "front"]
+    with create(tmp_path, []) as journal:
+
+        def work(name):
+            journal.add_sensor(name, TINY)
+            for entry in entries(8, sensor=name):
+                journal.append([entry])
+                journal.note_gap(name, 0, 1, "x")
+
+        threads = [threading.Thread(target=work, args=(name,)) for name in names]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for name in names:
+            assert [key.sequence for key in journal.index(name)] == list(range(10, 18))
+
+
+def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
+    with create(tmp_path, entries(1)) as journal:
+        wanted = {"synchronous": 2, "journal_mode": "wal", "locking_mode": "exclusive"}
+        assert {name: journal._database.execute(f"PRAGMA {name}")[0][0] for name in wanted} == wanted  # noqa: SLF001  nobody else can ask
+        journal.add_sensor("right", Settings())
+        most = 0
+        for entry in entries(20, sensor="right", settings=Settings()):
+            journal.append([entry])
+            most = max(most, (tmp_path / "rec.h5.journal-wal").stat().st_size)
+        assert LOG_BYTES / 2 < most < LOG_BYTES + 1_000_000
+        assert not (tmp_path / "rec.h5.journal-shm").exists()
+
+
+OPEN = """
+import sys
+from ertis_numba.journal import Journal, InUseError
+try:
+    Journal.open(sys.argv[1])
+except InUseError as error:
+    print(error)
+"""
+
+
+def test_nobody_else_can_open_it(tmp_path):
+    message = "is in use by another process, a capture or its sealing; wait until that has ended"
+    with create(tmp_path) as journal:
+        with pytest.raises(InUseError, match=message):
+            Journal.open(journal.path)
+        assert message in python(OPEN, journal.path).stdout
+        journal.append(entries(1, first=20))
+    assert python(OPEN, journal.path).stdout == ""
+
+
+HOLD = """
+import sys, time
+from tests.journals import create
+from pathlib import Path
+journal = create(Path(sys.argv[1]))
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_killed_process_holds_nothing(tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, tmp_path], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        with pytest.raises(InUseError):
+            Journal.open(tmp_path / "rec.h5.journal")
+        process.send_signal(signal.SIGKILL)
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
+        journal.append(entries(1, first=20))
+        assert len(journal) == 4
+
+
+@pytest.mark.parametrize("moment", ["file", "file and log", "tables"])
+def test_killed_while_it_was_made(tmp_path, moment):
+    """What there is then: an empty file; one that has become a database; one with tables and no sensor."""
+    path = tmp_path / "rec.h5.journal"
+    if moment == "tables":
+        create(tmp_path, []).close()
+    else:
+        path.touch()
+    if moment == "file and log":
+        assert not python(
+            "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('PRAGMA journal_mode = WAL')", path
+        ).stderr
+        assert path.stat().st_size
+    with Journal.open(path) as journal:
+        assert (len(journal), dict(journal.sensors), journal.target) == (0, {}, tmp_path / "rec.h5")
+        journal.add_sensor("left", TINY)
+        journal.append(entries())
+    with Journal.open(path) as journal:
+        assert len(journal) == 3
+
+
+def test_a_log_that_is_not_in_the_main_file_yet(tmp_path):
+    with Journal.open(crashed(tmp_path)) as journal:
+        assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
+
+
+def test_a_target_elsewhere(tmp_path):
+    elsewhere = tmp_path / "b" / "other.h5"
+    with Journal.create(tmp_path / "a", target=elsewhere) as journal:
+        with pytest.raises(DataError, match="b: No such file or directory; make the folder of the recording"):
+            journal.room()
+        elsewhere.parent.mkdir()
+        assert journal.room() > 0
+    with Journal.open(journal.path) as journal:
+        assert journal.target == elsewhere
+
+
+def test_an_older_journal_is_never_overwritten(tmp_path):
+    create(tmp_path).close()
+    with pytest.raises(
+        ArgumentError, match=r"rec.h5.journal exists, an interrupted capture left it; run 'ertis recover"
+    ):
+        create(tmp_path)
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        assert len(journal) == 3
+
+
+def test_closed(tmp_path):
+    journal = create(tmp_path)
+    journal.close()
+    journal.close()
+    with pytest.raises(DataError, match=r"rec.h5.journal is closed; open it again"):
+        journal.append(entries(1, first=20))
+
+
+@pytest.mark.parametrize("aside", [False, True])
+def test_removing_takes_all_of_it_away(tmp_path, aside):
+    with Journal.open(crashed(tmp_path)) as journal:
+        assert (tmp_path / "rec.h5.journal-wal").exists()
+        left = [journal.set_aside().name] if aside else journal.remove() or []
+    assert [path.name for path in tmp_path.iterdir()] == left
+    if aside:
+        crashed(tmp_path)
+        with Journal.open(tmp_path / "rec.h5.journal") as journal:
+            assert journal.set_aside().name == "rec.h5.journal.2.damaged"
+        for path in tmp_path.iterdir():
+            with Journal.open(path) as journal:
+                assert len(list(journal.entries())) == 3
+
+
+def test_processes_that_are_killed_lose_nothing(tmp_path):
+    found = kills.appending(tmp_path, seed=1, count=20)
+    assert found["told"] > 40
+    assert {name: found[name] for name in ("lost", "wrong", "unexpected")} == {"lost": 0, "wrong": 0, "unexpected": 0}
+
+
+def test_taking_measurements_in_loads_no_hdf5():
+    done = python("import ertis_numba.journal, sys; print(*sys.modules)")
+    assert not {"h5py", "scipy", "numba", "ertis_numba.storage"} & set(done.stdout.split())
+
+
+def test_tables_are_documented():
+    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    page = page[page.index("## Journal") :]
+    assert f"version {VERSION}" in page
+    for table, columns in TABLES.items():
+        told = re.findall(rf"^\| `{table}` \| `(\w+)` \| (\w+) \|([^|]*)\|", page, re.MULTILINE)
+        assert [(name, kind, units.strip()) for name, kind, units in told] == [
+            (column.name, column.kind, column.units) for column in columns
+        ]

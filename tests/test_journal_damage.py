@@ -1,0 +1,273 @@
+"""Journals that are not what they should be are refused in a line, and a full disk takes nothing away."""
+
+import resource
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.journal import Journal
+from ertis_numba.journal._tables import row_crc32
+from tests.journals import ENVIRONMENT, create, entries, python, same
+
+SPOIL = """
+import sqlite3, sys
+connection = sqlite3.connect(sys.argv[1])
+for statement in sys.argv[2:]:
+    connection.execute(statement)
+connection.commit()
+"""
+
+
+def spoil(path, *statements):
+    """Change a journal in the way of a failing disk that happens to obey SQL."""
+    done = python(SPOIL, path, *statements)
+    assert not done.stderr
+
+
+DAMAGED = {
+    "words": ("UPDATE measurements SET words = zeroblob(4096) WHERE id = 2", "measurement 11 of .* has CRC-32"),
+    "fewer words": ("UPDATE measurements SET words = x'00' WHERE id = 2", "measurement 11 of sensor left has CRC-32"),
+    "time": (
+        "UPDATE measurements SET timestamp_ns = 7 WHERE id = 2",
+        "the record of measurement 11 of sensor left has CRC-32 .*, wanted .*: the journal is damaged",
+    ),
+    "air": (
+        "UPDATE measurements SET temperature_c = 7 WHERE id = 2",
+        "the record of measurement 11 of sensor left has",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_measurement_leaves_the_others_readable(tmp_path, name):
+    statement, message = DAMAGED[name]
+    create(tmp_path).close()
+    spoil(tmp_path / "rec.h5.journal", statement)
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        keys = journal.index()
+        with pytest.raises(DataError, match=message):
+            journal.entry(keys[1])
+        wanted = entries()
+        assert same(journal.entry(keys[0]), wanted[0])
+        assert same(journal.entry(keys[2]), wanted[2])
+
+
+UNREADABLE = {
+    "header": ("DELETE FROM journal", "is damaged, it has no header; copy it again"),
+    "target": ("UPDATE journal SET target = x'00'", "the record of the journal has CRC-32"),
+    "settings": ("UPDATE sensors SET settings = ''", "the record of a sensor has CRC-32"),
+    "sensor": ("DELETE FROM sensors", "is damaged, it has no sensor 1; copy it again"),
+    "row": (
+        "UPDATE measurements SET id = 9 WHERE id = 3",
+        "is damaged, it lists 3 measurements and has 9; copy it again",
+    ),
+    "gap": ("UPDATE gaps SET reason = 'y'", "the record of a gap has CRC-32"),
+}
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_a_damaged_journal_is_refused(tmp_path, name):
+    statement, message = UNREADABLE[name]
+    with create(tmp_path) as journal:
+        journal.note_gap("left", 1, 1, "x")
+    spoil(tmp_path / "rec.h5.journal", statement)
+    with pytest.raises(DataError, match=message), Journal.open(tmp_path / "rec.h5.journal") as journal:
+        _ = journal.gaps
+
+
+def test_a_measurement_that_is_another_one(tmp_path):
+    create(tmp_path).close()
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        key = journal.index()[1]
+        for wrong in (key._replace(place=99), key._replace(sequence=12)):
+            with pytest.raises(DataError, match=r"has lost the record of measurement 1\d of sensor left"):
+                journal.entry(wrong)
+
+
+def test_one_damaged_bit_never_passes(tmp_path):
+    """Wherever it is, reading gives what was written or a `DataError` of one line."""
+    given = entries(4)
+    create(tmp_path, given).close()
+    path = tmp_path / "rec.h5.journal"
+    whole = path.read_bytes()
+    rng = np.random.default_rng(5)
+    refusals = []
+    used = np.flatnonzero(np.frombuffer(whole, np.uint8))  # most of the rest is not used
+    for place in rng.choice(used, 250):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.integers(0, 8)
+        path.write_bytes(damaged)
+        try:
+            with Journal.open(path) as journal:
+                assert (journal.target, journal.source) == (tmp_path / "rec.h5", "test")
+                assert journal.sensors["left"].firmware == "1.2.3"
+                assert all(same(*pair) for pair in zip(journal.entries(), given, strict=True))
+        except DataError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 100
+    assert all(str(path) in refusal and "\n" not in refusal for refusal in refusals)
+
+
+def test_settings_of_a_journal_that_cannot_be_used(tmp_path):
+    """As a newer version might write them that forgot to count itself up."""
+    create(tmp_path).close()
+    row = ("left", "[air]\nwind_m_s = 3.0\n", "", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    spoil(
+        tmp_path / "rec.h5.journal",
+        f"UPDATE sensors SET settings = '{row[1]}', firmware = '', row_crc32 = {row_crc32(row)}",
+    )
+    with pytest.raises(
+        DataError, match=r"rec.h5.journal: settings of sensor left, line 2, air: unknown key `wind_m_s`"
+    ):
+        Journal.open(tmp_path / "rec.h5.journal")
+
+
+FOREIGN = {
+    "nothing": (None, "No such file or directory; give a journal that 'ertis capture' left"),
+    "text": (b"abc" * 1000, "is not a journal .*; give a file that 'ertis capture' left"),
+    "empty file of another name": (b"", "is empty; give a journal that 'ertis capture' left"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_what_is_no_journal(tmp_path, name):
+    content, message = FOREIGN[name]
+    path = tmp_path / "rec.db"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        Journal.open(path)
+    assert content is None or path.read_bytes() == content
+
+
+def test_a_database_of_somebody_else_is_not_touched(tmp_path):
+    path = tmp_path / "their.journal"
+    spoil(path, "CREATE TABLE x (y)")
+    before = path.read_bytes()
+    with pytest.raises(DataError, match="is an SQLite file, but not a journal; give one that 'ertis capture' left"):
+        Journal.open(path)
+    assert path.read_bytes() == before
+
+
+def test_newer_version(tmp_path):
+    create(tmp_path).close()
+    spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 2")
+    with pytest.raises(FormatVersionError, match="has format version 2, this package reads up to 1; update"):
+        Journal.open(tmp_path / "rec.h5.journal")
+
+
+def test_no_place_for_a_journal(tmp_path):
+    with pytest.raises(DataError, match=r"none/rec.h5.journal: No such file or directory; give a place"):
+        Journal.create(tmp_path / "none" / "rec.h5.journal", target="rec.h5")
+
+
+def test_a_nearly_full_disk_is_left_enough_to_seal(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    with create(tmp_path) as journal:
+        with monkeypatch.context() as patch:
+            patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=9_500_000))
+            with pytest.raises(
+                DataError, match=r"has 9.5 MB free, wanted 9.\d MB so that rec.h5.journal can be sealed"
+            ):
+                journal.append(entries(1, first=20))
+            assert journal.room() == 0
+        assert len(journal) == len(journal.index()) == 3
+        journal.append(entries(1, first=20))  # once there is room
+        assert usage.free / 4 < journal.room() < usage.free / 2
+
+
+APPEND = """
+import sys
+from pathlib import Path
+from ertis_numba.errors import DataError
+from ertis_numba.journal import Journal, _room
+from ertis_numba.settings import Recording, Settings
+from tests.journals import create, entries, same
+settings = Settings(recording=Recording(n_samples=32_768))
+given = entries(200, settings=settings)
+if "unguarded" in sys.argv:
+    _room.require = lambda *_, **__: None
+journal = create(Path(sys.argv[1]), [])
+journal.add_sensor("left", settings)
+ballast = Path(sys.argv[1], "ballast")
+ballast.write_bytes(bytes(1_000_000))
+for number, entry in enumerate(given):
+    try:
+        journal.append([entry])
+    except DataError as error:
+        print(number, error, flush=True)
+        break
+ballast.unlink()
+if "freed" in sys.argv:
+    journal.append([given[number]])
+    number += 1
+assert all(same(*pair) for pair in zip(journal.entries(), given[:number], strict=True))
+journal.close()
+with Journal.open(journal.path) as journal:
+    assert all(same(*pair) for pair in zip(journal.entries(), given[:number], strict=True))
+"""
+
+
+def test_a_disk_that_fails(tmp_path):
+    """The limit on the size of a file stands for a disk that cannot be written."""
+    done = subprocess.run(
+        [sys.executable, "-c", APPEND, tmp_path, "unguarded"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000)),
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    number, _, message = done.stdout.partition(" ")
+    assert int(number) > 10
+    assert "rec.h5.journal cannot be written or read (disk I/O error); check the disk: what was" in message
+
+
+ON_A_SMALL_DISK = """
+mount -t tmpfs -o size=20m ertis "$1" || exit 99
+shift
+exec "$@"
+"""
+
+
+def on_a_small_disk(folder, code, *arguments):
+    """Run Python that sees a disk of 20 MB at ``folder``; with namespaces, that needs no rights."""
+    unshare = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", ON_A_SMALL_DISK, "sh", folder]
+    command = [*unshare, sys.executable, "-c", code, folder, *arguments]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    if done.returncode == 99 or "unshare: " in done.stderr:
+        pytest.skip(f"this system gives nobody a file system of his own: {done.stderr.strip()}")
+    assert (done.returncode, done.stderr) == (0, "")
+    number, _, message = done.stdout.partition(" ")
+    return int(number), message
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
+def test_a_full_disk(tmp_path):
+    number, message = on_a_small_disk(tmp_path, APPEND, "unguarded", "freed")
+    assert number > 60
+    assert "rec.h5.journal has no room on its disk; free some space: what was committed before is safe" in message
+
+
+SEAL = """
+import os
+from ertis_numba.storage import open_recording
+from ertis_numba.storage.sealing import seal
+sealed = seal(journal.path)
+with open_recording(sealed.recording) as recording:
+    assert [m.words.tobytes() for m in recording] == [entry.measurement.words.tobytes() for entry in given[:number]]
+assert os.listdir(sys.argv[1]) == ["rec.h5"]
+"""
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
+def test_what_a_small_disk_has_taken_can_be_sealed_there(tmp_path):
+    number, message = on_a_small_disk(tmp_path, APPEND + SEAL)
+    assert number > 10
+    assert "MB free, wanted" in message
+    assert "can be sealed with more in it; what it holds is safe: end the capture, or free some space" in message

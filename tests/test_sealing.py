@@ -1,0 +1,307 @@
+"""A journal becomes the recording that it should, whatever was there before and whoever is killed meanwhile."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ertis_bench import kills
+
+from ertis_numba import atomic
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.journal import InUseError, Journal
+from ertis_numba.settings import Air
+from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
+from ertis_numba.storage._gaps import UNKNOWN, Numbers
+from ertis_numba.storage.sealing import IN_USE, main, seal
+from tests.journals import TINY, crashed, create, entries, python
+from tests.test_journal_damage import spoil
+
+TURNED = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+
+
+def two_sensors(folder):
+    """A journal with measurements of two sensors in turn and gaps of all kinds; of a third sensor nothing came."""
+    left, right = entries(5), entries(2, sensor="right", first=0, seed=2)
+    warm = TINY.replace(air=Air(temperature_c=31.5))
+    left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
+    given = [left[0], right[0], left[1], right[1], left[4]]
+    with create(folder, []) as journal:
+        journal.add_sensor("left", TINY, firmware="1.2.3", translation_m=(1, -2, 0.5), rotation_xyzw=TURNED)
+        journal.add_sensor("absent", TINY)
+        journal.append(given[:1])
+        journal.add_sensor("right", TINY)
+        for entry in given[1:]:
+            journal.append([entry])
+        journal.note_gap("left", 12, 12, "footer")
+        journal.note_gap("left", 7, 9, "the sensor was unplugged")
+        journal.note_gap("right", 2, 5, "it never arrived")
+        journal.note_gap("absent", 0, 5, "it never arrived")
+    return journal.path, [entry.measurement for entry in given]
+
+
+def test_a_journal_becomes_a_recording(tmp_path):
+    path, given = two_sensors(tmp_path)
+    sealed = seal(path)
+    assert (sealed.recording, sealed.measurements, sealed.missing, sealed.damaged) == (tmp_path / "rec.h5", 5, 9, 0)
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+    assert sensor_names(tmp_path / "rec.h5") == ("left", "right")
+    with open_recording(tmp_path / "rec.h5", sensor="left") as left:
+        assert [(gap.first, gap.last, gap.reason) for gap in left.gaps] == [
+            (7, 9, "the sensor was unplugged"),
+            (12, 12, "footer"),
+            (13, 13, UNKNOWN),
+        ]
+        assert (left.firmware, left.translation_m.tolist()) == ("1.2.3", [1.0, -2.0, 0.5])
+        assert left.rotation_xyzw.tolist() == list(TURNED)
+        assert left.attributes["source"] == "test"
+        assert left.attributes["history"] == "sensor absent has no measurement; 0 to 5: it never arrived"
+        back = list(left)
+    with open_recording(tmp_path / "rec.h5", sensor="right") as right:
+        assert [(gap.first, gap.last, gap.reason) for gap in right.gaps] == [(2, 5, "it never arrived")]
+        back += list(right)
+    for came, wanted in zip(back, [given[i] for i in (0, 2, 4, 1, 3)], strict=True):
+        assert (came.stamp, came.settings.air) == (wanted.stamp, wanted.settings.air)
+        assert np.array_equal(came.words, wanted.words)
+
+
+def test_it_is_the_recording_that_would_have_been_written_at_once(tmp_path):
+    given = [entry.measurement for entry in entries()]
+    write_recording(tmp_path / "at_once.h5", given)
+    seal(crashed(tmp_path))
+    with open_recording(tmp_path / "at_once.h5") as one, open_recording(tmp_path / "rec.h5") as other:
+        assert one.uuid == other.uuid
+
+
+def test_what_was_sealed_is_not_written_again(tmp_path):
+    path, _ = two_sensors(tmp_path)
+    shutil.copy(path, tmp_path / "kept")
+    first = seal(path)
+    before = (tmp_path / "rec.h5").stat()
+    assert seal(path) == first  # killed after the journal had gone
+    shutil.copy(tmp_path / "kept", path)
+    (tmp_path / "rec.h5.sealing.part").touch()
+    (tmp_path / "rec.h5.12345678.part").touch()  # of somebody else
+    assert seal(path) == first
+    after = (tmp_path / "rec.h5").stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["kept", "rec.h5", "rec.h5.12345678.part"]
+
+
+OTHERS = {
+    "no recording": lambda path, _: path.write_bytes(b"mine"),
+    "one less": lambda path, given: write_recording(path, given[:-1]),
+    "one more": lambda path, given: write_recording(path, [*given, entries(9)[8].measurement]),
+    "another sensor": lambda path, given: write_recording(path, [*given, entries(1, sensor="right")[0].measurement]),
+    "other words": lambda path, given: write_recording(
+        path, [*given[:-1], replace(given[-1], words=given[-1].words ^ 1)]
+    ),
+    "another time": lambda path, given: write_recording(
+        path, [*given[:-1], replace(given[-1], stamp=replace(given[-1].stamp, timestamp_ns=7))]
+    ),
+    "another place": lambda path, given: write_recording(path, given, mounting={"left": ((1, 0, 0), (0, 0, 0, 1))}),
+    "another gap": lambda path, given: with_gap(path, given),
+}
+
+
+def with_gap(path, given):
+    """A recording that says that something is missing at its end."""
+    with RecordingWriter(path) as writer:
+        for measurement in given:
+            writer.write(measurement)
+        writer.note_gap("left", 20, 20, "footer")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_file_with_other_content_is_left_alone(tmp_path, name):
+    with create(tmp_path, []) as journal:
+        journal.add_sensor("left", TINY)
+        journal.append(entries())
+    OTHERS[name](tmp_path / "rec.h5", [entry.measurement for entry in entries()])
+    before = (tmp_path / "rec.h5").read_bytes()
+    with pytest.raises(DataError, match=r"rec.h5 exists and holds something else than .*rec.h5.journal; move it, or"):
+        seal(journal.path)
+    assert (tmp_path / "rec.h5").read_bytes() == before
+    assert seal(journal.path, overwrite=True).measurements == 3
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+@pytest.mark.parametrize("tables", [True, False])
+def test_nothing_was_measured(tmp_path, tables, capsys):
+    path = tmp_path / "rec.h5.journal"
+    if tables:
+        with create(tmp_path, []) as journal:
+            journal.add_sensor("left", TINY)
+    else:
+        path.touch()
+    assert main([str(path)]) == 1
+    assert capsys.readouterr().err == f"{path}: no measurement was captured\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_measurement_is_a_gap_and_the_journal_is_kept(tmp_path, capsys):
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE id = 2")
+    shutil.copy(path, tmp_path / "kept")
+    assert main([str(path)]) == 0
+    told = capsys.readouterr()
+    assert told.out == f"{tmp_path / 'rec.h5'}\n"
+    assert told.err == f"1 measurement is damaged; the journal is kept as {path}.damaged\n"
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == [10, 12]
+        assert [(gap.first, gap.last, gap.reason) for gap in recording.gaps] == [(11, 11, "damaged in the journal")]
+    shutil.move(tmp_path / "kept", path)
+    assert seal(path).set_aside == tmp_path / "rec.h5.journal.2.damaged"  # killed in between: the same recording
+
+
+def test_all_measurements_are_damaged(tmp_path):
+    create(tmp_path, [*entries(2), *entries(1, sensor="right")]).close()
+    path = tmp_path / "rec.h5.journal"
+    spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE sensor = 1")
+    shutil.copy(path, tmp_path / "kept")
+    for _ in range(2):  # written, then found to be there already
+        sealed = seal(path)
+        assert (sealed.measurements, sealed.damaged) == (1, 2)
+        assert sensor_names(tmp_path / "rec.h5") == ("right",)
+        shutil.copy(tmp_path / "kept", path)
+    spoil(path, "UPDATE measurements SET words = zeroblob(4096)")
+    (tmp_path / "rec.h5").unlink()
+    with pytest.raises(DataError, match="rec.h5.journal: all 3 measurements are damaged; copy it again if you can"):
+        seal(path)
+    assert path.exists()
+    assert not (tmp_path / "rec.h5").exists()
+
+
+def test_a_journal_in_use(tmp_path, capsys):
+    with create(tmp_path) as journal:
+        with pytest.raises(InUseError, match="is in use by another process"):
+            seal(journal.path)
+        assert main([str(journal.path), "--json"]) == IN_USE
+        assert json.loads(capsys.readouterr().out)["in_use"] is True
+        assert len(list(journal.entries())) == 3
+
+
+def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
+    path = crashed(tmp_path)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
+    assert main([str(path)]) == 1
+    assert "has 5.0 MB free, wanted 0.0 MB and 8 MB to spare; free some space" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
+    assert seal(path).measurements == 3
+
+
+@pytest.mark.parametrize("place", ["a folder", "nowhere"])
+def test_no_place_for_the_recording(tmp_path, place):
+    with Journal.create(tmp_path / "rec.h5.journal", target="there/rec.h5") as journal:
+        journal.add_sensor("left", TINY)
+        (tmp_path / "there").mkdir()
+        journal.append(entries())
+    if place == "a folder":
+        (tmp_path / "there" / "rec.h5").mkdir()
+    else:
+        (tmp_path / "there").rmdir()
+    with pytest.raises(ArgumentError, match=r"output .* is a folder; give|there is no folder .*there; make it"):
+        seal(journal.path)
+    assert journal.path.exists()
+
+
+def test_a_process_of_its_own(tmp_path):
+    path, _ = two_sensors(tmp_path)
+    code = "import runpy; runpy.run_module('ertis_numba.storage.sealing', run_name='__main__')"
+    done = python(code, path, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    *progress, result = map(json.loads, done.stdout.splitlines())
+    assert progress == [{"done": number + 1, "of": 5} for number in range(5)]
+    assert (result["recording"], result["measurements"], result["missing"]) == (str(tmp_path / "rec.h5"), 5, 9)
+    assert python(code, path).stdout == f"{tmp_path / 'rec.h5'}\n"
+    done = python(code, tmp_path / "none.journal")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert (
+        done.stderr
+        == f"{tmp_path / 'none.journal'}: No such file or directory; give a journal that 'ertis capture' left\n"
+    )
+
+
+def test_interrupted(tmp_path, monkeypatch):
+    path = crashed(tmp_path)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RecordingWriter, "write", interrupt)
+    assert main([str(path)]) == 130
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
+
+
+def test_processes_that_are_killed_leave_no_broken_file(tmp_path):
+    found = kills.sealing(tmp_path, seed=1, count=16)
+    assert found["late"] < 8
+    assert {name: found[name] for name in ("broken", "different", "left_over")} == {
+        "broken": 0,
+        "different": 0,
+        "left_over": 0,
+    }
+
+
+def naive_gaps(numbers, noted):
+    """What is missing, one number after the other."""
+    reasons = {}
+    for first, last, reason in sorted(noted, key=lambda item: item[0]):
+        for number in range(first, last + 1):
+            reasons.setdefault(number, reason)
+    for number in range(min(numbers), max(numbers)):
+        reasons.setdefault(number, UNKNOWN)
+    return {number: reason for number, reason in reasons.items() if number not in numbers}
+
+
+def test_gaps_are_those_of_a_naive_count():
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        present = np.flatnonzero(rng.random(40) < rng.random()).tolist() or [7]
+        noted = []
+        for _ in range(rng.integers(0, 6)):
+            first = int(rng.integers(0, 45))
+            noted.append((first, first + int(rng.integers(0, 12)), str(rng.choice(["a", "b"]))))
+        numbers = Numbers()
+        for number in present:
+            numbers.add(number)
+        missing = numbers.missing(noted)
+        told = {number: reason for first, last, reason in missing for number in range(first, last + 1)}
+        assert told == naive_gaps(set(present), noted)
+        assert sum(last - first + 1 for first, last, _ in missing) == len(told)
+        for before, after in zip(missing, missing[1:], strict=False):
+            assert before[1] < after[0]
+            assert before[1] + 1 < after[0] or before[2] != after[2]  # joined where they can be
+
+
+def test_gaps_where_numbers_start_again():
+    numbers = Numbers()
+    for number in (5, 6, 0, 1, 4):
+        numbers.add(number)
+    assert numbers.missing([(6, 7, "footer")]) == [(2, 3, UNKNOWN), (6, 7, "footer")]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "reason", "message"),
+    [
+        ("left", "x" * 65, "reason of a gap is .*; give a line of 1 to 64 bytes"),
+        ("right", "x", "a gap is given for sensor 'right', of which no measurement came"),
+    ],
+)
+def test_gaps_that_no_recording_can_hold(tmp_path, sensor, reason, message):
+    with pytest.raises(ArgumentError, match=message), RecordingWriter(tmp_path / "rec.h5") as writer:
+        writer.write(entries(1)[0].measurement)
+        writer.note_gap(sensor, 1, 2, reason)
+    assert not list(tmp_path.iterdir())
+
+
+def test_firmware_of_a_sensor_of_which_nothing_came(tmp_path):
+    with (
+        pytest.raises(ArgumentError, match="firmware is given for sensor 'right', of which no measurement came"),
+        RecordingWriter(tmp_path / "rec.h5", firmware={"right": "1"}) as writer,
+    ):
+        writer.write(entries(1)[0].measurement)
