@@ -1,5 +1,6 @@
 """A journal becomes the recording that it should, whatever was there before and whoever is killed meanwhile."""
 
+import itertools
 import json
 import shutil
 from dataclasses import replace
@@ -89,6 +90,14 @@ def test_what_was_sealed_is_not_written_again(tmp_path):
     assert sorted(item.name for item in tmp_path.iterdir()) == ["kept", "rec.h5", "rec.h5.12345678.part"]
 
 
+def with_gap(path, given, *, sensor="left", reason="footer"):
+    """A recording that says that something is missing at its end."""
+    with RecordingWriter(path) as writer:
+        for measurement in given:
+            writer.write(measurement)
+        writer.note_gap(sensor, 20, 20, reason)
+
+
 OTHERS = {
     "no recording": lambda path, _: path.write_bytes(b"mine"),
     "one less": lambda path, given: write_recording(path, given[:-1]),
@@ -101,16 +110,8 @@ OTHERS = {
         path, [*given[:-1], replace(given[-1], stamp=replace(given[-1].stamp, timestamp_ns=7))]
     ),
     "another place": lambda path, given: write_recording(path, given, mounting={"left": ((1, 0, 0), (0, 0, 0, 1))}),
-    "another gap": lambda path, given: with_gap(path, given),
+    "another gap": with_gap,
 }
-
-
-def with_gap(path, given):
-    """A recording that says that something is missing at its end."""
-    with RecordingWriter(path) as writer:
-        for measurement in given:
-            writer.write(measurement)
-        writer.note_gap("left", 20, 20, "footer")
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -168,7 +169,7 @@ def test_all_measurements_are_damaged(tmp_path):
         shutil.copy(tmp_path / "kept", path)
     spoil(path, "UPDATE measurements SET words = zeroblob(4096)")
     (tmp_path / "rec.h5").unlink()
-    with pytest.raises(DataError, match="rec.h5.journal: all 3 measurements are damaged; copy it again if you can"):
+    with pytest.raises(DataError, match=r"rec.h5.journal: all 3 measurements are damaged; copy it again if you can"):
         seal(path)
     assert path.exists()
     assert not (tmp_path / "rec.h5").exists()
@@ -273,7 +274,7 @@ def test_gaps_are_those_of_a_naive_count():
         told = {number: reason for first, last, reason in missing for number in range(first, last + 1)}
         assert told == naive_gaps(set(present), noted)
         assert sum(last - first + 1 for first, last, _ in missing) == len(told)
-        for before, after in zip(missing, missing[1:], strict=False):
+        for before, after in itertools.pairwise(missing):
             assert before[1] < after[0]
             assert before[1] + 1 < after[0] or before[2] != after[2]  # joined where they can be
 
@@ -293,9 +294,8 @@ def test_gaps_where_numbers_start_again():
     ],
 )
 def test_gaps_that_no_recording_can_hold(tmp_path, sensor, reason, message):
-    with pytest.raises(ArgumentError, match=message), RecordingWriter(tmp_path / "rec.h5") as writer:
-        writer.write(entries(1)[0].measurement)
-        writer.note_gap(sensor, 1, 2, reason)
+    with pytest.raises(ArgumentError, match=message):
+        with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
     assert not list(tmp_path.iterdir())
 
 

@@ -375,8 +375,8 @@ def test_listening_stops_at_once(armed):
     stop, stopped = threading.Event(), []
 
     def end():
-        stop.set()
         stopped.append(time.monotonic())
+        stop.set()
 
     timer = threading.Timer(0.1, end)
     timer.start()

@@ -163,16 +163,16 @@ def _emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
     command = [*_ERTIS, "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
     environment = os.environ | {"ERTIS_EMULATED_DIR": str(folder / "emulated")}
     n_sensors = len(Scene.load(source).sensors) if source.suffix == ".toml" else len(sensor_names(source))
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)  # noqa: S603
-    try:
-        assert process.stdout is not None  # noqa: S101  it is a pipe
-        lines = [process.stdout.readline() for _ in range(n_sensors)]
-        if not all(lines):
-            raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see what it said above")
-        yield [json.loads(line)["link"] for line in lines]
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(_WAIT_S)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:  # noqa: S603
+        try:
+            assert process.stdout is not None  # noqa: S101  it is a pipe
+            lines = [process.stdout.readline() for _ in range(n_sensors)]
+            if not all(lines):
+                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see what it said above")
+            yield [json.loads(line)["link"] for line in lines]
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(_WAIT_S)
 
 
 def _ports(ports: list[str]) -> list[str]:
@@ -195,14 +195,13 @@ def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
 def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
     """Start a capture, kill it and all that it has started some time after its first line, return what it printed."""
     command = [*_ERTIS, "capture", *_ports(ports), "-o", str(target), "--rate", "20", "--json", "--quiet", "-n", "16"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603
-    assert process.stdout is not None  # noqa: S101  it is a pipe
-    first = process.stdout.readline()
-    time.sleep(after_s)  # the moment is what is random here
-    ended = process.poll() is not None
-    process.kill()
-    lines = [json.loads(line) for line in [first, *process.stdout.readlines()] if line.endswith("\n")]
-    process.wait(_WAIT_S)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
+        assert process.stdout is not None  # noqa: S101  it is a pipe
+        first = process.stdout.readline()
+        time.sleep(after_s)  # the moment is what is random here
+        ended = process.poll() is not None
+        process.kill()
+        lines = [json.loads(line) for line in [first, *process.stdout.readlines()] if line.endswith("\n")]
     sealing = target.with_name(f"{target.name}.journal").exists() and len(lines) >= 16
     moments["after the end" if ended else "while it sealed" if sealing else "while it captured"] += 1
     return [line for line in lines if line["event"] == "stored"]

@@ -17,10 +17,12 @@ from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.commands import LENGTH_STEP
 from ertis_numba.storage import open_recording
 
-__all__ = ["LONG", "SHORT", "Extent", "run"]
+__all__ = ["LONG", "ONE_SENSOR", "SHORT", "Extent", "run", "small_disk", "wire"]
 
 _ROOT = Path(__file__).parents[2]
-_ONE_SENSOR = _ROOT / "data" / "synthetic" / "reflectors.h5"
+ONE_SENSOR = _ROOT / "data" / "synthetic" / "reflectors.h5"
+"""What is captured, where one sensor will do."""
+
 _DISK_MB = 20
 
 
@@ -47,7 +49,7 @@ class Extent:
     n_seal_kills: int
 
 
-SHORT = Extent(duration_s=5.0, n_groups=20, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5)
+SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5)
 LONG = Extent(duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200)
 
 
@@ -63,27 +65,27 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
         platform.write_text(captures.platform(4, n_measurements=5).to_toml())
         say(f"capturing at 20 Hz for {extent.duration_s:g} s")
         report["sustained"] = captures.sustained(
-            _ONE_SENSOR, _new(folder, "sustained"), duration_s=extent.duration_s, rate_hz=20.0
+            ONE_SENSOR, _new(folder, "sustained"), duration_s=extent.duration_s, rate_hz=20.0
         )
         say(f"{extent.n_groups} pulses to four sensors")
         report["chain"] = captures.chain(platform, _new(folder, "chain"), n_groups=extent.n_groups, rate_hz=10.0)
         say(f"{extent.n_blocks} faulty blocks")
-        report["wire"] = _wire(extent.n_blocks, seed)
+        report["wire"] = wire(extent.n_blocks, seed)
         say(f"{extent.n_unplugs} times without its plug")
-        report["unplugs"] = captures.unplugs(_ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
+        report["unplugs"] = captures.unplugs(ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
         say(f"{extent.n_kills} captures killed")
-        report["kills"] = captures.kills(_ONE_SENSOR, _new(folder, "kills"), seed=seed, count=extent.n_kills)
+        report["kills"] = captures.kills(ONE_SENSOR, _new(folder, "kills"), seed=seed, count=extent.n_kills)
         say(f"{extent.n_seal_kills} sealings killed")
         report["seal_kills"] = kills.sealing(_new(folder, "sealing"), seed=seed, count=extent.n_seal_kills)
         say(f"a disk of {_DISK_MB} MB")
         with small_disk(_new(folder, "disk")) as disk:
-            report["disk_full"] = None if disk is None else captures.disk_full(_ONE_SENSOR, folder, disk)
+            report["disk_full"] = None if disk is None else captures.disk_full(ONE_SENSOR, folder, disk)
     return report
 
 
-def _wire(n_blocks: int, seed: int) -> dict[str, Any]:
+def wire(n_blocks: int, seed: int) -> dict[str, Any]:
     """Send blocks of the least length, with the words of a sensor, over a line with faults."""
-    with open_recording(_ONE_SENSOR) as recording:
+    with open_recording(ONE_SENSOR) as recording:
         words = recording[0].words
     check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ)
     return asdict(wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check))

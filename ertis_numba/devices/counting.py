@@ -8,11 +8,13 @@ from typing import Final
 
 from ertis_numba.devices.blocks import Block
 
-__all__ = ["CounterCheck"]
+__all__ = ["BURST", "CounterCheck"]
+
+BURST: Final = 0.75
+"""Of the shortest interval: what comes later than this after a block's first byte is of another trigger."""
 
 _NUMBERS: Final = 2**32
 _MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
-_BURST = 0.75  # of the shortest interval: what comes later than this after a block's first byte is of another trigger
 _AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
 _UNHEARD = 2  # triggers in a row of which nothing may have come, where no later block tells
 _INTERVALS = 8  # remembered; of these …
@@ -86,7 +88,7 @@ class CounterCheck:
 
     def heard(self, at_ns: int) -> None:
         """Note that bytes came, whatever they are."""
-        if not self._burst_ns or at_ns - self._burst_ns[-1] >= _BURST * self._shortest_ns:
+        if not self._burst_ns or at_ns - self._burst_ns[-1] >= BURST * self._shortest_ns:
             self._burst_ns.append(at_ns)
 
     def judge(self, block: Block, rejected: float) -> list[tuple[Block, bool]]:
@@ -140,7 +142,7 @@ class CounterCheck:
             self._settle(held[-2:], entry)
             self._accept(entry)
         else:
-            if any(self._fits(last, each) and self._fits(each, entry) for each in held):
+            if any(self._is_between(last, each, entry) for each in held):
                 self._settle([], entry)
             elif len(held) == _MOST_HELD:
                 unlikely = [each for each in held if not self._fits(last, each)]
@@ -153,8 +155,7 @@ class CounterCheck:
         held, self._held = self._held, []
         for index, entry in enumerate(held):
             following = next((later for later in held[index:] if later in sure), end)
-            before = self._last is None or self._fits(self._last, entry)
-            if entry in sure or (before and self._fits(entry, following)):
+            if entry in sure or self._last is None or self._is_between(self._last, entry, following):
                 self._accept(entry)
             else:
                 self._reject(entry)
@@ -202,6 +203,12 @@ class CounterCheck:
         passed = _elapsed_ns(first, second) / typical_ns
         count = round(passed)
         return count if 1 <= count <= _FAR and abs(passed - count) <= _NEAR else None
+
+    def _is_between(self, first: _Entry, second: _Entry, third: _Entry) -> bool:
+        """Whether a number goes between two that are right, as it does where one is missing."""
+        if _ahead(first, second) == 1 == _ahead(second, third):
+            return True
+        return self._fits(first, second) and self._fits(second, third)
 
     def _fits(self, first: _Entry, second: _Entry) -> bool:
         """Whether nothing speaks against two numbers both being right."""

@@ -1,5 +1,6 @@
 """Measurements out of the bytes that a sensor sends: no input, no output and no clock in here."""
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
@@ -9,21 +10,21 @@ from numpy.typing import NDArray
 
 from ertis_numba.devices.blocks import Block, Instant
 from ertis_numba.devices.commands import FOOTER, FRAME_BYTES, HEADER
-from ertis_numba.devices.counting import CounterCheck
+from ertis_numba.devices.counting import BURST, CounterCheck
 
 __all__ = ["Block", "BlockParser", "Instant", "Receiver"]
 
 _HEADER: Final = HEADER.to_bytes(4, "little")
 _FOOTER: Final = FOOTER.to_bytes(4, "little")
-_MOST_SKIPPED = 256  # numbers by which a block that cut another short is ahead of it; random bits look so once in 1e11
+_MOST_SKIPPED = 256  # numbers by which a block that cut another one short is ahead of it
 
 
 class BlockParser:
     """Finds blocks in a stream of bytes, however it is cut into pieces: framing only.
 
     A block is header, counter, words, footer. What has a header but no footer is searched again from just behind
-    the header, so that damage costs no block but its own. The header of a block to come within a block means that
-    the sum of two damaged ones has the right length by chance.
+    the header, so that damage costs no block but its own. Two damaged blocks may by chance have the right length
+    together; the second one's header tells, which came later and has a number to come.
 
     ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time.
 
@@ -31,6 +32,8 @@ class BlockParser:
     ----------
     n_samples : int
         Words of a block.
+    apart_s : float
+        What came so long after a block's first byte may be of another one; never by default.
 
     Attributes
     ----------
@@ -43,11 +46,11 @@ class BlockParser:
         Headers by the reason for which no block was found behind them.
     """
 
-    def __init__(self, n_samples: int) -> None:
+    def __init__(self, n_samples: int, *, apart_s: float = math.inf) -> None:
         self.n_bytes = 4 * n_samples + FRAME_BYTES
         self.rejected: Counter[str] = Counter()
         self.rejected_blocks: Counter[str] = Counter()
-        self._n_samples = n_samples
+        self._n_samples, self._apart_ns = n_samples, apart_s * 1e9
         self._data = bytearray()  # begins with a header, or is the beginning of one
         self._reason = "no header"  # for which bytes up to the next header are rejected
         self._position = 0  # of the first of them in the stream
@@ -105,13 +108,19 @@ class BlockParser:
         footer = self.n_bytes - len(_FOOTER)
         if self._data[footer : self.n_bytes] != _FOOTER:
             return "footer"
-        counter = self._counter(0)
+        if self._pieces[-1][1].monotonic_ns - self._pieces[0][1].monotonic_ns < self._apart_ns:
+            return None
         place = self._data.find(_HEADER, len(_HEADER), footer)
         while place >= 0:
-            if (self._counter(place) - counter) % 2**32 <= _MOST_SKIPPED:
+            if self._is_apart(place) and (self._counter(place) - self._counter(0)) % 2**32 <= _MOST_SKIPPED:
                 return "cut short"
             place = self._data.find(_HEADER, place + 1, footer)
         return None
+
+    def _is_apart(self, place: int) -> bool:
+        """Whether a byte came so late that it may be of another block than the first."""
+        arrived = next(arrived for end, arrived in self._pieces if end > self._position + place)
+        return arrived.monotonic_ns - self._pieces[0][1].monotonic_ns >= self._apart_ns
 
     def _counter(self, place: int) -> int:
         """Return the counter behind the header at ``place``."""
@@ -185,7 +194,7 @@ class Receiver:
         shortest_s: float,
         bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
     ) -> None:
-        self._parser = BlockParser(n_samples)
+        self._parser = BlockParser(n_samples, apart_s=BURST * shortest_s)
         self._counters = CounterCheck(shortest_s=shortest_s, expected=expected)
         self._bits = bits
         self._rejected_blocks: Counter[str] = Counter()

@@ -1,0 +1,75 @@
+"""What is lost when things go wrong: the short form of what `ertis bench reliability --long` tries for an hour."""
+
+import secrets
+
+import pytest
+from ertis_bench import captures, kills, reliability
+
+from ertis_numba.errors import DataError
+
+SHORT = reliability.SHORT
+SOURCE = reliability.ONE_SENSOR
+
+
+@pytest.fixture
+def seed():
+    """Another one in each run, printed where a test fails."""
+    drawn = secrets.randbits(31)
+    print(f"seed {drawn}")  # noqa: T201
+    return drawn
+
+
+def test_nothing_is_lost_of_a_sustained_capture(tmp_path):
+    found = captures.sustained(SOURCE, tmp_path, duration_s=SHORT.duration_s, rate_hz=20.0)
+    assert found["stored"] > 12 * SHORT.duration_s  # a busy emulator ignores pulses while it still measures
+    assert (found["lost"], found["wrong"]) == (0, 0)
+
+
+def test_groups_of_a_sync_chain_are_complete(tmp_path):
+    platform = tmp_path / "platform.toml"
+    platform.write_text(captures.platform(4, n_measurements=3).to_toml())
+    found = captures.chain(platform, tmp_path, n_groups=SHORT.n_groups, rate_hz=10.0)
+    assert (found["groups"], found["mixed"], found["wrong"]) == (SHORT.n_groups, 0, 0)
+    assert found["complete"] >= SHORT.n_groups - 1  # the first pulse may come while sensors are being armed
+
+
+def test_no_fault_on_the_wire_is_taken_for_a_measurement(seed):
+    found = reliability.wire(SHORT.n_blocks, seed)
+    assert found["spoilt"] > SHORT.n_blocks / 3
+    assert found["delivered"] >= found["untouched"] > SHORT.n_blocks / 3
+    assert found["untouched_lost"] == found["mixed"] == found["wrong_counter"] == found["twice"] == 0
+
+
+def test_a_pulled_plug(tmp_path, seed):
+    found = captures.unplugs(SOURCE, tmp_path, seed=seed, count=SHORT.n_unplugs)
+    assert (found["noticed"], found["wrong"]) == (SHORT.n_unplugs, 0)
+    assert found["slowest_s"] < 3.0
+
+
+def test_killed_captures(tmp_path, seed):
+    found = captures.kills(SOURCE, tmp_path, seed=seed, count=SHORT.n_kills)
+    assert found["reported"] > 0
+    assert (found["lost"], found["wrong"], found["unreadable"], found["left over"]) == (0, 0, 0, 0)
+
+
+def test_killed_sealings(tmp_path, seed):
+    found = kills.sealing(tmp_path, seed=seed, count=SHORT.n_seal_kills)
+    assert (found["broken"], found["lost"]) == (0, 0)
+
+
+def test_a_full_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    with reliability.small_disk(disk) as mounted:
+        if mounted is None:
+            pytest.skip("only root may mount a small disk")
+        found = captures.disk_full(SOURCE, tmp_path, mounted)
+    assert found["exit code"] == 1
+    assert found["reported"] > 0
+    assert (found["lost"], found["wrong"]) == (0, 0)
+    assert "free some space" in found["said"]
+
+
+def test_an_emulator_that_does_not_start_is_told(tmp_path):
+    with pytest.raises((DataError, OSError)):
+        captures.sustained(tmp_path / "none.h5", tmp_path, duration_s=1.0, rate_hz=20.0)
