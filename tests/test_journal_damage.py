@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import DataError, FormatVersionError
-from ertis_numba.journal import Journal
+from ertis_numba.journal import InUseError, Journal
+from ertis_numba.journal._database import Database
 from ertis_numba.journal._tables import row_crc32
 from tests.journals import ENVIRONMENT, create, entries, python, same
 
@@ -151,6 +152,26 @@ def test_a_database_of_somebody_else_is_not_touched(tmp_path):
     with pytest.raises(DataError, match="is an SQLite file, but not a journal; give one that 'ertis capture' left"):
         Journal.open(path)
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, again):
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    execute = Database.execute
+
+    def too_late(self, statement, values=()):
+        if statement == "BEGIN EXCLUSIVE":
+            path.unlink()
+            if again:
+                (tmp_path / "new").touch()  # made while the old one is open: it is another file for sure
+                (tmp_path / "new").rename(path)
+        return execute(self, statement, values)
+
+    monkeypatch.setattr(Database, "execute", too_late)
+    with pytest.raises(InUseError, match="was removed or replaced by another process; look again"):
+        Journal.open(path)
+    assert path.exists() == again
 
 
 def test_newer_version(tmp_path):

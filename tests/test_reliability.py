@@ -3,7 +3,7 @@
 import secrets
 
 import pytest
-from ertis_bench import captures, kills, reliability
+from ertis_bench import captures, reliability
 
 from ertis_numba.errors import DataError
 
@@ -19,6 +19,7 @@ def seed():
     return drawn
 
 
+@pytest.mark.alone
 def test_nothing_is_lost_of_a_sustained_capture(tmp_path):
     found = captures.sustained(SOURCE, tmp_path, duration_s=SHORT.duration_s, rate_hz=20.0)
     assert found["stored"] > 12 * SHORT.duration_s  # a busy emulator ignores pulses while it still measures
@@ -50,11 +51,6 @@ def test_killed_captures(tmp_path, seed):
     found = captures.kills(SOURCE, tmp_path, seed=seed, count=SHORT.n_kills)
     assert found["reported"] > 0
     assert (found["lost"], found["wrong"], found["unreadable"], found["left over"]) == (0, 0, 0, 0)
-
-
-def test_killed_sealings(tmp_path, seed):
-    found = kills.sealing(tmp_path, seed=seed, count=SHORT.n_seal_kills)
-    assert (found["broken"], found["lost"]) == (0, 0)
 
 
 def test_a_full_disk(tmp_path):

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ertis_numba.devices.bits import BitCheck
-
 from ertis_bench import captures, kills, machine, wire_faults
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
+from ertis_numba.devices.bits import BitCheck
 from ertis_numba.devices.commands import LENGTH_STEP
 from ertis_numba.storage import open_recording
 
@@ -38,7 +37,10 @@ class Extent:
         Pulses of the SYNC chain.
     n_blocks : int
         With faults on the wire.
-    n_unplugs, n_kills, n_seal_kills : int
+    n_unplugs : int
+    n_kills : int
+        Of captures, and as many of processes that do nothing but write a journal.
+    n_seal_kills : int
     """
 
     duration_s: float
@@ -75,8 +77,10 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
         report["unplugs"] = captures.unplugs(ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
         say(f"{extent.n_kills} captures killed")
         report["kills"] = captures.kills(ONE_SENSOR, _new(folder, "kills"), seed=seed, count=extent.n_kills)
+        say(f"{extent.n_kills} writers of a journal killed")
+        report["journals"] = kills.appending(_new(folder, "journals"), seed=seed, count=extent.n_kills)
         say(f"{extent.n_seal_kills} sealings killed")
-        report["seal_kills"] = kills.sealing(_new(folder, "sealing"), seed=seed, count=extent.n_seal_kills)
+        report["seals"] = kills.sealing(_new(folder, "sealing"), seed=seed, count=extent.n_seal_kills)
         say(f"a disk of {_DISK_MB} MB")
         with small_disk(_new(folder, "disk")) as disk:
             report["disk_full"] = None if disk is None else captures.disk_full(ONE_SENSOR, folder, disk)

@@ -74,6 +74,7 @@ class Database:
                 self.is_new = self._take(before, empty=empty)
         except BaseException:
             self._connection.close()
+            self._require_there(before)  # which would explain the error
             raise
 
     def _take(self, before: os.stat_result, *, empty: bool) -> bool:
@@ -82,9 +83,7 @@ class Database:
         self.execute("PRAGMA locking_mode = EXCLUSIVE")
         self.execute("BEGIN EXCLUSIVE")
         self.execute("COMMIT")
-        now = self._path.stat()  # who locked it before may have sealed and removed it
-        if (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
-            raise InUseError(f"{self._path} was replaced by another process; try again")
+        self._require_there(before)
         ((application,),), ((version,),), ((n_tables,),) = map(
             self.execute, ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_schema")
         )
@@ -98,6 +97,12 @@ class Database:
         for statement in _SETUP:
             self.execute(statement)
         return is_new
+
+    def _require_there(self, before: os.stat_result) -> None:
+        """Refuse a file that has lost its name: who had locked it may have sealed and removed it."""
+        now = self._path.stat() if self._path.exists() else None
+        if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
+            raise InUseError(f"{self._path} was removed or replaced by another process; look again")
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
