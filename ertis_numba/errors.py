@@ -6,7 +6,8 @@
     ├── ArgumentError (ValueError)       a value given by the caller cannot be used
     │   └── SettingsError                a settings file or structure cannot be used
     ├── DataError (ValueError)           a file or measurement does not hold what it should
-    │   └── FormatVersionError           a file was written by a newer version
+    │   ├── FormatVersionError           a file was written by a newer version
+    │   └── InUseError                   a journal belongs to another process
     ├── DeviceError (RuntimeError)       the compute device asked for is not there
     └── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
         └── SonarGoneError               it was unplugged
@@ -20,6 +21,7 @@ __all__ = [
     "DeviceError",
     "ErtisError",
     "FormatVersionError",
+    "InUseError",
     "SettingsError",
     "SonarError",
     "SonarGoneError",
@@ -44,6 +46,10 @@ class DataError(ErtisError, ValueError):
 
 class FormatVersionError(DataError):
     """A file was written by a newer version of this package."""
+
+
+class InUseError(DataError):
+    """A journal belongs to another process: a capture that runs, or what seals it."""
 
 
 class DeviceError(ErtisError, RuntimeError):

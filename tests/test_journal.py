@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from ertis_bench import kills
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DataError, InUseError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import TABLES, VERSION, Gap, InUseError, Journal
+from ertis_numba.journal import TABLES, VERSION, Gap, Journal
 from ertis_numba.journal._database import LOG_BYTES
 from ertis_numba.settings import Air, Array, Recording, Settings
 from tests.files import line
@@ -220,7 +220,8 @@ def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
 
 OPEN = """
 import sys
-from ertis_numba.journal import Journal, InUseError
+from ertis_numba.errors import InUseError
+from ertis_numba.journal import Journal
 try:
     Journal.open(sys.argv[1])
 except InUseError as error:

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from ertis_numba.errors import DataError, FormatVersionError
-from ertis_numba.journal import InUseError, Journal
+from ertis_numba.errors import DataError, FormatVersionError, InUseError
+from ertis_numba.journal import Journal
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._tables import row_crc32
 from tests.journals import ENVIRONMENT, create, entries, python, same

@@ -10,8 +10,8 @@ import pytest
 from ertis_bench import kills
 
 from ertis_numba import atomic
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.journal import InUseError, Journal
+from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.journal import Journal
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, Numbers

@@ -18,15 +18,17 @@ _CHAIN = (
     "{complete:,} of {groups:,} groups complete, {mixed} mixed, {lost} lost, {wrong} wrong",
 )
 _WIRE = (
-    "{sent:,} blocks, {spoilt:,} with faults: bytes lost, added, changed, swapped; blocks cut, doubled, dropped; "
-    "stalls and pulled plugs; read in pieces of 1 to 4,095 bytes",
+    (
+        "{sent:,} blocks, {spoilt:,} with faults: bytes lost, added, changed, swapped; blocks cut, doubled, dropped; "
+        "stalls and pulled plugs; read in pieces of 1 to 4,095 bytes"
+    ),
     "0 false accepts; 0 untouched lost",
     "{false_accepts} displaced, mixed, wrongly numbered or repeated blocks accepted; {untouched_lost} untouched lost",
 )
 _ALTERED = (
-    "of these, {altered:,} whole ones in which words were exchanged for others",
+    "of these, whole ones in which words were exchanged for others",
     "nothing in a block tells but its bits",
-    "{refused:,} refused, {altered_accepted:,} accepted",
+    "{altered:,} accepted; {altered_unchecked:,} where the bits are not checked",
 )
 _UNPLUGS = (
     "unplugged {unplugged} times while it measured",
@@ -60,7 +62,7 @@ def reliability(report: dict[str, Any]) -> str:
     wire = report["wire"]
     counted = wire | {
         "false_accepts": wire["mixed"] + wire["wrong_counter"] + wire["twice"],
-        "refused": wire["altered"] - wire["altered_accepted"],
+        "altered_unchecked": report["wire_unchecked"]["altered"],
     }
     rows = [
         _row(_ONE, report["sustained"]),

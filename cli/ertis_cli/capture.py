@@ -100,10 +100,9 @@ def capture(
         _print_commands(setup, as_json=as_json)
         return
     _require_one_each(ports, names)
-    from ertis_numba.devices.bits import BitCheck
-
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
+    from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.sonar import Sonar
     from ertis_numba.journal import SUFFIX, Journal
 

@@ -19,12 +19,20 @@ def seal_apart(journal: Path, *, overwrite: bool) -> Path:
     DataError
         It failed; the journal is still there.
     """
-    command = [sys.executable, "-m", "ertis_numba.storage.sealing", str(journal), *(["--force"] if overwrite else [])]
+    # -P: a file in the current folder that is named like one of Python's must not be taken for it.
+    command = [sys.executable, "-P", "-m", "ertis_numba.storage.sealing", str(journal)]
     done = subprocess.run(  # noqa: S603  this very package
-        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, start_new_session=True
+        [*command, *(["--force"] if overwrite else [])],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        start_new_session=True,
     )
     if done.returncode:
         lines = done.stderr.strip().splitlines()
         reason = lines[-1] if lines else f"the process that seals it ended with {done.returncode}"
+        if not journal.exists():  # there was nothing in it
+            raise DataError(reason)
         raise DataError(f"{reason}; the measurements are safe in {journal}, seal them by 'ertis recover {journal}'")
     return Path(done.stdout.strip())

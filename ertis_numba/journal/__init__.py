@@ -1,8 +1,7 @@
 """Where measurements become durable before anything else is done with them. The only door to sqlite3."""
 
-from ertis_numba.journal._database import InUseError
 from ertis_numba.journal._journal import SUFFIX, Journal
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 
-__all__ = ["SUFFIX", "TABLES", "VERSION", "Column", "Entry", "Gap", "InUseError", "Journal", "Key", "Sensor"]
+__all__ = ["SUFFIX", "TABLES", "VERSION", "Column", "Entry", "Gap", "Journal", "Key", "Sensor"]

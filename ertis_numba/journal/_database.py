@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.errors import DataError, FormatVersionError, InUseError
 from ertis_numba.journal._tables import APPLICATION_ID, VERSION, layout
 
-__all__ = ["LOG_BYTES", "PAGE_BYTES", "Database", "InUseError"]
+__all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
 
 PAGE_BYTES: Final = 32_768  # of 4 to 64 KiB, it takes the least time for measurements of 128 KiB to 1 MiB
 LOG_BYTES: Final = 4_194_304  # of the write-ahead log; then what is in it moves to the main file
@@ -37,10 +37,6 @@ _TOLD: Final = {
     sqlite3.SQLITE_CORRUPT: "is damaged ({}); copy it again if you can",
     sqlite3.SQLITE_NOTADB: "is not a journal ({}); give a file that 'ertis capture' left",
 }
-
-
-class InUseError(DataError):
-    """A journal belongs to another process: a capture that runs, or what seals it."""
 
 
 class Database:

@@ -20,9 +20,9 @@ from typing import ClassVar, TextIO
 import numpy as np
 
 from ertis_numba.atomic import part_of, sync
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.errors import DataError, ErtisError, InUseError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import SUFFIX, InUseError, Journal, Sensor
+from ertis_numba.journal import SUFFIX, Journal, Sensor
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import RecordingReader, RecordingWriter, open_recording
