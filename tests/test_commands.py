@@ -13,6 +13,7 @@ from ertis_numba.devices import commands
 from ertis_numba.devices.commands import Command, Setup
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.settings import Array, Call, Recording, Settings
+from ertis_numba.waveform import call_samples
 from tests.cases import LINE_8
 
 NUMBERS = st.integers(0, 2**32 - 1)
@@ -176,6 +177,7 @@ def test_the_codes_of_a_call():
         slope = (high - low) / duration_s
         phase = 2 * math.pi / slope * (math.log(low + time_s * slope) - math.log(low))
         assert abs(codes[sample] - math.floor(2047 * math.sin(phase) + 2048)) <= 1
+    assert codes.tolist() == [math.floor(2047 * value + 2048) for value in call_samples(call).tolist()]
     assert codes[0] == codes[-1] == 2048
     assert 1 <= codes.min() < 10
     assert 4085 < codes.max() <= 4095
@@ -253,6 +255,12 @@ def test_what_no_sensor_can_do_is_refused(changes, message):
     with pytest.raises(ArgumentError, match=message) as caught:
         Setup.of(settings)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("n_samples", [64, 65_535])
+def test_the_shortest_and_the_longest_call_suit_a_sensor(n_samples):
+    setup = Setup.of(Settings().replace(**_call(duration_s=(n_samples - 1) / 450_000)))
+    assert setup.before_call()[-1] == Command("E", n_samples)
 
 
 @pytest.mark.parametrize(

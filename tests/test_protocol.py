@@ -115,12 +115,12 @@ def test_two_damaged_blocks_that_have_the_right_length_together_are_none(later_s
 
 
 def test_rejected_bytes_have_reasons():
-    parser, _ = fed(b"abc" + block_of(1) + b"de" + block_of(2)[:-2])
-    assert parser.rejected == {"no header": 5}
+    parser, _ = fed(b"abc" + block_of(0)[:-1] + block_of(1) + b"de" + block_of(2)[:-2])
+    assert parser.rejected == {"no header": 5, "footer": N_BYTES - 1}
     assert parser.missing == 2
     assert parser.expire() == []
-    assert parser.rejected == {"no header": 5, "cut short": N_BYTES - 2}
-    assert parser.rejected_blocks == {"cut short": 1}
+    assert parser.rejected == {"no header": 5, "footer": N_BYTES - 1, "cut short": N_BYTES - 2}
+    assert parser.rejected_blocks == {"cut short": 1, "footer": 1}
     assert parser.missing == 0
 
 
@@ -312,14 +312,96 @@ def test_a_wrong_first_number_is_recovered_from():
     assert found == [2**20, *range(1, 40)]
 
 
-def test_blocks_that_follow_but_are_all_damaged_between_are_followed():
-    """Stray bytes come between any two, at irregular times: neither clock nor bursts can tell."""
-    junk = [(time_s - 0.005, b"stray") for time_s in IRREGULAR[1:]] + [
-        (time_s - 0.04, b"s") for time_s in IRREGULAR[1:]
-    ]
-    found, receiver = heard(sorted(stream_of(IRREGULAR) + junk))
+def with_strays(stream):
+    """Stray bytes come between any two, so that neither clock nor bursts can tell how many triggers there were."""
+    times_s = [time_s for time_s, _ in stream[1:]]
+    return sorted(stream + [(time_s - early_s, b"stray") for time_s in times_s for early_s in (0.005, 0.04)])
+
+
+def test_blocks_between_which_there_are_strays_follow_all_the_same():
+    found, receiver = heard(with_strays(stream_of(IRREGULAR)))
     assert found == list(range(40))
     assert receiver.lost == 0
+
+
+def test_a_sensor_that_begins_anew_is_followed_between_strays():
+    stream = stream_of(IRREGULAR)[:5] + [(time_s, block_of(index)) for index, time_s in enumerate(IRREGULAR[5:])]
+    found, _ = heard(with_strays(stream))
+    assert found == [
+        *range(5),
+        *range(18, 17 + 35),
+    ]  # of its first two one agrees with the third; the other might be wrong
+
+
+def test_a_pulse_that_a_sensor_has_missed_is_no_gap():
+    """The number that follows is taken at once although the clock says that it should be another."""
+    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    times_s = REGULAR[:20] + REGULAR[21:30] + REGULAR[33:]
+    for time_s, data in stream_of(times_s):
+        assert len(receiver.feed(data, at(time_s))) == 1
+    assert receiver.lost == 0
+
+
+@pytest.mark.parametrize("times_s", [REGULAR, IRREGULAR])
+def test_numbers_may_go_by_twos(times_s):
+    """A sensor that counts pulses but serves every second one, from some moment on."""
+    stream = stream_of(times_s)[:10]
+    stream += [(time_s, block_of(FIRST + 10 + 2 * index)) for index, time_s in enumerate(times_s[10:])]
+    found, receiver = heard(stream)
+    assert found == [*range(10), *range(10, 70, 2)]
+    assert receiver.lost == 29
+    assert not receiver.rejected
+
+
+def test_two_that_agree_over_a_damaged_one_are_taken_at_once():
+    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    for index, (time_s, data) in enumerate(stream_of(IRREGULAR)[:24]):
+        if index != 20:
+            found = receiver.feed(data[:-9] if index == 22 else data, at(time_s))
+    assert counters(found) == [FIRST + 21 - 2**32, FIRST + 23 - 2**32]
+
+
+def test_a_true_number_outlives_many_wrong_ones():
+    stream = stream_of(IRREGULAR)
+    for index, wrong in ((22, 2**20), (23, 2**21), (24, 2**29)):
+        stream[index] = (stream[index][0], block_of(FIRST + index + wrong))
+    found, receiver = heard(stream[:20] + stream[21:])
+    assert found == [index for index in range(40) if index not in {20, 22, 23, 24}]
+    assert receiver.rejected_blocks == {"counter": 3}
+
+
+@pytest.mark.parametrize("times_s", [REGULAR, IRREGULAR])
+def test_a_number_of_a_damaged_block_is_not_another_ones(times_s):
+    """The counter of the block behind a damaged one is flipped to just that one's number."""
+    stream = stream_of(times_s)
+    stream[20] = (stream[20][0], stream[20][1][:-9])
+    stream[21] = (stream[21][0], block_of(FIRST + 20, np.zeros(N_SAMPLES)))
+    expected = [index for index in range(40) if index not in {20, 21}]
+    assert heard(stream)[0] == expected
+    assert heard(stream[:22] + stream[23:])[0] == [index for index in expected if index != 22]
+
+
+def test_a_number_of_a_damaged_block_is_not_another_ones_in_the_end():
+    stream = stream_of(REGULAR)
+    stream[20] = (stream[20][0], stream[20][1][:-9])
+    stream[21] = (stream[21][0], block_of(FIRST + 20))
+    assert heard(stream[:22])[0] == list(range(20))
+
+
+def test_bytes_that_come_late_are_no_trigger_of_their_own():
+    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    sent = [block_of(FIRST + index) for index in range(3)]
+    assert receiver.feed(sent[0][:15], at(0.0)) == []
+    assert len(receiver.feed(sent[0][15:], at(0.035))) == 1
+    assert receiver.feed(sent[1][:15], at(0.1)) == []
+    assert len(receiver.feed(sent[2], at(0.27))) == 1
+    assert receiver.lost == 1
+
+
+def test_what_comes_all_at_once_is_counted_by_its_bytes_in_the_end():
+    """The program was stopped for a while: a dozen damaged blocks and a whole one wait for it."""
+    waiting = b"".join(block_of(FIRST + index)[:-1] for index in range(1, 13))
+    assert heard([(0, block_of(FIRST)), (1, waiting + block_of(FIRST + 13))])[0] == [0, 13]
 
 
 def test_a_copy_is_not_taken():
@@ -332,6 +414,7 @@ def test_a_copy_is_not_taken():
 def test_numbers_that_have_room_are_taken_in_the_end_and_others_are_not():
     stream = stream_of(IRREGULAR)
     assert heard([*stream[:20], stream[21]])[0] == [*range(20), 21]
+    assert heard([*stream[:20], stream[30]])[0] == list(range(20))
     found, receiver = heard([*stream[:20], (stream[20][0], block_of(FIRST + 120))])
     assert found == list(range(20))
     assert receiver.rejected == {"counter": N_BYTES}
@@ -354,6 +437,19 @@ def test_after_a_counter_was_set_its_number_or_the_next_comes(first, taken):
 def test_any_first_number_is_taken_where_none_is_expected():
     receiver = Receiver(N_SAMPLES, shortest_s=SHORTEST_S)
     assert counters(receiver.feed(block_of(123_456), at(0))) == [123_456]
+
+
+def test_after_a_counter_was_set_strays_and_damaged_blocks_are_no_hindrance():
+    strays = [(0.1 * index, b"stray") for index in range(5)]
+    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    for time_s, data in strays:
+        receiver.feed(data, at(time_s))
+    assert len(receiver.feed(block_of(FIRST), at(0.5))) == 1
+    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    for index in range(5):
+        receiver.feed(block_of(FIRST + index)[:-1], at(0.1 * index))
+    assert len(receiver.feed(block_of(FIRST + 5), at(0.5))) == 1
+    assert receiver.lost == 5
 
 
 def test_what_is_expected_comes_next_and_what_was_before_does_not():
@@ -440,6 +536,8 @@ def test_notes_tell_what_was_done(kind):
         assert spoilt.note.startswith(f"{kind} {fault.n_bytes} at {fault.place}")
         assert spoilt.data == _as_told(block, fault, spoilt)
         assert kind != "duplicate" or spoilt.data == 2 * block
+        assert kind != "swap" or len(spoilt.data) == len(block)
+        assert kind in {"duplicate", "add"} or fault.place + fault.n_bytes <= len(block)
         if kind not in {"stall", "unplug", "swap", "cut"}:
             assert spoilt.data != block
         assert any(isinstance(piece, Stall) for piece in spoilt.pieces) == (kind == "stall")

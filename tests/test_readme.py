@@ -1,10 +1,11 @@
-"""What the README and the pages on simulation say runs."""
+"""What the README and the pages on simulation and sensors say runs."""
 
 import contextlib
 import importlib.metadata
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,23 +14,29 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import COMMANDS, cli
 
+from ertis_numba.storage import open_recording
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SIMULATION = (ROOT / "docs" / "simulation.md").read_text()
+DEVICES = (ROOT / "docs" / "devices.md").read_text()
 PAGES = (
     "README.md",
     "docs/accuracy.md",
     "docs/beamformers.md",
+    "docs/devices.md",
     "docs/formats.md",
     "docs/gallery.md",
     "docs/health.md",
+    "docs/reliability.md",
     "docs/simulation.md",
 )
 
 
 @pytest.fixture
-def place(tmp_path):
+def place(tmp_path, monkeypatch):
     """A folder with the files that the README's commands name."""
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     (tmp_path / "data").symlink_to(ROOT / "data")
     real = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     shutil.copy(str(real), tmp_path / "RAW.bin")
@@ -37,10 +44,24 @@ def place(tmp_path):
     return tmp_path
 
 
-def run(place, *command):
+def environment(place):
     paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench"))
-    environment = os.environ | {"PYTHONPATH": paths, "MPLCONFIGDIR": str(place)}
-    return subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True)
+    return os.environ | {"PYTHONPATH": paths, "MPLCONFIGDIR": str(place)}
+
+
+def run(place, *command):
+    return subprocess.run(command, cwd=place, env=environment(place), capture_output=True, text=True, check=True)
+
+
+@contextlib.contextmanager
+def in_background(place, command):
+    """Run a command that ends with ``&`` until the block ends; it has told its ports when the block begins."""
+    words = [sys.executable, "-m", "ertis_cli.main", *command.removesuffix("&").split()]
+    with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith("/dev/")
+        yield
+        process.send_signal(signal.SIGTERM)
+        process.communicate()
 
 
 def test_python_lines(place):
@@ -64,18 +85,39 @@ def commands_in(page):
 def test_commands(place):
     """Each in a process of its own where it is shown first."""
     started = set()
-    for command in commands_in(README):
-        name, *arguments = command.split()
-        if (place / "REC.h5").exists() and "REC.h5" in arguments and name in {"import", "simulate"}:
-            (place / "REC.h5").unlink()  # each of the two ways to a recording is shown
-        if name in started:
-            run_here(place, command)
-        else:
-            run(place, sys.executable, "-m", "ertis_cli.main", name, *arguments)
-        started.add(name)
+    with contextlib.ExitStack() as background:
+        for command in commands_in(README):
+            name, *arguments = command.split()
+            if (place / "REC.h5").exists() and "REC.h5" in arguments and name in {"import", "simulate"}:
+                (place / "REC.h5").unlink()  # each of the two ways to a recording is shown
+            if arguments and arguments[-1] == "&":
+                background.enter_context(in_background(place, command))
+            elif name in started:
+                run_here(place, command)
+            else:
+                run(place, sys.executable, "-m", "ertis_cli.main", name, *arguments)
+            started.add(name)
     assert started == {*COMMANDS} - {"bench"}
     assert (place / "picture.png").stat().st_size > 10_000
     assert (place / "shelf.png").stat().st_size > 10_000
+
+
+def test_page_on_devices(place):
+    with contextlib.ExitStack() as background:
+        for command in commands_in(DEVICES):
+            if command.endswith("&"):
+                background.enter_context(in_background(place, command))
+            else:
+                run_here(place, command)
+    with open_recording(place / "BOTH.h5", sensor="east") as recording:
+        assert len(recording) >= 19  # the first pulse may come while sensors are being armed
+
+
+def test_example(place):
+    """The nearest of the strong reflectors of the recording that is emulated."""
+    with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
+        told = run(place, sys.executable, "-W", "error", str(ROOT / "examples" / "1_nearest_reflector.py"), "sensor")
+    assert told.stdout.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
 
 def test_page_on_simulation(place):

@@ -341,6 +341,24 @@ def test_a_byte_that_is_lost_costs_one_measurement():
         assert sonar.receiver.rejected == {"cut short": BLOCK_BYTES - 1}
 
 
+def test_a_command_that_is_lost_does_not_shift_the_numbers():
+    """Each measurement has one of its own, even if the device has not counted."""
+    counters = []
+
+    def deaf_once(line, write):
+        obedient(line, write)
+        if line.startswith(b"!B"):
+            counters.append(int(line.split(b",")[1]))
+        elif line.startswith(b"!A") and len(counters) > 1:
+            write(encode_block(counters[-1], WORDS[1]))
+
+    with Fake(deaf_once) as device, Sonar.open(device.port) as sonar:
+        sonar.configure(Setup.of(SETTINGS))
+        with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
+            sonar.measure()
+        assert is_block(sonar.measure(), 1, WORDS[1])
+
+
 @pytest.mark.usefixtures("device")
 def test_bits_that_cannot_be_true():
     with Sonar.open("left") as sonar:
@@ -390,8 +408,10 @@ def test_closing_ends_listening_and_disarms(armed, device):
     timer.start()
     assert list(armed.listen(stop=lambda: False, timeout_s=TIMEOUT_S)) == []
     timer.join()
-    with Sonar.open("left"):
-        assert device.registers.armed == 0
+    with serial.Serial(device.port, timeout=TIMEOUT_S) as port:
+        port.write(b"!L,0,0,0\n")
+        assert len(port.read(4)) == 4  # now it has heard what closing said
+    assert device.registers.armed == 0
     with pytest.raises(SonarError, match="was closed; open it again"):
         armed.disarm()
 

@@ -72,6 +72,7 @@ class BitCheck:
         self._mean, self._change = (
             Filter(n_samples, np.ones(MEAN_OF, dtype=np.int16), 1 / MEAN_OF, MEAN_OF) for _ in range(2)
         )
+        self._squares = np.empty_like(self._mean(self._words))
         self._splices = Splices(n_samples, pdm_rate_hz) if Splices.can_tell(pdm_rate_hz) else None
 
     def check(self, words: NDArray[np.uint32]) -> str | None:
@@ -105,7 +106,7 @@ class BitCheck:
         # Not by BLAS, whose threads take longer to meet on busy cores than all of this takes.
         weights = (moving / moving.sum()).astype(np.float32)
         share = np.einsum("m,mn->n", weights, change)[1:-2]  # 1 where all bits change each time, -1 where none does
-        power = np.einsum("m,mn->n", weights, np.square(mean))[1:-2]
+        power = np.einsum("m,mn->n", weights, np.square(mean, out=self._squares))[1:-2]
         if self._stops(share, moving):
             return "constant bits"
         if self._is_off(np.median(mean[:, ::_EVERY], axis=1), moving):

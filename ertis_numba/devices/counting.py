@@ -16,7 +16,7 @@ BURST: Final = 0.75
 _NUMBERS: Final = 2**32
 _MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
 _AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
-_UNHEARD = 2  # triggers in a row of which nothing may have come, where no later block tells
+_UNHEARD = 4  # triggers in a row of which nothing may have come, where no later block tells
 _INTERVALS = 8  # remembered; of these …
 _ALIKE = 6  # … so many …
 _REGULAR = 0.03  # … are so near their median, as a share of it, where triggers are regular
@@ -142,9 +142,12 @@ class CounterCheck:
             self._settle(held[-2:], entry)
             self._accept(entry)
         else:
+            is_full = len(held) == _MOST_HELD
+            if is_full:
+                self._intervals_ns.clear()  # it may be the clock that is wrong: triggers have become others
             if any(self._is_between(last, each, entry) for each in held):
                 self._settle([], entry)
-            elif len(held) == _MOST_HELD:
+            elif is_full:
                 unlikely = [each for each in held if not self._fits(last, each)]
                 held.remove(worst := [*unlikely, *held][0])
                 self._reject(worst)

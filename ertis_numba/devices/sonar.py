@@ -168,10 +168,9 @@ class Sonar:
             self._line.drain(within_s=deadline_s)
         if self._is_late:  # should that measurement still come, its number tells
             self._line.ask(Command("B", self._next))
-        number = self._next
-        receiver.expect(number)
+        receiver.expect(self._next)
         self._line.send(Command("A", int(setup.active if active is None else active)).encode())
-        self._next, self._is_late = (number + 1) % _COUNTS, True  # whatever becomes of it, its number is used up
+        self._next, self._is_late = (self._next + 1) % _COUNTS, True  # whatever becomes of it, its number is used up
         began, read = time.monotonic(), 0
         while time.monotonic() - began <= deadline_s:
             data, arrived = self._line.receive(receiver.missing)
@@ -179,7 +178,6 @@ class Sonar:
             blocks = receiver.feed(data, arrived)
             if data and not (blocks or receiver.missing):
                 blocks = receiver.finish()  # no other block will come to decide
-                receiver.expect(number)  # that was none: what is late does not count as a trigger
             if blocks:
                 return self._counted(blocks[-1])
         receiver.expire()

@@ -28,9 +28,9 @@ MEAN_OF = 31
 """Samples over which means of bits are taken."""
 
 _LEAST_RATE_HZ = 4e6  # at the slower clock modulators are quiet below 40 kHz only, where sound is
-_BAND_HZ, _TAPS = (90e3, 130e3), 255  # above all calls, below the noise that modulators push upwards
+_BAND_HZ, _TAPS = (90e3, 130e3), 207  # above all calls, below the noise that modulators push upwards
 _HIGH_BAND_HZ, _HIGH_TAPS = (125e3, 180e3), 151
-_KAISER = 5.0
+_KAISER = 4.0
 _STEP = 30  # samples of the words: 150 kHz, which leaves 75 to 150 kHz in order
 _EVERY = 16  # samples of the band of which the noise is a median
 _SPAN = 4  # samples of the band, in which all of an impulse lies
@@ -139,15 +139,15 @@ class Splices:
             return False
         band *= np.where(moving, 1 / np.where(moving, noise, 1), 0).astype(np.float32)[:, None]
         band = band.reshape(_LANES, -1, band.shape[1])[lanes]
-        total = np.cumsum(np.einsum("lmn,lmn->ln", band, band), axis=1, dtype=np.float64)
-        power = (total[:, _SPAN:] - total[:, :-_SPAN]) / (_SPAN * counts[lanes, None])  # of the samples after each
+        each = np.einsum("lmn,lmn->ln", band, band) / (_SPAN * counts[lanes, None]).astype(np.float32)
+        power = sum((each[:, n : n - _SPAN] for n in range(1, _SPAN)), each[:, :-_SPAN])
         level = _level(power)
         above = np.sum(power > _RISE * level, axis=0) >= _LEAST_LANES
         above[: self._edge] = above[-self._edge :] = False
         variance = float(np.mean(noise[moving] ** 2)) * self._noise_gain
         for top in _tops(np.flatnonzero(above), power, level):
             around = float(np.median(level[:, top]))
-            at = round((top + (_SPAN + 1) / 2) * _STEP)
+            at = round((top + (_SPAN - 1) / 2) * _STEP)
             if around < _MOST_OVER_LEVEL and self._is_splice(words, mean, moving, at, variance * around):
                 return True
         return False
