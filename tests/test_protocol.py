@@ -315,22 +315,22 @@ def test_a_wrong_first_number_is_recovered_from():
 def with_strays(stream):
     """Stray bytes come between any two, so that neither clock nor bursts can tell how many triggers there were."""
     times_s = [time_s for time_s, _ in stream[1:]]
-    return sorted(stream + [(time_s - early_s, b"stray") for time_s in times_s for early_s in (0.005, 0.04)])
+    return sorted(stream + [(time_s - early_s, b"stray") for time_s in times_s for early_s in (0.05, 0.1, 0.15)])
+
+
+SPARSE = np.cumsum(0.2 + np.random.default_rng(6).exponential(0.2, 40)).tolist()
 
 
 def test_blocks_between_which_there_are_strays_follow_all_the_same():
-    found, receiver = heard(with_strays(stream_of(IRREGULAR)))
+    found, receiver = heard(with_strays(stream_of(SPARSE)))
     assert found == list(range(40))
     assert receiver.lost == 0
 
 
 def test_a_sensor_that_begins_anew_is_followed_between_strays():
-    stream = stream_of(IRREGULAR)[:5] + [(time_s, block_of(index)) for index, time_s in enumerate(IRREGULAR[5:])]
+    stream = stream_of(SPARSE)[:5] + [(time_s, block_of(index)) for index, time_s in enumerate(SPARSE[5:])]
     found, _ = heard(with_strays(stream))
-    assert found == [
-        *range(5),
-        *range(18, 17 + 35),
-    ]  # of its first two one agrees with the third; the other might be wrong
+    assert found == [*range(5), *range(17, 17 + 35)]
 
 
 def test_a_pulse_that_a_sensor_has_missed_is_no_gap():
@@ -401,7 +401,7 @@ def test_bytes_that_come_late_are_no_trigger_of_their_own():
 def test_what_comes_all_at_once_is_counted_by_its_bytes_in_the_end():
     """The program was stopped for a while: a dozen damaged blocks and a whole one wait for it."""
     waiting = b"".join(block_of(FIRST + index)[:-1] for index in range(1, 13))
-    assert heard([(0, block_of(FIRST)), (1, waiting + block_of(FIRST + 13))])[0] == [0, 13]
+    assert heard([(0, block_of(FIRST)), (0, waiting + block_of(FIRST + 13))])[0] == [0, 13]
 
 
 def test_a_copy_is_not_taken():
