@@ -158,6 +158,24 @@ def test_an_unplugged_sensor_comes_back(captures, words, trigger):
         assert all(zlib.crc32(measurement.words.tobytes()) in sent for measurement in recording)
 
 
+def test_a_counter_that_begins_anew_is_counted_on(captures):
+    """As after a power cut that nobody has noticed."""
+    capture = captures(trigger="sync")
+    runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
+    with SyncChain(capture.emulators, rate_hz=20.0):
+        runner.start()
+        capture.wait_for(12)
+        capture.emulators[0].registers.counter = 3
+        capture.wait_for(len(capture.stored) + 12)
+        capture.session.stop()
+        runner.join(10)
+    sequences = [stamp.sequence for stamp in capture.stored]
+    assert sequences == sorted(set(sequences))
+    assert sequences[-1] < 60
+    with capture.recording() as recording:
+        assert sum(gap.last - gap.first + 1 for gap in recording.gaps) == sequences[-1] + 1 - len(sequences) < 5
+
+
 def test_a_sensor_that_stays_away_ends_the_capture(captures):
     capture = captures(rate_hz=20.0, patience_s=0.5)
     runner_error = []

@@ -70,8 +70,8 @@ class Counts:
 class _Track:
     """Where one sensor's numbers are."""
 
-    counter: int | None = None  # without wrap-around
-    first: int | None = None
+    counter: int | None = None  # of its latest block
+    count: int = 0  # of its measurements; whether a counter that was set to 0 starts there is up to the firmware
     sequence: int | None = None
     away: bool = False
     rejected: int = 0
@@ -220,7 +220,6 @@ class Session:
                 case Returned(sensor, away_s):
                     self.counts[sensor].unplugged += 1
                     self._tracks[sensor].away = True
-                    self._tracks[sensor].counter = None
                     self._pulses.forget(sensor)
                     self._on_back(sensor, away_s)
                 case Ended(sensor, error):
@@ -232,12 +231,16 @@ class Session:
         self._store(ready)
 
     def _unwrapped(self, event: Arrived) -> int:
+        """Return the sensor's own count, from 0 and without end."""
         track, counter = self._tracks[event.sensor], event.block.counter
-        last = track.counter
-        track.counter = counter if last is None else last + (counter - last) % _TURNS
-        if track.first is None:
-            track.first = track.counter  # whether a counter that was set to 0 starts there is up to the firmware
-        return track.counter - track.first
+        if track.counter is not None:
+            step = (counter - track.counter) % _TURNS
+            if step >= _TURNS // 2:  # it has begun anew, as after a power cut that nobody has noticed
+                self._pulses.forget(event.sensor)
+                track.away, step = True, 1
+            track.count += step
+        track.counter = counter
+        return track.count
 
     def _store(self, ready: list[tuple[Arrived, int]]) -> None:
         """Commit measurements, then tell of them."""

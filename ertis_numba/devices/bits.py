@@ -31,10 +31,9 @@ _POWER_RANGE, _PRODUCT_REACH = (0.012, 0.06), 0.09
 _UNSHAPED, _SHAPED = -0.1, -0.25
 _WHITE_MEANS = 12  # in a row; sounds have 3, and clicks of thirty times full scale that reach 200 kHz have 8
 
-_EQUAL_MEANS = 6  # in a row, in which no bit changes: where to look for equal words
-_EQUAL_WORDS = 255
+_EQUAL_WORDS = 4096  # half a period in overload lasts 112, a push of thirty times full scale that fades in 0.1 ms 1530
 _AROUND = 8  # samples before and after them
-_AS_EVER = (0.3, 0.7)  # share of bits there that differ; next to overload, which comes and goes, few do
+_AS_EVER = (0.3, 0.7)  # share of bits there that differ; next to overload, which comes and goes, few do as a rule
 
 
 class BitCheck:
@@ -79,8 +78,8 @@ class BitCheck:
         """Return why a block cannot be right, or None.
 
         ``constant bits``: no channel changes, all along or over a stretch that begins and ends at once. ``density``:
-        channels have too many ones or zeros, or many have others than before. ``noise``: the bits are those of chance,
-        all along or over a stretch. ``splice``: words are missing or do not belong here.
+        most channels have too many ones or zeros, or many have others than before. ``noise``: the bits are those of
+        chance, all along or over a stretch. ``splice``: words are missing or do not belong here.
 
         Parameters
         ----------
@@ -116,31 +115,30 @@ class BitCheck:
         return "splice" if self._splices and self._splices.found(self._words, mean, moving) else None
 
     def _stops(self, share: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Whether equal words begin and end within words like any others.
+        """Whether there are long runs of equal words that begin and end among words like any others, or with the block.
 
-        In overload, too, words may be equal, but modulators do not enter it and leave it all at once.
+        In overload, too, words may be equal, but modulators enter and leave it one after the other.
         """
-        if _longest(share < -1 + 0.5 / (CHANNELS * MEAN_OF)) < _EQUAL_MEANS:
+        if _longest(share < -1 + 0.5 / (CHANNELS * MEAN_OF)) < _EQUAL_WORDS // MEAN_OF - 3:
             return False
-        mask = np.uint32(np.sum(moving.astype(np.uint64) << np.arange(CHANNELS, dtype=np.uint64)))
+        mask = np.sum(np.uint32(1) << np.flatnonzero(moving).astype(np.uint32), dtype=np.uint32)
         words = self._words[:, 0] & mask
-        begins = np.flatnonzero(np.concatenate([[True], words[1:] != words[:-1]]))
-        low, high = _AS_EVER
+        begins = np.flatnonzero(np.concatenate([[True], words[1:] != words[:-1], [True]]))
         for run in np.flatnonzero(np.diff(begins) >= _EQUAL_WORDS):
             first, stop = begins[run : run + 2]
             around = words[max(first - _AROUND, 0) : first], words[stop : stop + _AROUND]
-            differ = [np.sum(np.bitwise_count(side ^ words[first])) / (_AROUND * moving.sum()) for side in around]
-            if all(low < part < high for part in differ):
+            differ = (np.bitwise_count(side ^ words[first]).mean() / moving.sum() for side in around if len(side))
+            if all(_AS_EVER[0] < share < _AS_EVER[1] for share in differ):
                 return True
         return False
 
     def _is_off(self, offset: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Whether channels are far off zero, or a quarter of them otherwise than before.
+        """Whether most channels are far off zero, or a quarter of them otherwise than before.
 
         The offset is a median over time, which overload does not move. What moves all channels is left to them. A
         microphone may well break: what has come to stay is not rejected twice.
         """
-        if np.mean(np.abs(offset[moving])) > _OFF:
+        if np.median(np.abs(offset[moving])) > _OFF:
             return True
         offset = np.where(moving, offset, np.nan)
         jumps = [self._jumps(offset - known) for known in self._known]
