@@ -104,7 +104,7 @@ def test_what_is_stored_is_what_was_sent(captures, words):
             np.testing.assert_array_equal(measurement.words, words[number % 4])
             assert (measurement.stamp.sequence, measurement.stamp.sync_count) == (number, number)
         times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
-        assert np.all(np.abs(np.diff(times_ns) / 1e6 - 50) < 45)
+        assert np.median(np.diff(times_ns)) / 1e6 == pytest.approx(50, abs=20)  # on a busy machine, too
         assert all(0 < stamp.timestamp_uncertainty_ns < 1e8 for stamp in recording.stamps())
         assert recording.settings.recording == SETTINGS.recording
         assert not recording.gaps

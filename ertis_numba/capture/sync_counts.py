@@ -1,7 +1,7 @@
 """Which pulse of the SYNC chain a block belongs to."""
 
 import statistics
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -11,7 +11,9 @@ Item = TypeVar("Item")
 
 _NEAR = 0.4  # of the interval between pulses: what arrives within it is of the same pulse
 _PULSES = 64  # that are remembered: some seconds
-_HELD_S = 0.5  # that a block waits for one of another sensor to compare it with
+_VOTES = 3  # blocks that decide about an offset: one may be late, where a host or a sensor is busy
+_HELD_S = 0.5  # that blocks wait at most for that
+_DOUBTS = 5  # blocks in a row that must speak against an offset before it is changed
 
 
 @dataclass(slots=True)
@@ -31,9 +33,10 @@ class SyncCounts(Generic[Item]):
     """Gives blocks of several sensors the number of the pulse that triggered them.
 
     Each sensor counts its own triggers. The counters agree but for an offset, as the sensors are armed one after the
-    other, and one that was unplugged has missed pulses. Offsets are found by the times at which blocks arrived: chained
-    sensors measure within microseconds, pulses are 50 ms or more apart. From then on the counter decides, and times
-    only watch over it.
+    other, one that was unplugged has missed pulses, and so has one that was still measuring. Offsets are found by the
+    times at which blocks arrive: chained sensors measure within microseconds, pulses are 50 ms or more apart. As a
+    block may arrive late, the majority of three decides. From then on the counter does, until five blocks in
+    a row have arrived at other times than others of their number.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ class SyncCounts(Generic[Item]):
     Attributes
     ----------
     realigned : int
-        How often a sensor's counter disagreed with the times of the others and was compared anew.
+        How often the offset of a sensor had to be changed.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
@@ -73,11 +76,7 @@ class SyncCounts(Generic[Item]):
         arrived_ns : int
             By a clock that never steps.
         """
-        state = self._sensors[sensor]
-        if state.offset is not None and not self._agrees(counter + state.offset, arrived_ns):
-            state.offset = None
-            self.realigned += 1
-        state.held.append(_Held(item, counter, arrived_ns))
+        self._sensors[sensor].held.append(_Held(item, counter, arrived_ns))
         return self.release(arrived_ns)
 
     def release(self, now_ns: int, *, at_once: bool = False) -> list[tuple[Item, int]]:
@@ -87,13 +86,11 @@ class SyncCounts(Generic[Item]):
         while progress:  # one sensor's block may be what another one waited for
             progress = False
             for name, state in self._sensors.items():
-                if state.offset is None and state.held:
-                    state.offset = self._offset(name, state.held[0], now_ns, at_once=at_once)
-                if state.offset is None or not state.held:
+                if not state.held or not self._decided(name, state, now_ns, at_once=at_once):
                     continue
                 progress = True
                 for each in state.held:
-                    number = each.counter + state.offset
+                    number = each.counter + (state.offset or 0)
                     self._note(number, each.arrived_ns)
                     found.append((each.item, number))
                 state.held = []
@@ -104,24 +101,57 @@ class SyncCounts(Generic[Item]):
         """Time between pulses, the shortest possible while it is not known."""
         return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
-    def _offset(self, name: str, held: _Held[Item], now_ns: int, *, at_once: bool) -> int | None:
-        """Return the offset of a sensor by the time of its oldest block, None while it is too early to say."""
-        waited = at_once or now_ns - held.arrived_ns > _HELD_S * 1e9
+    def _decided(self, name: str, state: _Sensor[Item], now_ns: int, *, at_once: bool) -> bool:
+        """Decide about the offset of a sensor that holds blocks; return whether it is known now."""
+        waited = at_once or now_ns - state.held[0].arrived_ns > _HELD_S * 1e9
         if not self._pulses:
-            return -held.counter if name == self._first or waited else None  # the first pulse is number 0
+            if name == self._first or waited:
+                state.offset = -state.held[0].counter  # the first pulse is number 0
+            return state.offset is not None
+        if state.offset is not None:
+            if self._agrees(state.held[-1], state.offset) or at_once:
+                return True
+            if len(state.held) < _DOUBTS:
+                return False
+        elif len(state.held) < _VOTES and not waited and not self._is_alone:
+            return False
         if not self._intervals_ns and not waited:
-            return None  # how near is near, is not known yet
-        number = min(self._pulses, key=lambda each: abs(self._pulses[each] - held.arrived_ns))
-        away_ns = held.arrived_ns - self._pulses[number]
+            return False  # how near is near, is not known yet
+        voted = self._voted(state.held, waited=waited)
+        if voted is not None:
+            self.realigned += state.offset not in {None, voted}
+            state.offset = voted
+        return state.offset is not None
+
+    @property
+    def _is_alone(self) -> bool:
+        """Whether there is no sensor to compare another with."""
+        return len(self._sensors) == 1
+
+    def _voted(self, held: list[_Held[Item]], *, waited: bool) -> int | None:
+        """Return the offset that most blocks speak for by their times, None while it is too early to say."""
+        votes = Counter(
+            number - each.counter
+            for each in held
+            if (number := self._number(each.arrived_ns, waited=waited)) is not None
+        )
+        if not votes:
+            return None
+        offset, count = votes.most_common(1)[0]
+        return offset if waited or 2 * count > len(held) else None
+
+    def _number(self, arrived_ns: int, *, waited: bool) -> int | None:
+        """Return the pulse that a block belongs to by its time, None if that cannot be said yet."""
+        number = min(self._pulses, key=lambda each: abs(self._pulses[each] - arrived_ns))
+        away_ns = arrived_ns - self._pulses[number]
         if abs(away_ns) <= _NEAR * self.interval_ns:
-            return number - held.counter
-        earlier = [each for each, time_ns in self._pulses.items() if time_ns <= held.arrived_ns]
-        later = [each for each, time_ns in self._pulses.items() if time_ns > held.arrived_ns]
-        alone = all(state.offset is None for state in self._sensors.values())
+            return number
+        earlier = [each for each, time_ns in self._pulses.items() if time_ns <= arrived_ns]
+        later = [each for each, time_ns in self._pulses.items() if time_ns > arrived_ns]
         if earlier and later:  # a pulse that no other sensor has delivered, between two that one has
-            return self._between(max(earlier), min(later), held.arrived_ns) - held.counter
-        if later or waited or alone:  # counted by the interval
-            return number + round(away_ns / self.interval_ns) - held.counter
+            return self._between(max(earlier), min(later), arrived_ns)
+        if later or waited or self._is_alone or all(state.offset is None for state in self._sensors.values()):
+            return number + round(away_ns / self.interval_ns)  # counted by the interval
         return None
 
     def _between(self, first: int, last: int, time_ns: int) -> int:
@@ -130,13 +160,14 @@ class SyncCounts(Generic[Item]):
             return first if share < 1 / 2 else last
         return min(max(first + round(share * (last - first)), first + 1), last - 1)
 
-    def _agrees(self, number: int, arrived_ns: int) -> bool:
-        """Whether no other sensor's time speaks against a number."""
-        known_ns = self._pulses.get(number)
-        return known_ns is None or abs(arrived_ns - known_ns) <= max(self.interval_ns, self._shortest_ns) / 2
+    def _agrees(self, held: _Held[Item], offset: int) -> bool:
+        """Whether no other block's time speaks against an offset."""
+        known_ns = self._pulses.get(held.counter + offset)
+        return known_ns is None or abs(held.arrived_ns - known_ns) <= self.interval_ns / 2
 
     def _note(self, number: int, arrived_ns: int) -> None:
         if number in self._pulses:
+            self._pulses[number] = min(self._pulses[number], arrived_ns)
             return
         before_ns = self._pulses.get(number - 1)
         if before_ns is not None and arrived_ns > before_ns:

@@ -1,0 +1,27 @@
+"""Blocks as they stand on the wire, short and each with words of its own."""
+
+import numpy as np
+
+from ertis_numba.devices.commands import FRAME_BYTES, encode_block
+from ertis_numba.devices.protocol import Instant
+
+N_SAMPLES = 5
+N_BYTES = 4 * N_SAMPLES + FRAME_BYTES
+
+
+def at(time_s):
+    return Instant(10**18 + round(time_s * 1e9), round(time_s * 1e9), 1000)
+
+
+def block_of(counter, words=None, n_samples=N_SAMPLES):
+    if words is None:
+        words = np.random.default_rng(counter % 2**32).integers(0, 2**32, n_samples, dtype=np.uint32)
+    return encode_block(counter % 2**32, np.asarray(words, dtype=np.uint32))
+
+
+def told(blocks):
+    return [encode_block(block.counter, block.words) for block in blocks]
+
+
+def counters(blocks):
+    return [block.counter for block in blocks]
