@@ -73,7 +73,7 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
         report["chain"] = captures.chain(platform, _new(folder, "chain"), n_groups=extent.n_groups, rate_hz=10.0)
         say(f"{extent.n_blocks} faulty blocks")
         report["wire"] = wire(extent.n_blocks, seed)
-        report["wire_unchecked"] = wire(extent.n_blocks, seed, check_bits=False)
+        report["wire_splices"] = wire(extent.n_blocks, seed, splices=True)
         say(f"{extent.n_unplugs} times without its plug")
         report["unplugs"] = captures.unplugs(ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
         say(f"{extent.n_kills} captures killed")
@@ -88,12 +88,12 @@ def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = No
     return report
 
 
-def wire(n_blocks: int, seed: int, *, check_bits: bool = True) -> dict[str, Any]:
+def wire(n_blocks: int, seed: int, *, splices: bool = False) -> dict[str, Any]:
     """Send blocks of the least length, with the words of a sensor, over a line with faults."""
     with open_recording(ONE_SENSOR) as recording:
         words = recording[0].words
-    bits = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ).check if check_bits else None
-    return asdict(wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=bits))
+    check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ, splices=splices)
+    return asdict(wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check))
 
 
 @contextmanager

@@ -28,7 +28,7 @@ _WIRE = (
 _ALTERED = (
     "of these, whole ones in which words were exchanged for others",
     "nothing in a block tells but its bits",
-    "{altered:,} accepted; {altered_unchecked:,} where the bits are not checked",
+    "{altered:,} accepted; {altered_splices:,} with `--refuse-splices`",
 )
 _UNPLUGS = (
     "unplugged {unplugged} times while it measured",
@@ -62,7 +62,7 @@ def reliability(report: dict[str, Any]) -> str:
     wire = report["wire"]
     counted = wire | {
         "false_accepts": wire["mixed"] + wire["wrong_counter"] + wire["twice"],
-        "altered_unchecked": report["wire_unchecked"]["altered"],
+        "altered_splices": report["wire_splices"]["altered"],
     }
     rows = [
         _row(_ONE, report["sustained"]),

@@ -13,9 +13,8 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.devices.bits import BitCheck
-
     from ertis_numba.capture import Session
+    from ertis_numba.devices.bits import BitCheck
     from ertis_numba.journal import Entry, Journal
 
 __all__ = ["Signals", "Watch", "report", "stopped_by_signals"]

@@ -59,6 +59,7 @@ __all__ = ["capture"]
     help="How long a sensor may be silent or away.",
 )
 @click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse words that cannot be PDM.")
+@click.option("--refuse-splices", is_flag=True, help="Refuse words that seem cut and joined, too.")
 @click.option("--dry-run", is_flag=True, help="Print the commands that the sensor would get, and end.")
 @options.force
 @options.quiet
@@ -81,6 +82,7 @@ def capture(
     names: tuple[str, ...],
     patience: float,
     check_bits: bool,
+    refuse_splices: bool,
     dry_run: bool,
     force: bool,
     quiet: bool,
@@ -125,7 +127,7 @@ def capture(
             on_note=watch.note,
             on_back=watch.back,
         )
-        checks = {name: BitCheck(setup.n_samples, setup.pdm_rate_hz) for name in sonars}
+        checks = {name: BitCheck(setup.n_samples, setup.pdm_rate_hz, splices=refuse_splices) for name in sonars}
         for name, sonar in sonars.items():
             sonar.configure(setup, bits=checks[name].check if check_bits else None)
         path = target.with_name(f"{target.name}{SUFFIX}")

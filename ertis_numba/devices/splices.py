@@ -44,7 +44,8 @@ _LANES, _LEAST_LANES, _LEAST_CHANNELS = 4, 3, 4  # bytes of a word, how many of 
 # What makes an impulse a splice, and where 98 % of those of the real measurement lie. Of 812 impulses in sounds, which
 # ``tests/test_bits.py`` makes a few of, none was on the right side of more than all but two of these bounds.
 _NOISE = (0.03, 0.35)  # of a size: lower, and there is no microphone; higher, and there is no telling. 0.09
-_LEAST_OVER_NOISE, _SIZE = 2.0, (0.45, 2.0)  # 0.75 to 1.7
+_LEAST_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # 0.75 to 1.7; a few bytes too many make 4
+_LANE_POWER, _LANE_OVER_NOISE = 0.12, 5.0  # mean square in the third of the lanes, and by the variance of noise: 0.4
 _ALONE = (0.85, 1.25)  # share of the power about it that it explains: 0.99 to 1.03
 _LEAST_AT_ONCE = 0.62  # share of its power that is in phase: 0.88 to 0.99; in sounds from aside 0.5 to 0.6
 _MOST_ALIKE = 0.4  # share of its power that is the same in all channels: 0 to 0.16; in sounds from ahead 1
@@ -176,6 +177,10 @@ class Splices:
         count, total = len(sizes), float(sizes @ sizes)
         power = total - count * variance
         if not max(_SIZE[0], _LEAST_OVER_NOISE * math.sqrt(variance)) ** 2 < power / count < _SIZE[1] ** 2:
+            return False
+        lanes = np.bincount(np.flatnonzero(moving) * _LANES // CHANNELS, weights=sizes**2, minlength=_LANES)
+        third = np.sort(lanes / np.maximum(moving.reshape(_LANES, -1).sum(axis=1), 1))[-_LEAST_LANES] - variance
+        if third < max(_LANE_POWER, _LANE_OVER_NOISE * variance):
             return False
         both = power + max(float(others @ others) - count * variance, 0.0)
         around = float(np.sum(band**2)) - count * band.shape[1] * variance / self._noise_gain
