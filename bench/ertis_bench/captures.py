@@ -148,7 +148,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
     found = _checked(target, stored, _sent(folder))
     return {
         "exit code": done.returncode,
-        "said": done.stderr.strip().splitlines()[-1],
+        "said": done.stderr.strip().splitlines()[-1].replace(str(disk), "DISK"),
         "reported": len(stored),
         "lost": found["lost"],
         "wrong": found["wrong"],

@@ -31,9 +31,9 @@ _ALTERED = (
     "{altered:,} accepted; {altered_splices:,} with `--refuse-splices`",
 )
 _UNPLUGS = (
-    "unplugged {unplugged} times while it measured",
+    "{unplugged} times unplugged while it measured",
     "back within 3 s; 0 wrong",
-    "{noticed} times back, {slowest_s:.2f} s from plug to measurement at most; {wrong} wrong",
+    "{noticed} times back; {slowest_s:.2f} s from plug to measurement at most; {wrong} wrong",
 )
 _KILLS = (
     "{kills:,} captures ended by kill -9",
@@ -77,7 +77,7 @@ def reliability(report: dict[str, Any]) -> str:
     ]
     extent = " --long" if report["long"] else ""
     made = f"By `ertis bench reliability{extent} --seed {report['seed']}`. {sentence(report['machine'])}"
-    return f"{table(('tried', 'wanted', 'found'), rows)}\n\n{made}"
+    return f"{table(('tried', 'wanted', 'found'), rows, numbers=False)}\n\n{made}"
 
 
 def _row(texts: tuple[str, str, str], found: dict[str, Any]) -> tuple[str, str, str]:
