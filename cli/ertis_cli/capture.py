@@ -41,7 +41,8 @@ __all__ = ["capture"]
 )
 @click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Of commands.")
 @click.option("--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="Input of the SYNC pulses.")
-@click.option("--passive", is_flag=True, help="Only listen: nothing is emitted.")
+@click.option("--passive", is_flag=True, help="Record without emitting the call.")
+@click.option("--listen-only", is_flag=True, help="Send nothing: another program has set up the sensor.")
 @click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Calls per measurement.")
 @click.option(
     "--preset", metavar="NAME", help="short_, default_ or long_ with 20_80 or 25_50; default_25_50 by default."
@@ -74,6 +75,7 @@ def capture(
     rate: float,
     pin: int,
     passive: bool,
+    listen_only: bool,
     emissions: int,
     preset: str | None,
     layout: str | None,
@@ -97,6 +99,7 @@ def capture(
     from ertis_numba.devices.commands import Setup
 
     settings = _settings(preset, layout, settings_file, temperature)
+    trigger = "sync" if listen_only else trigger
     setup = Setup.of(settings, active=not passive, trigger=trigger, pin=pin, emissions=emissions)
     if dry_run:
         _print_commands(setup, as_json=as_json)
@@ -112,7 +115,7 @@ def capture(
         check_target(target, overwrite=force)
     watch = Watch(quiet=quiet, as_json=as_json)
     with stopped_by_signals() as signals, ExitStack() as stack:
-        sonars = _named(ports, names, [stack.enter_context(Sonar.open(port)) for port in ports])
+        sonars = _named(ports, names, [stack.enter_context(Sonar.open(port, passive=listen_only)) for port in ports])
         target = target or Path(_default_name(list(sonars)))
         check_target(target, overwrite=force)
         session = Session(

@@ -127,10 +127,14 @@ class Reader(threading.Thread):
     def _listen(self) -> None:
         while not self._stop_asked.is_set():
             try:
-                for block in self._sonar.listen(stop=self._stop_asked.is_set, timeout_s=self._patience_s):
+                for block in self._sonar.listen(stop=self._may_stop, timeout_s=self._patience_s):
                     self._put(Arrived(self._sensor, block, None))
             except SonarGoneError as error:
                 self._come_back(error)
+
+    def _may_stop(self) -> bool:
+        """Whether to stop listening: not within a measurement, of which the rest comes or whose deadline passes."""
+        return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
     def _command(self, pace: Pace) -> None:
         tick = taken = failures = 0

@@ -83,7 +83,8 @@ class Session:
     Parameters
     ----------
     sonars : dict of str to Sonar
-        Configured, by the names that the recording is to have; armed one after the other in this order.
+        Configured, by the names that the recording is to have; armed one after the other in this order, but for those
+        that are only listened to.
     settings : Settings
         Of all of them.
     trigger : {"command", "sync"}
@@ -175,7 +176,8 @@ class Session:
             self._journal.add_sensor(sensor, self._settings, firmware=sonar.firmware)
         if self._synced:
             for sonar in self._sonars.values():
-                sonar.arm()
+                if not sonar.passive:
+                    sonar.arm()
         pace = None if self._synced else Pace(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
         readers = [
             Reader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events)

@@ -90,6 +90,11 @@ class Sonar:
         return self._port.serial_number
 
     @property
+    def passive(self) -> bool:
+        """Whether nothing is ever sent to it."""
+        return self._passive
+
+    @property
     def receiver(self) -> Receiver:
         """What was received, lost and rejected since `configure`."""
         return self._state()[1]

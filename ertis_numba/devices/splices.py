@@ -45,7 +45,7 @@ _LANES, _LEAST_LANES, _LEAST_CHANNELS = 4, 3, 4  # bytes of a word, how many of 
 # ``tests/test_bits.py`` makes a few of, none was on the right side of more than all but two of these bounds.
 _NOISE = (0.03, 0.35)  # of a size: lower, and there is no microphone; higher, and there is no telling. 0.09
 _LEAST_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # 0.75 to 1.7; a few bytes too many make 4
-_LANE_POWER, _LANE_OVER_NOISE = 0.12, 5.0  # mean square in the third of the lanes, and by the variance of noise: 0.4
+_LANE_POWER, _LANE_OVER_NOISE = 0.2, 5.0  # mean square in the third of the lanes, also by the variance of noise: 0.4
 _ALONE = (0.85, 1.25)  # share of the power about it that it explains: 0.99 to 1.03
 _LEAST_AT_ONCE = 0.62  # share of its power that is in phase: 0.88 to 0.99; in sounds from aside 0.5 to 0.6
 _MOST_ALIKE = 0.4  # share of its power that is the same in all channels: 0 to 0.16; in sounds from ahead 1
