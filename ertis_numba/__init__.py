@@ -23,11 +23,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ertis_numba.devices.commands import Setup
     from ertis_numba.devices.emulator import Emulator
+    from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import Sonar
     from ertis_numba.errors import (
         ArgumentError,
+        DamagedError,
         DataError,
         DeviceError,
         ErtisError,
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ArgumentError",
+    "DamagedError",
     "DataError",
     "DeviceError",
     "Emulator",
@@ -89,11 +91,12 @@ __all__ = [
 ]
 
 _HOMES = {
-    "devices.commands": ("Setup",),
     "devices.emulator": ("Emulator",),
+    "devices.setup": ("Setup",),
     "devices.sonar": ("Sonar",),
     "errors": (
         "ArgumentError",
+        "DamagedError",
         "DataError",
         "DeviceError",
         "ErtisError",

@@ -6,6 +6,7 @@
     ├── ArgumentError (ValueError)       a value given by the caller cannot be used
     │   └── SettingsError                a settings file or structure cannot be used
     ├── DataError (ValueError)           a file or measurement does not hold what it should
+    │   ├── DamagedError                 it is not what was written, and never will be
     │   ├── FormatVersionError           a file was written by a newer version
     │   └── InUseError                   a journal belongs to another process
     ├── DeviceError (RuntimeError)       the compute device asked for is not there
@@ -17,6 +18,7 @@ Each class also inherits the builtin that a caller would catch without knowing t
 
 __all__ = [
     "ArgumentError",
+    "DamagedError",
     "DataError",
     "DeviceError",
     "ErtisError",
@@ -42,6 +44,10 @@ class SettingsError(ArgumentError):
 
 class DataError(ErtisError, ValueError):
     """A file or a measurement does not hold what it should."""
+
+
+class DamagedError(DataError):
+    """What is in a file is not what was written; to read it again, as after a fault of the disk, does not help."""
 
 
 class FormatVersionError(DataError):

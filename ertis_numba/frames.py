@@ -21,6 +21,8 @@ class Stamp:
         Serial number or name of the sensor.
     sequence : int
         Number given at capture; a gap is a loss.
+    epoch : int
+        Number of the run of the sensor that gave the sequence numbers: (sensor, epoch, sequence) is unique.
     sync_count : int
         Pulse of the SYNC chain; equal for all sensors that emitted together.
     timestamp_ns : int
@@ -33,6 +35,7 @@ class Stamp:
     sync_count: int = 0
     timestamp_ns: int = 0
     timestamp_uncertainty_ns: int = 0
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

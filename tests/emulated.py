@@ -6,7 +6,7 @@ import queue
 import numpy as np
 import serial
 
-from ertis_numba.devices.commands import FOOTER, HEADER
+from ertis_numba.devices.blocks import FOOTER, HEADER
 
 N_SAMPLES = 32_768
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]

@@ -22,8 +22,8 @@ def entries(count=3, *, sensor="left", first=10, settings=TINY, epoch=EPOCH, see
     """Measurements of noise whose stamps all differ, as they would arrive."""
     made = []
     for number, measurement in enumerate(noise(settings, count, seed)):
-        stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number)
-        made.append(Entry(replace(measurement, stamp=stamp), epoch=epoch, monotonic_ns=1_000 + number))
+        stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, epoch=epoch)
+        made.append(Entry(replace(measurement, stamp=stamp), monotonic_ns=1_000 + number))
     return made
 
 
@@ -52,8 +52,7 @@ def same(came, wanted):
     """Whether an entry that was read is another one to the last bit, and has its CRC-32."""
     words = [np.ascontiguousarray(entry.measurement.words) for entry in (came, wanted)]
     return (
-        (came.epoch, came.monotonic_ns, came.measurement.stamp)
-        == (wanted.epoch, wanted.monotonic_ns, wanted.measurement.stamp)
+        (came.monotonic_ns, came.measurement.stamp) == (wanted.monotonic_ns, wanted.measurement.stamp)
         and came.measurement.settings.air == wanted.measurement.settings.air
         and words[0].dtype == words[1].dtype
         and words[0].tobytes() == words[1].tobytes()

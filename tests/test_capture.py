@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from ertis_numba.capture import Session
-from ertis_numba.devices.commands import Setup
-from ertis_numba.devices.emulator import Emulator, Quirks
+from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
+from ertis_numba.devices.emulator.faults import Fault, Faults, Spoilt
+from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import Sonar
-from ertis_numba.devices.sync_chain import SyncChain
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.journal import Journal
 from ertis_numba.settings import Recording, Settings
@@ -40,19 +40,34 @@ def words():
     return [np.ascontiguousarray(whole[start : start + SHORT]) for start in range(0, 4 * SHORT, SHORT)]
 
 
+class Dropping(Faults):
+    """Loses the measurements with some numbers."""
+
+    def __init__(self, counters):
+        super().__init__()
+        self._counters = counters
+
+    def spoil(self, block):
+        if int.from_bytes(block[4:8], "little") in self._counters:
+            return Spoilt((), (Fault("drop", 0, len(block)),))
+        return super().spoil(block)
+
+
 class Capture:
     """Emulated sensors, the driver, a journal, and what became of it."""
 
-    def __init__(self, stack, folder, words, *, trigger="command", names=("one",), rotated=0, **options):
+    def __init__(self, stack, folder, words, *, trigger="command", names=("one",), dropped=None, **options):
         self.log = io.StringIO()
         self.emulators = [
             stack.enter_context(
-                Emulator([*words[rotated:], *words[:rotated]], name=name, link=folder / name, log=self.log)
+                Emulator(
+                    words, name=name, link=folder / name, log=self.log, faults=Dropping((dropped or {}).get(name, ()))
+                )
             )
             for name in names
         ]
         sonars = {name: stack.enter_context(Sonar.open(str(folder / name))) for name in names}
-        setup = Setup.of(SETTINGS, trigger=trigger)
+        setup = Setup.of(SETTINGS)
         for sonar in sonars.values():
             sonar.configure(setup)
         self.sonars = sonars
@@ -127,6 +142,41 @@ def test_groups_of_a_sync_chain(captures, words):
                 rows.setdefault(measurement.stamp.sync_count, set()).add(index)
     assert sorted(rows) == list(range(8))
     assert all(len(indices) == 1 for indices in rows.values())
+
+
+def test_measurements_that_are_missing_are_gaps(captures):
+    """Also at the beginning and at the end, and by their reason."""
+    capture = captures(rate_hz=20.0, n=4, dropped={"one": (0, 2, 3, 6)})
+    capture.session.run(capture.journal)
+    with capture.recording() as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == [1, 4, 5, 7]
+        assert [(gap.first, gap.last) for gap in recording.gaps] == [(0, 0), (2, 3), (6, 6)]
+        assert {gap.reason for gap in recording.gaps} == {"it did not arrive in time"}
+    assert capture.session.counts["one"].missing == {"it did not arrive in time": 4}
+    assert [text.split(":")[1] for _, text in capture.notes] == [
+        " no whole measurement within 0.53 s; 0 of 131084 bytes came"
+    ] * 4
+
+
+def test_a_capture_by_pulses_ends_though_the_last_is_lost(captures):
+    capture = captures(trigger="sync", n=6, dropped={"one": (2, 5)})
+    with SyncChain(capture.emulators, rate_hz=20.0):
+        capture.session.run(capture.journal)
+    with capture.recording() as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == [0, 1, 3, 4]
+        assert [(gap.first, gap.last) for gap in recording.gaps] == [(2, 2), (5, 5)]
+    assert capture.session.counts["one"].lost == 2
+
+
+def test_a_sensor_may_hear_pulses_before_the_first_one_does(captures):
+    capture = captures(trigger="sync", names=("one", "two"), n=8, dropped={"one": range(4)})
+    with SyncChain(capture.emulators, rate_hz=20.0):
+        capture.session.run(capture.journal)
+    with capture.recording("two") as recording:
+        assert recording.stamps()[0].sequence == 0
+        assert recording.stamps()[0].sync_count in {-4, -3}  # it is armed after the other
+        assert not recording.gaps
+    assert capture.session.complete >= 7
 
 
 @pytest.mark.parametrize("trigger", ["command", "sync"])

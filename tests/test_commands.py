@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ertis_numba.devices import commands
-from ertis_numba.devices.commands import Command, Setup
+from ertis_numba.devices import blocks, commands
+from ertis_numba.devices.commands import Command
+from ertis_numba.devices.setup import Setup, call_codes, call_hash
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.settings import Array, Call, Recording, Settings
 from ertis_numba.waveform import call_samples
@@ -147,9 +148,9 @@ def test_an_answer_that_does_not_fit_is_refused():
 def test_a_block_as_it_stands_on_the_wire():
     words = np.array([1, 0xA0B0C0D0], dtype=np.uint32)
     expected = struct.pack("<IIIII", 0x51534E12, 7, 1, 0xA0B0C0D0, 0x2F418672)
-    assert commands.encode_block(7, words) == expected
-    assert commands.encode_block(7, words.astype(">u4")) == expected
-    assert len(expected) == commands.FRAME_BYTES + 4 * len(words)
+    assert blocks.encode_block(7, words) == expected
+    assert blocks.encode_block(7, words.astype(">u4")) == expected
+    assert len(expected) == blocks.FRAME_BYTES + 4 * len(words)
 
 
 @pytest.mark.parametrize(
@@ -163,13 +164,13 @@ def test_a_block_as_it_stands_on_the_wire():
 )
 def test_what_is_no_block_is_refused(counter, words, message):
     with pytest.raises(ArgumentError, match=message):
-        commands.encode_block(counter, words)
+        blocks.encode_block(counter, words)
 
 
 def test_the_codes_of_a_call():
     """Against the phase as the makers write it, sample by sample."""
     call = Call()
-    codes = commands.call_codes(call)
+    codes = call_codes(call)
     assert (len(codes), codes.dtype) == (1126, np.uint16)  # t = 0 … T inclusive
     low, high, duration_s = 1 / call.start_frequency_hz, 1 / call.stop_frequency_hz, call.duration_s
     for sample in range(113, 1013):  # between the ramps
@@ -184,8 +185,8 @@ def test_the_codes_of_a_call():
 
 
 def test_the_hash_of_a_call_is_the_xor_of_its_codes():
-    assert commands.call_hash(np.array([0b0101, 0b0011, 0b1000], np.uint16)) == 0b1110
-    assert commands.call_hash(np.array([], np.uint16)) == 0
+    assert call_hash(np.array([0b0101, 0b0011, 0b1000], np.uint16)) == 0b1110
+    assert call_hash(np.array([], np.uint16)) == 0
 
 
 def test_what_a_sensor_is_told_by_default():
@@ -198,7 +199,7 @@ def test_what_a_sensor_is_told_by_default():
         b"!E,1126,0,0\n",
     ]
     assert [(command.code, command.first, command.second) for command in setup.call()] == [
-        ("C", index, code) for index, code in enumerate(commands.call_codes(Call()))
+        ("C", index, code) for index, code in enumerate(call_codes(Call()))
     ]
     assert [command.encode() for command in setup.after_call()] == [b"!I,1,0,0\n", b"!K,1,0,0\n", b"!H,1,0,0\n"]
     assert setup.n_bytes == 655_360
@@ -206,10 +207,10 @@ def test_what_a_sensor_is_told_by_default():
 
 def test_what_a_passive_sensor_is_told():
     settings = Settings().replace(recording=Recording(n_samples=32_768, pdm_rate_hz=1_125_000.0), call=_slow())
-    setup = Setup.of(settings, active=False, trigger="sync", pin=2, emissions=3)
+    setup = Setup.of(settings, active=False, pin=2, emissions=3)
     assert b"".join(command.encode() for command in setup.before_call()[:3]) == b"!J,0,2,0\n!G,131072,0,0\n!F,1,0,0\n"
     assert b"".join(command.encode() for command in setup.after_call()) == b"!I,3,0,0\n!K,0,0,0\n!H,0,0,0\n"
-    assert (setup.trigger, setup.amplifier) == ("sync", False)
+    assert not setup.amplifier
 
 
 def _slow():
@@ -266,7 +267,6 @@ def test_the_shortest_and_the_longest_call_suit_a_sensor(n_samples):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"trigger": "snyc"}, r"trigger 'snyc' is unknown \(did you mean 'sync'\?\)"),
         ({"pin": 3}, "pin is 3; give a whole number from 1 to 2"),
         ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
     ],
@@ -274,6 +274,37 @@ def test_the_shortest_and_the_longest_call_suit_a_sensor(n_samples):
 def test_how_no_sensor_measures_is_refused(changes, message):
     with pytest.raises(ArgumentError, match=message):
         Setup.of(Settings(), **changes)
+
+
+CODES = call_codes(Call())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_samples": 100_000}, "n_samples is 100000; a sensor measures multiples of 32768"),
+        ({"n_samples": 0}, "n_samples is 0; give a whole number of at least 1"),
+        ({"n_samples": 32_768.0}, "n_samples is 32768.0; give a whole number"),
+        ({"pdm_rate_hz": 4e6}, "pdm_rate_hz is 4000000; a sensor's clocks are 4500000 and 1125000"),
+        ({"dac_rate_hz": 100_000}, "sample_rate_hz is 100000; give a whole number from 160000 to 2000000"),
+        ({"codes": CODES[:63]}, "call has 63 samples; a sensor plays 64 to 65535"),
+        ({"codes": CODES.astype(int)}, r"codes are int64 of shape \(1126,\); give \(sample,\) uint16"),
+        ({"codes": CODES[None]}, r"codes are uint16 of shape \(1, 1126\); give \(sample,\) uint16"),
+        ({"codes": CODES + np.uint16(2_000)}, r"codes reach \d+; a sensor's converter takes 0 to 4095"),
+        ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
+        ({"pin": 3}, "pin is 3; give a whole number from 1 to 2"),
+        (
+            {"amplifier": False},
+            "active is True with the amplifier off, which emits nothing; switch it on",
+        ),
+    ],
+)
+def test_a_setup_without_settings_is_checked_as_well(changes, message):
+    right = {"n_samples": 32_768, "pdm_rate_hz": 4.5e6, "codes": CODES, "dac_rate_hz": 450_000}
+    with pytest.raises(ArgumentError, match=message) as caught:
+        Setup(**right | changes)
+    assert "\n" not in str(caught.value)
+    assert Setup(**right).before_call() == Setup.of(Settings(recording=Recording(n_samples=32_768))).before_call()
 
 
 def test_fewer_channels_than_bits_are_no_harm():

@@ -113,6 +113,34 @@ def test_a_killed_emulator_leaves_a_link_that_the_next_replaces(emulate, recordi
     assert ended(process, signal.SIGTERM)[0] == 143
 
 
+ELSEWHERE = """
+import sys
+import serial  # which has a module of its own for Windows
+
+for name in ("fcntl", "termios", "tty"):
+    sys.modules[name] = None
+import ertis_numba
+from ertis_cli.main import main
+
+print(ertis_numba.Emulator.__name__, ertis_numba.Setup.__name__, ertis_numba.Sonar.__name__, flush=True)
+main()
+"""
+
+
+def test_a_system_without_pseudo_terminals(recording, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, "emulate", str(recording)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=ENVIRONMENT | {"ERTIS_EMULATED_DIR": str(tmp_path / "links")},
+    )
+    assert done.stdout == "Emulator Setup Sonar\n"
+    assert done.stderr == ("ertis: error: this system has no pseudo terminals; emulate sensors on Linux or macOS\n")
+    assert done.returncode == 1
+    assert not (tmp_path / "links").exists()
+
+
 SCENE = """
 seed = 3
 count = 2

@@ -8,8 +8,8 @@ import zlib
 import numpy as np
 import pytest
 
-from ertis_numba.devices.commands import call_codes, call_hash
 from ertis_numba.devices.emulator import Emulator, Quirks
+from ertis_numba.devices.setup import call_codes, call_hash
 from ertis_numba.settings import Call
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log, ask, block, is_block, opened
 

@@ -1,6 +1,9 @@
 """Emulated devices go wrong as they are told: spoilt bytes, unplugged, silent; and their links are their own."""
 
+import fcntl
+import os
 import queue
+import threading
 import time
 import zlib
 from pathlib import Path
@@ -9,10 +12,10 @@ import numpy as np
 import pytest
 import serial
 
-from ertis_numba.devices.commands import FOOTER, HEADER
+from ertis_numba.devices.blocks import FOOTER, HEADER
 from ertis_numba.devices.emulator import Emulator, Quirks
-from ertis_numba.devices.faults import Faults
-from ertis_numba.devices.places import HeldLink, emulated_folder
+from ertis_numba.devices.emulator.faults import Faults
+from ertis_numba.devices.links import HeldLink, emulated_folder
 from ertis_numba.errors import ArgumentError
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log, Numbered, ask, opened
 
@@ -129,6 +132,16 @@ def test_a_link_belongs_to_one_device(tmp_path):
     with pytest.raises(ArgumentError, match="front exists and leads to no port; give another name"):
         HeldLink(link)
     assert link.read_text() == "precious"
+
+
+def test_a_link_that_somebody_looks_at_can_be_taken(tmp_path):
+    """Whether it is held shows a lock, which whoever looks holds for an instant."""
+    looker = os.open(tmp_path / ".front.lock", os.O_CREAT | os.O_RDONLY)
+    fcntl.flock(looker, fcntl.LOCK_SH)
+    timer = threading.Timer(0.02, os.close, [looker])
+    timer.start()
+    HeldLink(tmp_path / "front").release()
+    timer.join()
 
 
 def test_the_folder_of_links_can_be_chosen(monkeypatch, tmp_path):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ertis_numba.devices.commands import encode_block
-from ertis_numba.devices.faults import KINDS, Faults, Stall, Unplug
+from ertis_numba.devices.blocks import encode_block
+from ertis_numba.devices.emulator.faults import KINDS, Faults, Stall, Unplug
 from ertis_numba.errors import ArgumentError
 from tests.wire import block_of
 

@@ -72,10 +72,21 @@ def test_a_layout_file_is_not_needed_any_more(tmp_path):
 
 def test_gaps_are_kept(tmp_path):
     with create(tmp_path) as journal:
-        journal.note_gap("left", 3, 3, "footer")
-        journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged")
+        journal.note_gap("left", 3, 3, "footer", epoch=EPOCH)
+        journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged", epoch=2**63 - 1)
     with Journal.open(journal.path) as journal:
-        assert journal.gaps == (Gap("left", 3, 3, "footer"), Gap("left", 0, 2**63 - 1, "the sensor was unplugged"))
+        assert journal.gaps == (
+            Gap("left", 3, 3, "footer", EPOCH),
+            Gap("left", 0, 2**63 - 1, "the sensor was unplugged", 2**63 - 1),
+        )
+
+
+def test_zero_may_be_negative(tmp_path):
+    """SQLite stores -0.0 as 0.0: the CRC-32 of a row must not tell them apart."""
+    with create(tmp_path, []) as journal:
+        journal.add_sensor("left", TINY, translation_m=(-0.0, -1.0, 0.0))
+    with Journal.open(journal.path) as journal:
+        assert journal.sensors["left"].translation_m == (0.0, -1.0, 0.0)
 
 
 def test_numbers_rise_within_an_epoch(tmp_path):
@@ -120,12 +131,31 @@ BAD = {
         lambda journal: journal.append(entries(1, sensor="right")),
         "sensor 'right' is not in .*rec.h5.journal; add it first",
     ),
-    "gap of it": (lambda journal: journal.note_gap("right", 1, 2, "x"), "sensor 'right' is not in .*; add it first"),
+    "gap of it": (
+        lambda journal: journal.note_gap("right", 1, 2, "x", epoch=1),
+        "sensor 'right' is not in .*; add it first",
+    ),
     "entries of it": (lambda journal: list(journal.entries("right")), "sensor 'right' is not in .*; add it first"),
-    "gap backwards": (lambda journal: journal.note_gap("left", 2, 1, "x"), "last missing sequence number is 1; give"),
-    "no reason": (lambda journal: journal.note_gap("left", 1, 2, ""), "reason of a gap is ''; give a line of 1 to 64"),
-    "two lines": (lambda journal: journal.note_gap("left", 1, 2, "a\nb"), "reason of a gap is .*; give a line"),
-    "long reason": (lambda journal: journal.note_gap("left", 1, 2, "é" * 33), "reason of a gap is .*; give a line"),
+    "gap backwards": (
+        lambda journal: journal.note_gap("left", 2, 1, "x", epoch=1),
+        "last missing sequence number is 1; give",
+    ),
+    "gap of no run": (
+        lambda journal: journal.note_gap("left", 1, 2, "x", epoch=-1),
+        "epoch is -1; give a whole number from 0",
+    ),
+    "no reason": (
+        lambda journal: journal.note_gap("left", 1, 2, "", epoch=1),
+        "reason of a gap is ''; give a line of 1 to 64",
+    ),
+    "two lines": (
+        lambda journal: journal.note_gap("left", 1, 2, "a\nb", epoch=1),
+        "reason of a gap is .*; give a line",
+    ),
+    "long reason": (
+        lambda journal: journal.note_gap("left", 1, 2, "é" * 33, epoch=1),
+        "reason of a gap is .*; give a line",
+    ),
     "sensor twice": (
         lambda journal: journal.add_sensor("left", TINY),
         "sensor 'left' is in .* already; give each sensor a name of its own",
@@ -154,6 +184,10 @@ BAD = {
     "type": (
         lambda journal: journal.append([spoilt(words=np.zeros(4096, np.int16))]),
         "a measurement of sensor left holds int16; give uint8",
+    ),
+    "epoch": (
+        lambda journal: journal.append([spoilt(epoch=2**63)]),
+        "epoch is 9223372036854775808; give a whole number from 0",
     ),
     "stamp": (
         lambda journal: journal.append([spoilt(timestamp_uncertainty_ns=2**32)]),
@@ -194,7 +228,7 @@ def test_threads_may_share_a_journal(tmp_path):
             journal.add_sensor(name, TINY)
             for entry in entries(8, sensor=name):
                 journal.append([entry])
-                journal.note_gap(name, 0, 1, "x")
+                journal.note_gap(name, 0, 1, "x", epoch=EPOCH)
 
         threads = [threading.Thread(target=work, args=(name,)) for name in names]
         for thread in threads:
@@ -316,6 +350,20 @@ def test_closed(tmp_path):
     journal.close()
     with pytest.raises(DataError, match=r"rec.h5.journal is closed; open it again"):
         journal.append(entries(1, first=20))
+
+
+@pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
+def test_removing_waits_for_its_turn(tmp_path, act):
+    with create(tmp_path) as journal:
+        thread = threading.Thread(target=act, args=(journal,))
+        with journal._turn:  # noqa: SLF001  as while another thread appends
+            thread.start()
+            thread.join(0.05)
+            assert thread.is_alive()
+            assert journal.path.exists()
+            journal.append(entries(1, first=20))
+        thread.join(10)
+        assert not journal.path.exists()
 
 
 @pytest.mark.parametrize("aside", [False, True])

@@ -1,17 +1,26 @@
 """Journals that are not what they should be are refused in a line, and a full disk takes nothing away."""
 
+import json
+import re
 import resource
 import shutil
+import sqlite3
 import subprocess
 import sys
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ertis_numba.errors import DataError, FormatVersionError, InUseError
+from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
 from ertis_numba.journal import Journal
-from ertis_numba.journal._database import Database
+from ertis_numba.journal._database import PAGE_BYTES, Database
 from ertis_numba.journal._tables import row_crc32
+from ertis_numba.settings import Recording
+from ertis_numba.storage.sealing import seal
+from ertis_numba.storage.verify import verify
+from tests.files import line
 from tests.journals import ENVIRONMENT, create, entries, python, same
 
 SPOIL = """
@@ -36,6 +45,10 @@ DAMAGED = {
         "UPDATE measurements SET timestamp_ns = 7 WHERE id = 2",
         "the record of measurement 11 of sensor left has CRC-32 .*, wanted .*: the journal is damaged",
     ),
+    "type of the words": (
+        "UPDATE measurements SET words = 'text' WHERE id = 2",
+        "measurement 11 of sensor left has CRC-32",
+    ),
     "air": (
         "UPDATE measurements SET temperature_c = 7 WHERE id = 2",
         "the record of measurement 11 of sensor left has",
@@ -50,7 +63,7 @@ def test_a_damaged_measurement_leaves_the_others_readable(tmp_path, name):
     spoil(tmp_path / "rec.h5.journal", statement)
     with Journal.open(tmp_path / "rec.h5.journal") as journal:
         keys = journal.index()
-        with pytest.raises(DataError, match=message):
+        with pytest.raises(DamagedError, match=message):
             journal.entry(keys[1])
         wanted = entries()
         assert same(journal.entry(keys[0]), wanted[0])
@@ -66,6 +79,10 @@ UNREADABLE = {
         "UPDATE measurements SET id = 9 WHERE id = 3",
         "is damaged, it lists 3 measurements and has 9; copy it again",
     ),
+    "row in the middle": (
+        "DELETE FROM measurements WHERE id = 2",
+        "is damaged, it lists 2 measurements and has 3; copy it again",
+    ),
     "gap": ("UPDATE gaps SET reason = 'y'", "the record of a gap has CRC-32"),
 }
 
@@ -74,10 +91,87 @@ UNREADABLE = {
 def test_a_damaged_journal_is_refused(tmp_path, name):
     statement, message = UNREADABLE[name]
     with create(tmp_path) as journal:
-        journal.note_gap("left", 1, 1, "x")
+        journal.note_gap("left", 1, 1, "x", epoch=7)
     spoil(tmp_path / "rec.h5.journal", statement)
-    with pytest.raises(DataError, match=message), Journal.open(tmp_path / "rec.h5.journal") as journal:
+    with pytest.raises(DamagedError, match=message), Journal.open(tmp_path / "rec.h5.journal") as journal:
         _ = journal.gaps
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_measurements_may_be_deleted_from_the_front(tmp_path, count):
+    create(tmp_path).close()
+    spoil(tmp_path / "rec.h5.journal", f"DELETE FROM measurements WHERE id <= {count}")
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        journal.append(entries(1, first=13))
+        assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [10, 11, 12, 13][count:]
+        assert len(journal) == 4 - count
+
+
+@pytest.mark.parametrize("tree", ["key", "measurements"])
+def test_rows_that_only_one_tree_has_lost(tmp_path, tree):
+    """A page in which fewer cells are counted is a sound one, for SQLite."""
+    settings = line(8, 8).replace(recording=Recording(n_samples=64))
+    create(tmp_path, entries(20, settings=settings), settings=settings).close()
+    path = tmp_path / "rec.h5.journal"
+    ((root,),) = json.loads(
+        python(
+            "import json, sqlite3, sys\n"
+            "connection = sqlite3.connect(sys.argv[1])\n"
+            "found = connection.execute('SELECT rootpage FROM sqlite_schema WHERE name = ?', sys.argv[2:])\n"
+            "print(json.dumps(found.fetchall()))",
+            path,
+            tree,
+        ).stdout
+    )
+    damaged = bytearray(path.read_bytes())
+    page = (root - 1) * PAGE_BYTES
+    damaged[page + 3 : page + 5] = (19).to_bytes(2, "big")
+    path.write_bytes(damaged)
+    with pytest.raises(DamagedError, match="is damaged, it lists"):
+        Journal.open(path)
+
+
+def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
+    """Built by hand as docs/formats.md says."""
+    create(tmp_path, entries(1)).close()
+    told = python(
+        "import sqlite3, sys\n"
+        "(row,) = sqlite3.connect(sys.argv[1]).execute('SELECT epoch, sequence, row_crc32 FROM measurements')\n"
+        "(header,) = sqlite3.connect(sys.argv[1]).execute('SELECT created, row_crc32 FROM journal')\n"
+        "print(*row, *header)",
+        tmp_path / "rec.h5.journal",
+    ).stdout.split()
+    assert (told[0], told[1]) == ("5", "10")
+    header = b"B\x06\0\0\0rec.h5" + b"T\x04\0\0\0test" + b"T\x14\0\0\0" + told[3].encode()
+    assert zlib.crc32(header) == int(told[4])
+    row = b"I\x03\0\0\0-12" + b"R\x08\0\0\0\0\0\0\0\0\0\xf8\xbf" + b"N\0\0\0\0" + b"T\x02\0\0\0\xc3\xa9"
+    assert row_crc32((-12, -1.5, None, "é")) == zlib.crc32(row)
+    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    example, check = re.search(r"`([0-9a-f ]{20,})` and the CRC-32 `([0-9a-f]{8})`", page).groups()
+    assert row_crc32((7, "a")) == zlib.crc32(bytes.fromhex(example)) == int(check, 16)
+
+
+def test_what_the_disk_cannot_read_now_is_not_damaged(tmp_path, monkeypatch):
+    """It may be read later: nothing is sealed, and nothing goes."""
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    execute = Database.execute
+
+    def fail(self, statement, values=()):
+        if values != (2,):
+            return execute(self, statement, values)
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR_READ
+        with self._told():
+            raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "execute", fail)
+        for act in (seal, verify):
+            with pytest.raises(DataError, match=r"rec.h5.journal cannot be written or read \(disk I/O error\)"):
+                act(path)
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
+    assert seal(path).damaged == 0
 
 
 def test_a_measurement_that_is_another_one(tmp_path):

@@ -1,5 +1,6 @@
 """Which serial ports are found, which one a name means, and what sensors say when they are asked."""
 
+import errno
 import json
 import os
 import re
@@ -115,13 +116,15 @@ def test_a_port_without_a_file_and_one_that_is_not_of_usb(monkeypatch):
 def test_several_ports_of_one_serial_number(monkeypatch):
     plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN7")
     wanted = re.escape("'SN7' are 2 ports: /dev/ttyACM0 (SN7), /dev/ttyACM1 (SN7); give the path of one")
-    with pytest.raises(SonarError, match=wanted):
+    with pytest.raises(SonarError, match=wanted) as caught:
         resolve("SN7")
+    assert caught.value.errno == errno.EINVAL
 
 
 def test_a_port_that_is_not_there(monkeypatch):
-    with pytest.raises(SonarError, match=r"no serial port 'SN7'; none is plugged in: .* 'ertis emulate'"):
+    with pytest.raises(SonarError, match=r"no serial port 'SN7'; none is plugged in: .* 'ertis emulate'") as caught:
         resolve("SN7")
+    assert caught.value.errno == errno.ENOENT
     plug_in(monkeypatch, ttyACM0="SN8")
     with pytest.raises(SonarError, match=r"no serial port '/dev/ttyACM7'; give one .* are: /dev/ttyACM0 \(SN8\)$"):
         resolve("/dev/ttyACM7")

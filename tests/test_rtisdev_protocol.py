@@ -22,10 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from ertis_numba.devices.commands import call_codes, call_hash
-from ertis_numba.devices.emulator import Emulator
-from ertis_numba.devices.registers import Registers
-from ertis_numba.devices.sync_chain import SyncChain
+from ertis_numba.devices.emulator import Emulator, SyncChain
+from ertis_numba.devices.emulator.registers import Registers
+from ertis_numba.devices.setup import call_codes, call_hash
 from ertis_numba.settings import Call
 
 N_SAMPLES = 65_536

@@ -3,6 +3,8 @@
 import itertools
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +13,13 @@ from ertis_bench import kills
 
 from ertis_numba import atomic
 from ertis_numba.errors import ArgumentError, DataError, InUseError
-from ertis_numba.journal import Journal
+from ertis_numba.journal import Journal, seal_apart, sealer
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, Numbers
-from ertis_numba.storage.sealing import IN_USE, main, seal
-from tests.journals import TINY, crashed, create, entries, python
+from ertis_numba.storage._sealing_process import IN_USE, NOTHING, main
+from ertis_numba.storage.sealing import seal
+from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python
 from tests.test_journal_damage import spoil
 
 TURNED = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
@@ -35,10 +38,10 @@ def two_sensors(folder):
         journal.add_sensor("right", TINY)
         for entry in given[1:]:
             journal.append([entry])
-        journal.note_gap("left", 12, 12, "footer")
-        journal.note_gap("left", 7, 9, "the sensor was unplugged")
-        journal.note_gap("right", 2, 5, "it never arrived")
-        journal.note_gap("absent", 0, 5, "it never arrived")
+        journal.note_gap("left", 12, 12, "footer", epoch=EPOCH)
+        journal.note_gap("left", 7, 9, "the sensor was unplugged", epoch=EPOCH)
+        journal.note_gap("right", 2, 5, "it never arrived", epoch=EPOCH)
+        journal.note_gap("absent", 0, 5, "it never arrived", epoch=EPOCH)
     return journal.path, [entry.measurement for entry in given]
 
 
@@ -57,7 +60,9 @@ def test_a_journal_becomes_a_recording(tmp_path):
         assert (left.firmware, left.translation_m.tolist()) == ("1.2.3", [1.0, -2.0, 0.5])
         assert left.rotation_xyzw.tolist() == list(TURNED)
         assert left.attributes["source"] == "test"
-        assert left.attributes["history"] == "sensor absent has no measurement; 0 to 5: it never arrived"
+        assert left.attributes["history"] == (
+            "sealed from rec.h5.journal; sensor absent has no measurement; 0 to 5: it never arrived"
+        )
         back = list(left)
     with open_recording(tmp_path / "rec.h5", sensor="right") as right:
         assert [(gap.first, gap.last, gap.reason) for gap in right.gaps] == [(2, 5, "it never arrived")]
@@ -88,6 +93,16 @@ def test_what_was_sealed_is_not_written_again(tmp_path):
     after = (tmp_path / "rec.h5").stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     assert sorted(item.name for item in tmp_path.iterdir()) == ["kept", "rec.h5", "rec.h5.12345678.part"]
+
+
+def test_a_recording_beside_a_journal_that_never_was(tmp_path):
+    seal(crashed(tmp_path))
+    (tmp_path / "rec.h5").rename(tmp_path / "typo.h5")
+    write_recording(tmp_path / "rec.h5", [entry.measurement for entry in entries()])
+    (tmp_path / "text.h5").write_text("mine")
+    for name in ("typo.h5", "rec.h5", "text.h5", "none.h5"):
+        with pytest.raises(DataError, match=f"{name}.journal: No such file or directory; give a journal"):
+            seal(tmp_path / f"{name}.journal")
 
 
 def with_gap(path, given, *, sensor="left", reason="footer"):
@@ -136,7 +151,7 @@ def test_nothing_was_measured(tmp_path, tables, capsys):
             journal.add_sensor("left", TINY)
     else:
         path.touch()
-    assert main([str(path)]) == 1
+    assert main([str(path)]) == NOTHING
     assert capsys.readouterr().err == f"{path}: no measurement was captured\n"
     assert not list(tmp_path.iterdir())
 
@@ -225,6 +240,92 @@ def test_a_process_of_its_own(tmp_path):
         done.stderr
         == f"{tmp_path / 'none.journal'}: No such file or directory; give a journal that 'ertis capture' left\n"
     )
+
+
+def test_it_goes_on_when_nobody_listens_any_more(tmp_path):
+    path = crashed(tmp_path)
+    command = [sys.executable, "-m", "ertis_numba.storage._sealing_process", "--json", str(path)]
+    with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        process.stderr.close()
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_apart(tmp_path):
+    path, _ = two_sensors(tmp_path)
+    shutil.copy(path, tmp_path / "kept")
+    told = []
+    sealed = seal_apart(path, progress=lambda *numbers: told.append(numbers))
+    assert told == [(number + 1, 5) for number in range(5)]
+    assert not path.exists()
+    shutil.copy(tmp_path / "kept", path)
+    assert sealed == seal(path)
+    with open_recording(tmp_path / "rec.h5", sensor="left") as left:
+        assert len(left) == 3
+
+
+def test_apart_nothing_was_measured(tmp_path):
+    create(tmp_path, []).close()
+    sealed = seal_apart(tmp_path / "rec.h5.journal")
+    assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
+
+
+def test_apart_refused(tmp_path):
+    with create(tmp_path) as journal, pytest.raises(InUseError, match=r"rec.h5.journal is in use by another process"):
+        seal_apart(journal.path)
+    (tmp_path / "rec.h5").write_text("mine")
+    with pytest.raises(DataError, match="exists and holds something else"):
+        seal_apart(journal.path)
+    assert seal_apart(journal.path, overwrite=True).measurements == 3
+
+
+@pytest.fixture
+def instead(tmp_path, monkeypatch):
+    """What makes seal_apart run a line of shell where it would run Python; ``$0`` is that line's own file."""
+
+    def replace_python(line):
+        script = tmp_path / "python"
+        script.write_text(f"#!/bin/sh\n{line}\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sealer.sys, "executable", str(script))
+
+    return replace_python
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("kill -9 $$", "ended with -9, saying nothing; seal it again"),
+        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, saying nothing; seal it again"),
+        ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, saying 'KeyError: 1'; seal it"),
+        ("seq 100000 >&2; exit 3", "ended with 3, saying '100000'; seal it again"),  # more than a pipe holds
+        (
+            f"exec {sys.executable} -c 'import os, sys; sys.exit(str(os.getsid(0) == os.getpid()))'",
+            "ended with 1, saying 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
+        ),
+    ],
+)
+def test_apart_and_lost(tmp_path, instead, line, reason):
+    instead(line)
+    with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
+        seal_apart(crashed(tmp_path))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_apart_and_interrupted(tmp_path, instead, late):
+    path = crashed(tmp_path)
+    begun = 'echo \'{"done": 1, "of": 3}\''
+    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"{begun}; exec sleep 60")
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as error:
+        seal_apart(path, progress=interrupt)
+    safe = f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
+    assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
+    assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
+    assert seal(path).measurements == 3
 
 
 def test_interrupted(tmp_path, monkeypatch):

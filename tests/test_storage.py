@@ -66,17 +66,20 @@ def test_recording_depends_on_no_other_file(tmp_path):
 def test_gaps_epochs_and_air(tmp_path):
     warm = SMALL.replace(air=Air(temperature_c=31.25, humidity_percent=80.0))
     words = noise(count=1)[0].words
-    stamps = [Stamp(sequence=s, sync_count=c) for s, c in [(3, 9), (4, 10), (9, 2), (10, 3), (12, 0)]]
+    runs = [(3, 7), (4, 7), (9, 7), (1, 2**40), (3, 2**40), (4, 0)]
+    stamps = [Stamp(sequence=sequence, epoch=epoch) for sequence, epoch in runs]
     write_recording(
         tmp_path / "rec.h5", (Measurement(words, warm if s.sequence == 9 else SMALL, s) for s in stamps), settings=SMALL
     )
     with open_recording(tmp_path / "rec.h5") as recording:
-        assert [(gap.first, gap.last) for gap in recording.gaps] == [(5, 8), (11, 11)]
+        assert [(gap.first, gap.last, gap.epoch) for gap in recording.gaps] == [(5, 8, 7), (2, 2, 2**40)]
+        assert recording.stamps() == stamps
         assert isinstance(recording.gaps[0], Gap)
-        assert [m.settings.air for m in recording] == [SMALL.air, SMALL.air, warm.air, SMALL.air, SMALL.air]
+        assert [m.settings.air for m in recording] == [SMALL.air] * 2 + [warm.air] + [SMALL.air] * 3
         assert recording.settings.air == SMALL.air
     with h5py.File(tmp_path / "rec.h5") as file:
-        assert file["sensors/sensor/epoch"][:].tolist() == [0, 0, 1, 1, 2]
+        assert file["sensors/sensor/epoch"][:].tolist() == [epoch for _, epoch in runs]
+        assert file["sensors/sensor/gap_epoch"][:].tolist() == [7, 2**40]
 
 
 def test_columns_pass_the_end_of_a_chunk(tmp_path):

@@ -68,14 +68,15 @@ def test_energyscapes_of_several_sensors_come_back(tmp_path):
 
 def test_each_sensor_has_gaps_and_epochs_of_its_own(tmp_path):
     given = two()
-    given[2] = replace(given[2], stamp=replace(given[2].stamp, sequence=20, sync_count=1))
+    given[2] = replace(given[2], stamp=replace(given[2].stamp, sequence=20, epoch=3))
+    given.append(replace(given[2], stamp=replace(given[2].stamp, sequence=22)))
     write_recording(tmp_path / "rec.h5", given)
     with open_recording(tmp_path / "rec.h5", sensor="left") as left:
-        assert [(gap.first, gap.last) for gap in left.gaps] == [(11, 19)]
+        assert [(gap.first, gap.last, gap.epoch) for gap in left.gaps] == [(21, 21, 3)]
     with open_recording(tmp_path / "rec.h5", sensor="right") as right:
         assert right.gaps == ()
     with h5py.File(tmp_path / "rec.h5") as file:
-        assert file["sensors/left/epoch"][:].tolist() == [0, 1]
+        assert file["sensors/left/epoch"][:].tolist() == [0, 3, 3]
         assert file["sensors/right/epoch"][:].tolist() == [0, 0, 0]
 
 

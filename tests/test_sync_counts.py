@@ -62,7 +62,7 @@ def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
         if sensor == last and pulse >= 20 + seed and seed:
             if restarted is None:
                 restarted = counter - 7
-                counts.forget(last)
+                found += counts.forget(last)
             counter -= restarted  # noqa: PLW2901
         found += counts.add(sensor, (sensor, pulse), counter, now_ns)
     found += counts.release(now_ns, at_once=True)
@@ -81,6 +81,19 @@ def test_a_counter_that_missed_a_pulse_unnoticed_is_compared_anew():
     assert first
     assert counts.realigned >= 1
     assert all(number == pulse for (sensor, pulse), number in found if pulse >= 35)
+
+
+def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
+    counts = SyncCounts(["a", "b"], shortest_s=SHORTEST_S)
+    found = [each for number in range(4) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
+    found += counts.add("b", ("b", 2), 100, 205_000_000)
+    assert not [item for (item, _), _ in found if item == "b"]  # too few to decide
+    assert counts.forget("b") == [(("b", 2), 2)]
+    assert counts.forget("b") == []
+    found += [each for number in range(4, 8) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
+    found += [each for number in (4, 5, 6) for each in counts.add("b", ("b", number), number - 4, number * 100_000_000)]
+    assert all(pulse == number for (_, pulse), number in found)
+    assert len(found) == 11
 
 
 def test_nothing_waits_for_ever():

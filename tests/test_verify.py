@@ -1,19 +1,25 @@
-"""What is missing or damaged is found and told, all of it; what a crash has left is recovered."""
+"""What is missing or damaged is found and told, all of it."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError
 from ertis_numba.journal import Journal
-from ertis_numba.storage import RecordingWriter, write_energyscapes, write_recording
+from ertis_numba.storage import RecordingWriter, open_recording, write_energyscapes, write_recording
+from ertis_numba.storage._gaps import UNKNOWN
+from ertis_numba.storage._rows import RowReader
+from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.files import image
-from tests.journals import crashed, create, entries
+from tests.journals import EPOCH, crashed, create, entries
 from tests.test_journal_damage import spoil
 
 
@@ -35,8 +41,8 @@ def recording(tmp_path):
     with RecordingWriter(tmp_path / "rec.h5") as writer:
         for measurement in measurements(10, 11, 12, 14, 15, 18):
             writer.write(measurement)
-        writer.note_gap("left", 13, 13, "footer")
-        writer.note_gap("left", 19, 21, "the sensor was unplugged")
+        writer.note_gap("left", 13, 13, "footer", EPOCH)
+        writer.note_gap("left", 19, 21, "the sensor was unplugged", EPOCH)
     return tmp_path / "rec.h5"
 
 
@@ -86,8 +92,66 @@ def test_numbers_that_start_again(tmp_path):
         journal.append(entries(2, first=0, epoch=2))
     assert verify(journal.path)[0].whole
     given = measurements(8, 9, 0, 1)
-    given[2:] = [replace(m, stamp=replace(m.stamp, sync_count=m.stamp.sequence)) for m in given[2:]]
+    given[2:] = [replace(m, stamp=replace(m.stamp, epoch=2**62)) for m in given[2:]]
     assert verify(write_recording(tmp_path / "rec.h5", given))[0].whole
+
+
+def test_gaps_of_two_runs(tmp_path):
+    """Each run has its own numbers, also where both have given the same ones."""
+    with create(tmp_path, [*entries(1, first=0, epoch=9), *entries(1, first=3, epoch=9)]) as journal:
+        journal.append([*entries(2, first=0, epoch=4), *entries(1, first=3, epoch=4)])
+        journal.note_gap("left", 2, 2, "footer", epoch=4)
+        journal.note_gap("left", 2, 2, "it never arrived", epoch=9)
+        journal.note_gap("left", 0, 1, "it was silent", epoch=3)
+    spoil(journal.path, "UPDATE measurements SET words = x'00' WHERE id = 3")
+    wanted = [
+        (1, 1, UNKNOWN, 9),
+        (2, 2, "it never arrived", 9),
+        (0, 0, "damaged in the journal", 4),
+        (2, 2, "footer", 4),
+        (0, 1, "it was silent", 3),
+    ]
+    (report,) = verify(journal.path)
+    assert [(gap.first, gap.last, gap.reason, gap.epoch) for gap in report.gaps] == wanted
+    shutil.copy(journal.path, tmp_path / "kept")
+    seal(journal.path)
+    shutil.move(tmp_path / "kept", journal.path)
+    before = (tmp_path / "rec.h5").stat().st_ino
+    seal(journal.path)  # killed in between
+    assert (tmp_path / "rec.h5").stat().st_ino == before
+    (report,) = verify(tmp_path / "rec.h5")
+    assert [(gap.first, gap.last, gap.reason, gap.epoch) for gap in report.gaps] == wanted
+    assert (report.disordered, report.damaged) == ((), ())
+
+
+def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
+    given = [*entries(2, first=8, epoch=2**63 - 1), *entries(3, first=0, epoch=1)]
+    create(tmp_path, given).close()
+    path = seal(tmp_path / "rec.h5.journal").recording
+    assert verify(path)[0].whole
+    with open_recording(path) as recording:
+        assert recording.stamps() == [measurement.stamp for measurement in recording]
+        assert recording.stamps() == [entry.measurement.stamp for entry in given]
+
+
+@pytest.mark.parametrize("name", ["line", "reflectors", "reflectors_3d"])
+def test_files_from_before_epochs_were_numbers_of_runs(name):
+    path = Path(__file__).parents[1] / "data" / "synthetic" / f"{name}.h5"
+    with h5py.File(path) as file:
+        (group,) = file["sensors"].values()
+        assert (group["epoch"].dtype, "gap_epoch" in group) == (np.dtype("<i4"), False)
+    assert all(report.whole for report in verify(path))
+
+
+def test_a_disk_that_fails_damages_no_recording(tmp_path, monkeypatch):
+    path = write_recording(tmp_path / "rec.h5", measurements(1, 2))
+
+    def fail(*_):
+        raise OSError("Can't read data (file read failed: time = now, errno = 5, error message = 'Input/output error')")
+
+    monkeypatch.setattr(RowReader, "row", fail)
+    with pytest.raises(DataError, match=r"rec.h5 cannot be read \(Input/output error\); check the disk"):
+        verify(path)
 
 
 def test_one_sensor_of_two_cannot_be_read(tmp_path):
@@ -108,7 +172,7 @@ def test_journals(tmp_path):
     path = crashed(tmp_path, [*entries(2), *entries(1, sensor="right")])
     assert [report.whole for report in verify(path)] == [True, True]
     with Journal.open(path) as journal:
-        journal.note_gap("left", 12, 13, "footer")
+        journal.note_gap("left", 12, 13, "footer", epoch=EPOCH)
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id <= 2")
     left, right = verify(path)
     assert right.whole
@@ -136,57 +200,3 @@ def test_a_recording_without_a_sensor(recording):
         del file["sensors/left"]
     with pytest.raises(DataError, match=r"rec.h5 holds no sensor; copy it again"):
         verify(recording)
-
-
-def test_recover_a_folder(tmp_path):
-    (tmp_path / "sub").mkdir()
-    crashed(tmp_path)
-    crashed(tmp_path, entries(1), name="b.h5")
-    (tmp_path / "c.h5.journal").touch()
-    with create(tmp_path, name="used.h5"):
-        done = run("recover", tmp_path)
-    assert sorted(done.stderr.splitlines()) == [
-        f"{tmp_path}/b.h5: 1 measurement, 0 missing",
-        f"{tmp_path}/c.h5.journal: no measurement was captured; removed",
-        f"{tmp_path}/rec.h5: 3 measurements, 0 missing",
-        f"{tmp_path}/used.h5.journal: in use by a running capture; left alone",
-    ]
-    assert done.stdout == ""
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.h5", "rec.h5", "sub", "used.h5.journal"]
-    assert verify(tmp_path / "rec.h5")[0].whole
-
-
-def test_recover_what_cannot_be_sealed(tmp_path):
-    path = crashed(tmp_path)
-    (tmp_path / "rec.h5").write_text("mine")
-    crashed(tmp_path, name="b.h5")
-    done = run("recover", tmp_path, "--json", "--quiet", code=1)
-    assert done.stderr == (
-        f"ertis: error: {tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force\n"
-    )
-    told = json.loads(done.stdout)["journals"]
-    assert [(report.get("measurements"), "error" in report) for report in told] == [(3, False), (None, True)]
-    assert run("recover", path, "--force", "--quiet").stderr == ""
-    assert verify(tmp_path / "rec.h5")[0].whole
-
-
-def test_recover_damaged_measurements(tmp_path):
-    create(tmp_path).close()
-    path = tmp_path / "rec.h5.journal"
-    spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
-    told = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
-    assert told in run("recover", path).stderr
-
-
-def test_recover_nothing(tmp_path):
-    assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
-    assert run("recover", tmp_path, "--quiet").stderr == ""
-    assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}
-    assert "none.journal: No such file or directory" in run("recover", tmp_path / "none.journal", code=1).stderr
-
-
-def test_recover_from_a_folder_with_a_module_in_it(tmp_path, monkeypatch):
-    crashed(tmp_path)
-    (tmp_path / "h5py.py").write_text("raise SystemExit('the wrong one')")
-    monkeypatch.chdir(tmp_path)
-    assert run("recover", ".").stderr == "rec.h5: 3 measurements, 0 missing\n"

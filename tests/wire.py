@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ertis_numba.devices.commands import FRAME_BYTES, encode_block
+from ertis_numba.devices.blocks import FRAME_BYTES, encode_block
 from ertis_numba.devices.protocol import Instant
 
 N_SAMPLES = 5

@@ -112,9 +112,9 @@ def _append(*, path: str, seed: int) -> None:
             sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _LATE)])
             if sensor not in journal.sensors:
                 journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
-            stamp = Stamp(sensor=sensor, sequence=counts[sensor])
+            stamp = Stamp(sensor=sensor, sequence=counts[sensor], epoch=_EPOCH)
             measurement = Measurement(_words(seed, sensor, counts[sensor]), _SETTINGS, stamp)
-            entries.append(Entry(measurement, epoch=_EPOCH, monotonic_ns=counts[sensor]))
+            entries.append(Entry(measurement, monotonic_ns=counts[sensor]))
             counts[sensor] += 1
         journal.append(entries)
         for entry in entries:
@@ -165,11 +165,13 @@ def _crash(folder: Path, seed: int) -> None:
             journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3", translation_m=(1.0, 2.0, 3.0))
         for sequence in (1, 2, 3, 5, 6):
             for sensor in _SENSORS:
-                stamp = Stamp(sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence)
+                stamp = Stamp(
+                    sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence, epoch=_EPOCH
+                )
                 words = _words(seed, sensor, sequence)
-                journal.append([Entry(Measurement(words, _SETTINGS, stamp), epoch=_EPOCH, monotonic_ns=sequence)])
-        journal.note_gap("left", 4, 4, "footer")
-        journal.note_gap("absent", 0, 6, "it was silent")
+                journal.append([Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=sequence)])
+        journal.note_gap("left", 4, 4, "footer", epoch=_EPOCH)
+        journal.note_gap("absent", 0, 6, "it was silent", epoch=_EPOCH)
         shutil.copytree(made, folder)  # nothing is written now: to the files, it is as if this process was killed
     shutil.rmtree(made)
 

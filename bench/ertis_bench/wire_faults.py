@@ -9,11 +9,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.devices.commands import encode_block
-from ertis_numba.devices.faults import Faults, Spoilt, Stall, Unplug
+from ertis_numba.devices.blocks import COUNTERS, encode_block
+from ertis_numba.devices.emulator.faults import Faults, Spoilt, Stall, Unplug
 from ertis_numba.devices.protocol import Block, Instant, Receiver
 
-__all__ = ["KINDS", "Line", "Report", "send"]
+__all__ = ["KINDS", "Report", "Wire", "send"]
 
 KINDS: Final[dict[str, float]] = {
     "flip": 0.12,
@@ -89,7 +89,7 @@ class _Sent:
     delivered: bool = False
 
 
-class Line:
+class Wire:
     """Triggers, a line with faults, and a receiver whose blocks are compared with those that were sent.
 
     Parameters are those of `send`.
@@ -118,7 +118,7 @@ class Line:
     def measure(self, words: NDArray[np.uint32]) -> None:
         """Send one more block."""
         self._wait()
-        counter, self._counter = self._counter, (self._counter + 1) % 2**32
+        counter, self._counter = self._counter, (self._counter + 1) % COUNTERS
         block = encode_block(counter, words)
         spoilt = self._faults.spoil(block)
         self._note(counter, block, spoilt)
@@ -231,10 +231,10 @@ def send(
     Report
     """
     random = np.random.default_rng(seed)
-    line = Line(
+    wire = Wire(
         n_samples=n_samples,
         faults=Faults(seed, kinds),
-        counter=(2**32 - n_blocks // 2) % 2**32,
+        counter=(-n_blocks // 2) % COUNTERS,
         triggers=triggers,
         deadline_s=deadline_s,
         bits=bits,
@@ -246,7 +246,7 @@ def send(
         else:
             begin = int(random.integers(len(words) - n_samples + 1))
             block = words[begin : begin + n_samples]
-        line.measure(block)
+        wire.measure(block)
         if progress is not None:
             progress()
-    return line.finish()
+    return wire.finish()

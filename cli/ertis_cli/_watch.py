@@ -34,7 +34,9 @@ class Signals:
     def __call__(self, number: int, _: object) -> None:
         self.came.append(number)
         if self.stop is None or len(self.came) > 1:  # before there is anything to save, or who asks twice means it
-            raise KeyboardInterrupt
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            sys.exit(128 + number)
         self.stop()
 
 
@@ -69,6 +71,10 @@ class Watch:
             session.run(journal)
         except (OSError, ValueError) as error:  # what was stored is sealed whatever happened
             return error
+        except (KeyboardInterrupt, SystemExit):
+            path = journal.path
+            click.echo(f"the measurements so far are safe in {path}; seal them by 'ertis recover {path}'", err=True)
+            raise
         finally:
             self.took = {"seconds": time.monotonic() - begun_s, "cpu_s": time.process_time() - cpu_s}
             if self._line:
@@ -91,6 +97,9 @@ class Watch:
                         "crc32": entry.crc32,
                     }
                 )
+
+    def tick(self) -> None:
+        """Draw the line of progress again, if it is time."""
         if self._line and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _REFRESH_S
             click.echo(f"\r\x1b[K{self._progress()}", err=True, nl=False)
@@ -147,7 +156,6 @@ def report(target: Path, session: "Session", took: dict[str, float], *, quiet: b
             sensor: {
                 "stored": each.stored,
                 "missing": dict(each.missing),
-                "failed": each.failed,
                 "unplugged": each.unplugged,
             }
             for sensor, each in counts.items()

@@ -13,7 +13,10 @@ from ertis_cli import options
 from ertis_cli._watch import Watch, report, stopped_by_signals
 
 if TYPE_CHECKING:
-    from ertis_numba.devices.commands import Setup
+    from collections.abc import Iterable
+
+    from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import Sonar
     from ertis_numba.settings import Settings
 
@@ -96,18 +99,17 @@ def capture(
     complete at the end. Ctrl-C ends a capture after the measurement that has begun. What a crash leaves,
     'ertis recover' seals. With --json there is a line for each measurement.
     """
-    from ertis_numba.devices.commands import Setup
+    from ertis_numba.devices.setup import Setup
 
     settings = _settings(preset, layout, settings_file, temperature)
     trigger = "sync" if listen_only else trigger
-    setup = Setup.of(settings, active=not passive, trigger=trigger, pin=pin, emissions=emissions)
+    setup = Setup.of(settings, active=not passive, pin=pin, emissions=emissions)
     if dry_run:
         _print_commands(setup, as_json=as_json)
         return
     _require_one_each(ports, names)
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
-    from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.sonar import Sonar
     from ertis_numba.journal import SUFFIX, Journal
 
@@ -129,8 +131,9 @@ def capture(
             on_stored=watch.stored,
             on_note=watch.note,
             on_back=watch.back,
+            on_tick=watch.tick,
         )
-        checks = {name: BitCheck(setup.n_samples, setup.pdm_rate_hz, splices=refuse_splices) for name in sonars}
+        checks = _checks(sonars, settings, splices=refuse_splices) if check_bits else {}
         for name, sonar in sonars.items():
             sonar.configure(setup, bits=checks[name].check if check_bits else None)
         path = target.with_name(f"{target.name}{SUFFIX}")
@@ -139,26 +142,51 @@ def capture(
         )
         signals.stop = session.stop
         failure = watch.run(session, journal, checks)
+        asked_to_end = list(signals.came)
         stack.close()
         _seal(path, failure, overwrite=force)
     report(target, session, watch.took, quiet=quiet, as_json=as_json)
     if failure is not None:
         raise failure
-    if signals.came and (n is not None or duration is not None):
-        sys.exit(128 + signals.came[0])
+    if asked_to_end and (n is not None or duration is not None):
+        sys.exit(128 + asked_to_end[0])
 
 
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
-    """Make the recording, whatever has ended the capture; what that was is told rather than that nothing came."""
-    from ertis_numba.capture.sealer import seal_apart
+    """Make the recording, whatever has ended the capture; what that was is told last."""
+    from ertis_numba.errors import DataError
+    from ertis_numba.journal import seal_apart
 
     try:
-        seal_apart(path, overwrite=overwrite)
+        sealed = seal_apart(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        raise failure or error from error
-    except KeyboardInterrupt:
-        click.echo(f"the measurements are safe in {path}; seal them by 'ertis recover {path}'", err=True)
-        raise
+        told = f"{error}; the measurements are safe in {path}, seal them by 'ertis recover {path}'"
+        if failure is None:
+            raise DataError(told) from error
+        click.echo(f"ertis: error: {told}", err=True)
+        raise failure from error
+    except KeyboardInterrupt as interrupt:
+        click.echo(str(interrupt), err=True)
+        if failure is None:
+            raise
+        raise failure from interrupt
+    if sealed.recording is None:
+        raise failure or DataError(sealed.remark)
+    if sealed.remark:
+        click.echo(sealed.remark, err=True)
+
+
+def _checks(names: "Iterable[str]", settings: "Settings", *, splices: bool) -> "dict[str, BitCheck]":
+    """Return what looks at the words of each sensor."""
+    import numpy as np
+
+    from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.geometry import microphones
+
+    recording, given = settings.recording, microphones(settings.array).enabled
+    enabled = np.zeros(32, dtype=bool)
+    enabled[: len(given)] = given
+    return {name: BitCheck(recording.n_samples, recording.pdm_rate_hz, enabled, splices=splices) for name in names}
 
 
 def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:

@@ -101,10 +101,9 @@ def emulate(
     commands of a real one, and measures what the scene lets it hear, or what was recorded, over and over.
     Measurements without emission are those of the scene while all sensors are silent.
     """
-    from ertis_numba.devices.emulator import Emulator
-    from ertis_numba.devices.faults import Faults
-    from ertis_numba.devices.places import HeldLink, emulated_folder
-    from ertis_numba.devices.sync_chain import SyncChain
+    from ertis_numba.devices.emulator import Emulator, SyncChain
+    from ertis_numba.devices.emulator.faults import Faults
+    from ertis_numba.devices.links import HeldLink, emulated_folder
 
     kinds = dict(faults)
     Faults(0, kinds)  # refused before a scene is rendered
@@ -150,7 +149,7 @@ def emulate(
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
     """Return the sensors to emulate, none of which measures what no device can."""
-    from ertis_numba.devices.commands import Setup
+    from ertis_numba.devices.setup import Setup
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import open_recording
 

@@ -1,9 +1,7 @@
 """``ertis recover``: recordings from what an interrupted capture left."""
 
-import json
-import subprocess
-import sys
-from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +32,7 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
         options.say(f"no journal in {', '.join(map(str, places))}", quiet=quiet)
     reports = []
     for journal in journals:
-        report = {"journal": str(journal), **_seal(journal, force=force, quiet=quiet)}
+        report = _seal(journal, force=force, quiet=quiet)
         reports.append(report)
         if _failed(report):
             click.echo(f"ertis: error: {report['error']}", err=True)
@@ -52,33 +50,27 @@ def _found(place: Path) -> list[Path]:
 
 
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
-    """Seal a journal in a process of its own, which a failing disk may end, and return what that says at last."""
-    # Without -P, a file in the folder where one happens to be could stand in for a module.
-    command = [sys.executable, "-P", "-m", "ertis_numba.storage.sealing", "--json", *(["--force"] if force else [])]
-    told: dict[str, Any] = {"error": f"{journal}: the process that seals it said nothing; it is still there"}
-    with (
-        subprocess.Popen(  # noqa: S603  this very package
-            [*command, "--", str(journal)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        ) as process,
-        options.progress(_steps(process, told), length=_STEPS, label=journal.name, quiet=quiet) as shown,
-    ):
-        for _ in shown:
-            pass
-    return told
+    """Seal a journal and return what became of it, as it is printed."""
+    from ertis_numba.errors import DataError, InUseError
+    from ertis_numba.journal import seal_apart
 
+    with options.progress(range(_STEPS), length=_STEPS, label=journal.name, quiet=quiet) as shown:
+        steps = iter(shown)
+        n_told = 0
 
-def _steps(process: "subprocess.Popen[str]", told: dict[str, Any]) -> Iterator[None]:
-    """Yield so often as a share of the work is done, and put what the process says at last into ``told``."""
-    n_told = 0
-    for line in process.stdout or ():
-        report = json.loads(line)
-        if "of" not in report:
-            told.clear()
-            told.update(report)
-            continue
-        while n_told < _STEPS * report["done"] // report["of"]:
-            n_told += 1
-            yield
+        def progress(done: int, of: int) -> None:
+            nonlocal n_told
+            for _ in islice(steps, _STEPS * done // of - n_told):
+                n_told += 1
+
+        try:
+            sealed = seal_apart(journal, overwrite=force, progress=progress)
+        except (DataError, OSError) as error:
+            return {"journal": str(journal), "error": str(error), "in_use": isinstance(error, InUseError)}
+        except KeyboardInterrupt as interrupt:
+            click.echo(str(interrupt), err=True)
+            raise
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(sealed).items()}
 
 
 def _failed(report: dict[str, Any]) -> bool:

@@ -10,19 +10,33 @@ from ertis_numba.devices.protocol import Block
 from ertis_numba.devices.sonar import Sonar
 from ertis_numba.errors import SonarError, SonarGoneError
 
-__all__ = ["Arrived", "Ended", "Event", "Failed", "Note", "Pace", "Reader", "Returned"]
+__all__ = ["Arrived", "Ended", "Event", "Failed", "Note", "Pace", "Reader", "Restarted", "Returned"]
 
-_MOST_FAILURES = 5  # measurements in a row without an answer
+_COUNTS = 2**32  # of the counter
 
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """A measurement is here."""
+    """A measurement is here.
+
+    Attributes
+    ----------
+    sensor : str
+    block : Block
+    count : int
+        Number of the measurement among those of this sensor: of the commands that it was given, or else what it has
+        counted itself, from 0 and without end.
+    tick : int or None
+        Of the command, which all sensors share; None where SYNC pulses trigger.
+    damaged : bool
+        Whether blocks were rejected since the one before.
+    """
 
     sensor: str
     block: Block
+    count: int
     tick: int | None
-    """Number of the command; None where SYNC pulses trigger."""
+    damaged: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +44,12 @@ class Failed:
     """A measurement that was asked for did not come."""
 
     sensor: str
+    count: int
     reason: str
+    """For the recording: short."""
+
+    text: str
+    """For whoever watches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +61,15 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
+class Restarted:
+    """A sensor's counter has begun anew, as after a power cut that nobody has noticed."""
+
+    sensor: str
+
+
+@dataclass(frozen=True, slots=True)
 class Returned:
-    """A sensor was unplugged and is back; its counter has started again."""
+    """A sensor was unplugged and is back."""
 
     sensor: str
     away_s: float
@@ -57,7 +83,7 @@ class Ended:
     error: Exception | None
 
 
-Event = Arrived | Failed | Note | Returned | Ended
+Event = Arrived | Failed | Note | Restarted | Returned | Ended
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,6 +107,8 @@ class Pace:
 class Reader(threading.Thread):
     """Takes the blocks of one sensor, and survives that it is unplugged.
 
+    Nothing else may use the sensor while this runs.
+
     Parameters
     ----------
     sensor : str
@@ -102,6 +130,9 @@ class Reader(threading.Thread):
         self._patience_s, self._events = patience_s, events
         self._stop_asked = threading.Event()
         self._abandoned = threading.Event()
+        self._counter: int | None = None  # of the latest block
+        self._count = 0
+        self._rejected = 0
 
     def stop(self) -> None:
         """Take the measurement that has begun, and no more."""
@@ -128,16 +159,21 @@ class Reader(threading.Thread):
         while not self._stop_asked.is_set():
             try:
                 for block in self._sonar.listen(stop=self._may_stop, timeout_s=self._patience_s):
-                    self._put(Arrived(self._sensor, block, None))
+                    self._count_on(block)
+                    self._put(Arrived(self._sensor, block, self._count, None, self._was_damaged()))
             except SonarGoneError as error:
-                self._come_back(error)
+                self._put(Note(self._sensor, str(error)))
+                self._come_back()
+            else:
+                return
 
     def _may_stop(self) -> bool:
         """Whether to stop listening: not within a measurement, of which the rest comes or whose deadline passes."""
         return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
     def _command(self, pace: Pace) -> None:
-        tick = taken = failures = 0
+        tick = taken = 0
+        latest_s = time.monotonic()
         while pace.n is None or taken < pace.n:
             due_s = pace.start_s + tick / pace.rate_hz
             if self._stop_asked.wait(max(0.0, due_s - time.monotonic())):
@@ -145,20 +181,35 @@ class Reader(threading.Thread):
             try:
                 block = self._sonar.measure()
             except SonarGoneError as error:
-                self._come_back(error)
+                self._put(Failed(self._sensor, self._count, "the sensor was unplugged", str(error)))
+                self._come_back()
+                latest_s = time.monotonic()
             except SonarError as error:
-                failures += 1
-                self._put(Failed(self._sensor, str(error)))
-                if failures == _MOST_FAILURES:
+                self._put(Failed(self._sensor, self._count, "it did not arrive in time", str(error)))
+                if time.monotonic() - latest_s > self._patience_s:
                     raise
             else:
-                failures, taken = 0, taken + 1
-                self._put(Arrived(self._sensor, block, tick))
+                latest_s, taken = time.monotonic(), taken + 1
+                self._put(Arrived(self._sensor, block, self._count, tick, self._was_damaged()))
+            self._count += 1
             late = math.ceil((time.monotonic() - pace.start_s) * pace.rate_hz - 1e-3)
             tick = max(tick + 1, late)
 
-    def _come_back(self, error: SonarGoneError) -> None:
-        self._put(Note(self._sensor, str(error)))
+    def _count_on(self, block: Block) -> None:
+        """Follow the sensor's own count."""
+        if self._counter is not None:
+            step = (block.counter - self._counter) % _COUNTS
+            if step >= _COUNTS // 2:
+                self._put(Restarted(self._sensor))
+                step = 1
+            self._count += step
+        self._counter = block.counter
+
+    def _was_damaged(self) -> bool:
+        before, self._rejected = self._rejected, sum(self._sonar.receiver.rejected_blocks.values())
+        return self._rejected > before
+
+    def _come_back(self) -> None:
         gone_s = time.monotonic()
         self._sonar.reconnect(within_s=self._patience_s, stop=self._stop_asked.is_set)
         if not self._stop_asked.is_set():

@@ -1,28 +1,41 @@
-"""A capture: sensors in, a journal out."""
+"""A capture: sensors in, durable measurements out."""
 
 import queue
 import secrets
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from ertis_numba import checks
-from ertis_numba.capture.readers import Arrived, Ended, Event, Failed, Note, Pace, Reader, Returned
+from ertis_numba.capture.readers import Arrived, Ended, Event, Failed, Note, Pace, Reader, Restarted, Returned
 from ertis_numba.capture.sync_counts import SyncCounts
 from ertis_numba.devices.sonar import Sonar
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry, Journal
+from ertis_numba.journal import Entry
 from ertis_numba.settings import Settings
 
-__all__ = ["Counts", "Session"]
+__all__ = ["Counts", "Session", "Sink"]
 
-_WAITING = 64  # blocks that wait for the disk, some 40 MB; then sensors wait
+_WAITING_BYTES = 40_000_000  # of blocks that wait for the disk; then sensors wait
 _RECENT_S = 3.0  # over which the rate is told
 _GROUPS = 16  # that are still open: sensors deliver what they measured together at different times
-_TURNS = 2**32  # of the counter
+
+
+class Sink(Protocol):
+    """Where measurements become durable, such as a `Journal`."""
+
+    def add_sensor(self, name: str, settings: Settings, *, firmware: str = "") -> None:
+        """Tell of a sensor before its first measurement."""
+
+    def append(self, entries: Sequence[Entry]) -> None:
+        """Store measurements; when this returns they are durable."""
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+        """Store which of a sensor's numbers are missing, and why."""
 
 
 @dataclass(slots=True)
@@ -32,53 +45,46 @@ class Counts:
     Attributes
     ----------
     stored : int
-        Durable in the journal.
+        Durable.
     missing : Counter of str
-        Sequence numbers that are missing, by reason.
-    failed : int
-        Measurements that were asked for and did not come.
+        Numbers that are missing, by reason.
     unplugged : int
     """
 
     stored: int = 0
     missing: Counter[str] = field(default_factory=Counter)
-    failed: int = 0
     unplugged: int = 0
-    _recent: deque[float] = field(default_factory=deque)
+    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
+    """When the latest were stored, by `time.monotonic`."""
 
     @property
     def lost(self) -> int:
         """All that is missing."""
-        return sum(self.missing.values()) + self.failed
+        return sum(self.missing.values())
 
     @property
     def rate_hz(self) -> float:
         """Measurements per second, lately."""
-        while self._recent and self._recent[0] < time.monotonic() - _RECENT_S:
-            self._recent.popleft()
-        if len(self._recent) < 2:
-            return 0.0
-        return (len(self._recent) - 1) / max(self._recent[-1] - self._recent[0], 1e-9)
-
-    def count(self) -> None:
-        """Count a stored measurement."""
-        self.stored += 1
-        self._recent.append(time.monotonic())
+        now_s = time.monotonic()
+        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
+        return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
 
 
 @dataclass(slots=True)
 class _Track:
     """Where one sensor's numbers are."""
 
-    counter: int | None = None  # of its latest block
-    count: int = 0  # of its measurements; whether a counter that was set to 0 starts there is up to the firmware
-    sequence: int | None = None
-    away: bool = False
-    rejected: int = 0
+    sequence: int | None = None  # of the latest that is stored or known to be missing
+    first_pulse: int | None = None
+    why: str = ""  # measurements are missing, where that is known
+    passed: bool = False  # whether a pulse beyond the last that is wanted has come
 
 
 class Session:
-    """Takes measurements of sensors into a journal, durably and in groups.
+    """Takes measurements of sensors, makes them durable, and tells of them.
+
+    Numbers in the sequence are those of the commands that a sensor was given, or else of the pulses since its first:
+    one that is missing is a measurement that is.
 
     Parameters
     ----------
@@ -91,27 +97,31 @@ class Session:
     rate_hz : float
         Of commands.
     n : int, optional
-        Measurements of each sensor; until it is stopped by default.
+        Measurements of each sensor, or pulses; until it is stopped by default.
     duration_s : float, optional
     patience_s : float
         How long a sensor may be silent or unplugged before it is given up.
+    epoch : int, optional
+        Number of this run, without which the sequence of another could not be told from this one's; drawn by default.
     on_stored : callable, optional
         Called with the entries of each commit, when they are durable.
     on_note : callable, optional
         Called with the sensor's name and a line about it.
     on_back : callable, optional
         Called with the sensor's name and the seconds that it was unplugged.
+    on_tick : callable, optional
+        Called some ten times a second.
 
     Attributes
     ----------
     counts : dict of str to Counts
     complete, incomplete : int
-        Pulses of which all sensors have delivered, and others; of several sensors only.
+        Pulses of which all sensors have delivered, and others.
     """
 
     def __init__(
         self,
-        sonars: dict[str, Sonar],
+        sonars: Mapping[str, Sonar],
         settings: Settings,
         *,
         trigger: str,
@@ -119,27 +129,30 @@ class Session:
         n: int | None = None,
         duration_s: float | None = None,
         patience_s: float = 30.0,
+        epoch: int | None = None,
         on_stored: Callable[[list[Entry]], None] = lambda _: None,
         on_note: Callable[[str, str], None] = lambda _sensor, _text: None,
         on_back: Callable[[str, float], None] = lambda _sensor, _away_s: None,
+        on_tick: Callable[[], None] = lambda: None,
     ) -> None:
         checks.choice("trigger", trigger, ("command", "sync"))
         if not sonars:
             raise ArgumentError("no sensor is given to capture from; give at least one")
-        self._sonars, self._settings = sonars, settings
-        self._journal: Journal
+        self._sonars, self._settings = dict(sonars), settings
         self._synced = trigger == "sync"
         self._rate_hz = checks.between("rate", rate_hz, 1e-3, 1e3)
         self._n = None if n is None else checks.whole("n", n, 1)
         self._duration_s = None if duration_s is None else checks.positive("duration", duration_s)
         self._patience_s = checks.positive("patience", patience_s)
-        self._on_stored, self._on_note, self._on_back = on_stored, on_note, on_back
-        self._epoch = secrets.randbits(63)
+        self._on_stored, self._on_note, self._on_back, self._on_tick = on_stored, on_note, on_back, on_tick
+        self._epoch = secrets.randbits(62) if epoch is None else checks.whole("epoch", epoch, 0, 2**63 - 1)
+        self._record_ns = round(1e9 * settings.recording.duration_s)
         self._stop = threading.Event()
         self._errors: dict[str, Exception] = {}
         self._tracks = {sensor: _Track() for sensor in sonars}
         self._pulses: SyncCounts[Arrived] = SyncCounts(list(sonars), shortest_s=settings.recording.duration_s)
         self._groups: dict[int, int] = {}
+        self._closed = -(2**63)  # the latest group that is not open any more
         self._ended: set[str] = set()
         self.counts = {sensor: Counts() for sensor in sonars}
         self.complete = self.incomplete = 0
@@ -148,81 +161,89 @@ class Session:
         """End after the measurement that has begun; may be called from a signal handler or another thread."""
         self._stop.set()
 
-    def run(self, journal: Journal) -> None:
-        """Capture into a journal until it is done.
+    def run(self, sink: Sink) -> None:
+        """Capture until it is done.
 
         Raises
         ------
         SonarError
-            Sensors were given up; what the others delivered is in the journal.
+            Sensors were given up; what the others delivered is stored.
         DataError
-            The journal cannot be written; what was reported is in it.
+            Nothing more can be stored; what was told of is.
         """
-        self._journal = journal
-        events: queue.Queue[Event] = queue.Queue(_WAITING)
-        readers = self._begin(events)
+        n_bytes = 4 * self._settings.recording.n_samples
+        events: queue.Queue[Event] = queue.Queue(max(2, _WAITING_BYTES // n_bytes))
+        readers: list[Reader] = []
         try:
-            self._take(readers, events)
+            self._begin(sink, readers, events)
+            self._take(sink, readers, events)
         finally:
             for reader in readers:
                 reader.abandon()
             for reader in readers:
-                reader.join()
-        for sensor, error in self._errors.items():
-            raise SonarError(f"{sensor}: {error}") if isinstance(error, SonarError) else error
+                if reader.ident is not None:
+                    reader.join()
+        self._raise_errors()
 
-    def _begin(self, events: "queue.Queue[Event]") -> list[Reader]:
+    def _raise_errors(self) -> None:
+        for error in self._errors.values():
+            if not isinstance(error, SonarError):
+                raise error
+        if self._errors:
+            raise SonarError("; ".join(f"{sensor}: {error}" for sensor, error in self._errors.items()))
+
+    def _begin(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
         for sensor, sonar in self._sonars.items():
-            self._journal.add_sensor(sensor, self._settings, firmware=sonar.firmware)
+            sink.add_sensor(sensor, self._settings, firmware=sonar.firmware)
         if self._synced:
             for sonar in self._sonars.values():
                 if not sonar.passive:
                     sonar.arm()
         pace = None if self._synced else Pace(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
-        readers = [
-            Reader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events)
-            for sensor, sonar in self._sonars.items()
-        ]
+        for sensor, sonar in self._sonars.items():
+            readers.append(Reader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events))
         for reader in readers:
             reader.start()
-        return readers
 
-    def _take(self, readers: list[Reader], events: "queue.Queue[Event]") -> None:
+    def _take(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         while len(self._ended) < len(readers):
             if self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s):
                 for reader in readers:
                     reader.stop()
-            self._handle(_all_of(events))
-        self._store(self._pulses.release(time.monotonic_ns(), at_once=True))
-        for sensors in self._groups.values():
-            self._close_group(sensors)
+            self._handle(sink, _all_of(events))
+            self._on_tick()
+        self._store(sink, self._pulses.release(time.monotonic_ns(), at_once=True))
+        for sync_count in sorted(self._groups):
+            self._close_group(sync_count)
 
     def _done(self) -> bool:
-        """Whether every sensor that is still there has passed the last pulse."""
+        """Whether every sensor that is still there has delivered the last pulse, or a later one."""
         if self._n is None or not self._synced:
             return False
-        sequences = [self._tracks[sensor].sequence for sensor in self._sonars if sensor not in self._ended]
-        return all(sequence is not None and sequence >= self._n - 1 for sequence in sequences)
+        return all(self._tracks[sensor].passed for sensor in self._sonars if sensor not in self._ended)
 
-    def _handle(self, events: Iterable[Event]) -> None:
+    def _handle(self, sink: Sink, events: Iterable[Event]) -> None:
         ready: list[tuple[Arrived, int]] = []
         for event in events:
             match event:
                 case Arrived(tick=None):
-                    counter = self._unwrapped(event)
-                    ready += self._pulses.add(event.sensor, event, counter, event.block.arrived.monotonic_ns)
+                    ready += self._pulses.add(event.sensor, event, event.count, event.block.arrived.monotonic_ns)
                 case Arrived(tick=int(tick)):
                     ready.append((event, tick))
-                case Failed(sensor, reason):
-                    self.counts[sensor].failed += 1
-                    self._on_note(sensor, reason)
+                case Failed():
+                    self._store(sink, ready)
+                    ready = []
+                    self._miss_until(sink, event.sensor, event.count + 1, event.reason)
+                    self._on_note(event.sensor, event.text)
                 case Note(sensor, text):
                     self._on_note(sensor, text)
+                case Restarted(sensor):
+                    ready += self._begin_anew(sensor, "the sensor began anew")
+                    self._on_note(sensor, "has begun to count anew")
                 case Returned(sensor, away_s):
                     self.counts[sensor].unplugged += 1
-                    self._tracks[sensor].away = True
-                    self._pulses.forget(sensor)
+                    ready += self._begin_anew(sensor, "the sensor was unplugged")
                     self._on_back(sensor, away_s)
                 case Ended(sensor, error):
                     self._ended.add(sensor)
@@ -230,66 +251,74 @@ class Session:
                         self._errors[sensor] = error
                         self._on_note(sensor, str(error))
         ready += self._pulses.release(time.monotonic_ns())
-        self._store(ready)
+        self._store(sink, ready)
 
-    def _unwrapped(self, event: Arrived) -> int:
-        """Return the sensor's own count, from 0 and without end."""
-        track, counter = self._tracks[event.sensor], event.block.counter
-        if track.counter is not None:
-            step = (counter - track.counter) % _TURNS
-            if step >= _TURNS // 2:  # it has begun anew, as after a power cut that nobody has noticed
-                self._pulses.forget(event.sensor)
-                track.away, step = True, 1
-            track.count += step
-        track.counter = counter
-        return track.count
+    def _begin_anew(self, sensor: str, why: str) -> list[tuple[Arrived, int]]:
+        """Return what was held of a sensor; what it counts from now on is compared with the others anew."""
+        self._tracks[sensor].why = why
+        return self._pulses.forget(sensor)
 
-    def _store(self, ready: list[tuple[Arrived, int]]) -> None:
-        """Commit measurements, then tell of them."""
-        entries: list[Entry] = []
-        for event, number in ready:
-            if self._synced and self._n is not None and number >= self._n:
-                continue
-            sequence = number if self._synced else self._unwrapped(event)
-            entries.append(self._entry(event, number, sequence))
+    def _store(self, sink: Sink, ready: list[tuple[Arrived, int]]) -> None:
+        """Make measurements durable, then tell of them."""
+        entries = [entry for event, number in ready if (entry := self._entry(sink, event, number)) is not None]
         if not entries:
             return
-        self._journal.append(entries)
+        sink.append(entries)
         for entry in entries:
             stamp = entry.measurement.stamp
-            self.counts[stamp.sensor].count()
+            counts = self.counts[stamp.sensor]
+            counts.stored += 1
+            counts.times_s.append(time.monotonic())
             self._group(stamp.sync_count)
         self._on_stored(entries)
 
-    def _entry(self, event: Arrived, number: int, sequence: int) -> Entry:
+    def _entry(self, sink: Sink, event: Arrived, number: int) -> Entry | None:
+        """Return what is to be stored of a block, None beyond the last pulse; note what is missing before it."""
         track, block = self._tracks[event.sensor], event.block
-        rejected = sum(self._sonars[event.sensor].receiver.rejected_blocks.values())
+        sequence = event.count
+        if self._synced:
+            if track.first_pulse is None:
+                track.first_pulse = number
+            sequence = number - track.first_pulse
+            end = sequence + 1 if self._n is None else self._n - track.first_pulse
+            track.passed = self._n is not None and sequence >= end - 1
+            why = track.why or ("it was damaged on the wire" if event.damaged else "it never arrived")
+            self._miss_until(sink, event.sensor, min(sequence, end), why)
+            if sequence >= end:
+                return None
         if track.sequence is not None:
             sequence = max(sequence, track.sequence + 1)  # a number is never given twice
-            if sequence > track.sequence + 1:
-                reason = "the sensor was unplugged" if track.away else "it never arrived"
-                if rejected > track.rejected and not track.away:
-                    reason = "it was damaged on the wire"
-                self.counts[event.sensor].missing[reason] += sequence - track.sequence - 1
-                self._journal.note_gap(event.sensor, track.sequence + 1, sequence - 1, reason)
-        track.sequence, track.away, track.rejected = sequence, False, rejected
+        track.sequence, track.why = sequence, ""
         stamp = Stamp(
             sensor=event.sensor,
             sequence=sequence,
             sync_count=number,
-            timestamp_ns=block.arrived.realtime_ns,
+            epoch=self._epoch,
+            timestamp_ns=block.arrived.realtime_ns - self._record_ns,  # a block follows when all of it is recorded
             timestamp_uncertainty_ns=min(block.arrived.uncertainty_ns, 2**32 - 1),
         )
         measurement = Measurement(block.words, self._settings, stamp)
-        return Entry(measurement=measurement, epoch=self._epoch, monotonic_ns=block.arrived.monotonic_ns)
+        return Entry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
+
+    def _miss_until(self, sink: Sink, sensor: str, stop: int, why: str) -> None:
+        """Note that what was not stored before a number is missing."""
+        track = self._tracks[sensor]
+        first = 0 if track.sequence is None else track.sequence + 1
+        if first < stop:
+            sink.note_gap(sensor, first, stop - 1, why, epoch=self._epoch)
+            self.counts[sensor].missing[why] += stop - first
+            track.sequence = stop - 1
 
     def _group(self, sync_count: int) -> None:
+        if sync_count <= self._closed:
+            return  # it was counted when it was closed
         self._groups[sync_count] = self._groups.get(sync_count, 0) + 1
         while len(self._groups) > _GROUPS:
-            self._close_group(self._groups.pop(min(self._groups)))
+            self._close_group(min(self._groups))
 
-    def _close_group(self, n_sensors: int) -> None:
-        if n_sensors == len(self._sonars):
+    def _close_group(self, sync_count: int) -> None:
+        self._closed = max(self._closed, sync_count)
+        if self._groups.pop(sync_count) == len(self._sonars):
             self.complete += 1
         else:
             self.incomplete += 1

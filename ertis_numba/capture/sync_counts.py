@@ -13,7 +13,8 @@ _NEAR = 0.4  # of the interval between pulses: what arrives within it is of the 
 _PULSES = 64  # that are remembered: some seconds
 _VOTES = 3  # blocks that decide about an offset: one may be late, where a host or a sensor is busy
 _HELD_S = 0.5  # that blocks wait at most for that
-_DOUBTS = 5  # blocks in a row that must speak against an offset before it is changed
+_DOUBTS = 5  # blocks in a row that must speak against an offset before it is changed …
+_DOUBTED_S = 5.0  # … and that wait for it at most
 
 
 @dataclass(slots=True)
@@ -59,9 +60,14 @@ class SyncCounts(Generic[Item]):
         self._intervals_ns: deque[float] = deque(maxlen=_PULSES)
         self.realigned = 0
 
-    def forget(self, sensor: str) -> None:
-        """Compare a sensor anew: its counter has started again."""
-        self._sensors[sensor].offset = None
+    def forget(self, sensor: str) -> list[tuple[Item, int]]:
+        """Compare a sensor anew: it has missed pulses, or begun to count anew. Return what was held of it."""
+        state = self._sensors[sensor]
+        found: list[tuple[Item, int]] = []
+        if state.held and self._decided(sensor, state, state.held[-1].arrived_ns, at_once=True):
+            found = self._released(state)
+        state.offset = None
+        return found
 
     def add(self, sensor: str, item: Item, counter: int, arrived_ns: int) -> list[tuple[Item, int]]:
         """Take a block and return those whose pulse is known now, with its number.
@@ -89,11 +95,16 @@ class SyncCounts(Generic[Item]):
                 if not state.held or not self._decided(name, state, now_ns, at_once=at_once):
                     continue
                 progress = True
-                for each in state.held:
-                    number = each.counter + (state.offset or 0)
-                    self._note(number, each.arrived_ns)
-                    found.append((each.item, number))
-                state.held = []
+                found += self._released(state)
+        return found
+
+    def _released(self, state: _Sensor[Item]) -> list[tuple[Item, int]]:
+        found = []
+        for each in state.held:
+            number = each.counter + (state.offset or 0)
+            self._note(number, each.arrived_ns)
+            found.append((each.item, number))
+        state.held = []
         return found
 
     @property
@@ -109,7 +120,8 @@ class SyncCounts(Generic[Item]):
                 state.offset = -state.held[0].counter  # the first pulse is number 0
             return state.offset is not None
         if state.offset is not None:
-            if self._agrees(state.held[-1], state.offset) or at_once:
+            doubted_s = (now_ns - state.held[0].arrived_ns) / 1e9
+            if self._agrees(state.held[-1], state.offset) or at_once or doubted_s > _DOUBTED_S:
                 return True
             if len(state.held) < _DOUBTS:
                 return False

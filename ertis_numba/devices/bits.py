@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.devices.splices import CHANNELS, MEAN_OF, Filter, Splices
+from ertis_numba.devices.blocks import CHANNELS
+from ertis_numba.devices.splices import MEAN_OF, Filter, Splices
 from ertis_numba.errors import ArgumentError
 
 __all__ = ["BitCheck"]
@@ -19,16 +20,13 @@ __all__ = ["BitCheck"]
 Floats = NDArray[np.floating[Any]]
 
 _EVERY = 32  # means of which medians are taken; of those over channels every eighth. All would take half a millisecond
-_OFF = 0.2  # full scale 1: offset that no array has; a real one has 0.0002, text 0.45
-_JUMP = 0.2  # the same, of a channel against earlier blocks
-_JUMPING = 0.25  # share of the channels
-
 # Of white bits the mean square of a mean of 31 is 1/31, and the mean product of neighbours less that square is:
 _WHITE_PRODUCT = -1 / MEAN_OF
 # How far both stray by chance. Products of a real sensor are -0.30 and less, in its direct sound -0.19 where the power
 # is that of white bits; those of simulated sensors, in loud noise, -0.17. In overload the power is higher.
 _POWER_RANGE, _PRODUCT_REACH = (0.012, 0.06), 0.09
 _UNSHAPED, _SHAPED = -0.1, -0.25
+_OFF = (0.2, 0.5)  # of a channel, full scale 1; text has 0.3 to 0.4, and wind may do that to products of -0.2
 _WHITE_MEANS = 16  # in a row; sounds have 3, and overload by what is above 100 kHz, which microphones do not hear, 12
 
 _EQUAL_WORDS = 4096  # half a period in overload lasts 112, a push of thirty times full scale that fades in 0.1 ms 1530
@@ -70,12 +68,11 @@ class BitCheck:
         *,
         splices: bool = False,
     ) -> None:
-        self._n_samples = checks.whole("n_samples", n_samples, 8 * MEAN_OF)
+        self._n_samples = checks.whole("n_samples", n_samples, _EQUAL_WORDS)
         checks.positive("pdm_rate_hz", pdm_rate_hz)
         self._enabled = np.ones(CHANNELS, dtype=bool) if enabled is None else np.asarray(enabled, dtype=bool)
         checks.shape("enabled", self._enabled.shape, (CHANNELS,))
         self.density: NDArray[np.float64] | None = None
-        self._known: list[Floats] = []
         self._words = np.empty((n_samples, 1), dtype=np.uint32)
         self._changes = np.zeros((n_samples, 1), dtype=np.uint32)
         self._mean, self._change = (
@@ -89,7 +86,7 @@ class BitCheck:
         """Return why a block cannot be right, or None.
 
         ``constant bits``: no channel changes, all along or over a stretch that begins and ends at once. ``density``:
-        most channels have too many ones or zeros, or many have others than before. ``noise``: the bits are those of
+        most channels have too many ones or zeros, and change as no modulator does. ``noise``: the bits are those of
         chance, all along or over a stretch. ``splice``: words are missing or do not belong here.
 
         Parameters
@@ -119,10 +116,8 @@ class BitCheck:
         power = np.einsum("m,mn->n", weights, np.square(mean, out=self._squares))[1:-2]
         if self._stops(share, moving):
             return "constant bits"
-        if self._is_off(np.median(mean[:, ::_EVERY], axis=1), moving):
-            return "density"
-        if self._is_noise(power, -share - power):
-            return "noise"
+        if found := self._chance(mean[moving], power, -share - power):
+            return found
         return "splice" if self._splices and self._splices.found(self._words, mean, moving) else None
 
     def _stops(self, share: Floats, moving: NDArray[np.bool_]) -> bool:
@@ -143,43 +138,27 @@ class BitCheck:
                 return True
         return False
 
-    def _is_off(self, offset: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Whether most channels are far off zero, or a quarter of them otherwise than before.
-
-        The offset is a median over time, which overload does not move. What moves all channels is left to them. A
-        microphone may well break: what has come to stay is not rejected twice.
-        """
-        if np.median(np.abs(offset[moving])) > _OFF:
-            return True
-        offset = np.where(moving, offset, np.nan)
-        jumps = [self._jumps(offset - known) for known in self._known]
-        if jumps and all(jumps):
-            self._known = [self._known[0], offset]
-            return True
-        self._known = [offset]
-        return False
-
-    @staticmethod
-    def _jumps(change: Floats) -> bool:
-        change = change[np.isfinite(change)]
-        return len(change) > 0 and bool(np.mean(np.abs(change - np.median(change)) > _JUMP) >= _JUMPING)
-
-    def _is_noise(self, power: Floats, product: Floats) -> bool:
-        """Whether bits are those of chance, all along or over a stretch.
+    def _chance(self, mean: Floats, power: Floats, product: Floats) -> str | None:
+        """Return ``density`` or ``noise`` where bits are not those of modulators, all along or over a stretch.
 
         Parameters
         ----------
+        mean : (channel, n) float32
+            Of each 31 samples.
         power, product : (n,) float32
-            Of each 31 samples, the mean square of their mean and the mean product of neighbours less that.
+            Mean square of these means and the mean product of neighbours less that.
         """
         low, high = _POWER_RANGE
         usual, middle = np.quantile(product[:: _EVERY // 4], [0.25, 0.5])
-        if usual > _UNSHAPED and low < np.median(power[:: _EVERY // 4]) < high:
-            return True
+        if usual > _UNSHAPED:
+            if low < np.median(power[:: _EVERY // 4]) < high:
+                return "noise"
+            if _OFF[0] < np.median(np.abs(np.median(mean[:, ::_EVERY], axis=1))) < _OFF[1]:
+                return "density"
         if not self._is_fast or middle > _SHAPED:
-            return False
+            return None
         is_white = (power > low) & (power < high) & (np.abs(product - _WHITE_PRODUCT) < _PRODUCT_REACH)
-        return _longest(is_white) >= _WHITE_MEANS
+        return "noise" if _longest(is_white) >= _WHITE_MEANS else None
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:

@@ -1,11 +1,33 @@
-"""Measurements as they come from a sensor, and when."""
+"""Measurements as they come from a sensor, and when.
+
+A measurement comes as a block: header, counter, PDM words, footer; nothing in it tells its length or its time.
+"""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Block", "Instant"]
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["CHANNELS", "COUNTERS", "FOOTER", "FRAME_BYTES", "HEADER", "Block", "Instant", "encode_block"]
+
+HEADER: Final = 1_364_413_970
+"""First word of a block."""
+
+FOOTER: Final = 792_823_410
+"""Last word of a block."""
+
+FRAME_BYTES: Final = 12
+"""Header, counter and footer."""
+
+CHANNELS: Final = 32
+"""Microphones, each of which has a bit of every word."""
+
+COUNTERS: Final = 2**32
+"""Numbers that a counter runs through before it begins anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,3 +66,23 @@ class Block:
     counter: int
     words: NDArray[np.uint32]
     arrived: Instant
+
+
+def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:
+    """Return a measurement as a sensor sends it.
+
+    Parameters
+    ----------
+    counter : int
+    words : (sample,) uint32
+
+    Raises
+    ------
+    ArgumentError
+        The counter does not fit into 32 bits, or the words are no uint32.
+    """
+    counter = checks.whole("counter", counter, 0, COUNTERS - 1)
+    if words.dtype.kind != "u" or words.dtype.itemsize != 4 or words.ndim != 1:
+        raise ArgumentError(f"words are {words.dtype} of shape {words.shape}; give (sample,) uint32")
+    payload = words.astype("<u4", copy=False).tobytes()
+    return HEADER.to_bytes(4, "little") + counter.to_bytes(4, "little") + payload + FOOTER.to_bytes(4, "little")

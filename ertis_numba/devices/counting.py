@@ -6,14 +6,13 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.devices.blocks import Block
+from ertis_numba.devices.blocks import COUNTERS, Block
 
 __all__ = ["BURST", "CounterCheck"]
 
 BURST: Final = 0.75
 """Of the shortest interval: what comes later than this after a block's first byte is of another trigger."""
 
-_NUMBERS: Final = 2**32
 _MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
 _AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
 _UNHEARD = 4  # triggers in a row of which nothing may have come, where no later block tells
@@ -83,7 +82,7 @@ class CounterCheck:
     def expect(self, counter: int) -> list[tuple[Block, bool]]:
         """Say that ``counter``, or the number after it, comes next; return what was held, none of it right."""
         self._reject_held()
-        self._last = _Entry((counter - 1) % _NUMBERS, 0.0, self._bursts + len(self._burst_ns))
+        self._last = _Entry((counter - 1) % COUNTERS, 0.0, self._bursts + len(self._burst_ns))
         return self._results()
 
     def heard(self, at_ns: int) -> None:
@@ -240,7 +239,7 @@ def _directly(first: _Entry, second: _Entry) -> bool:
 
 
 def _ahead(first: _Entry, second: _Entry) -> int:
-    return (second.counter - first.counter) % _NUMBERS
+    return (second.counter - first.counter) % COUNTERS
 
 
 def _elapsed_ns(first: _Entry, second: _Entry) -> int:

@@ -5,8 +5,9 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
-from ertis_numba.devices.commands import Command, Setup, call_hash, decode_answer
-from ertis_numba.devices.line import Line, sonar_error
+from ertis_numba.devices.commands import Command, decode_answer
+from ertis_numba.devices.line import SerialLine, sonar_error
+from ertis_numba.devices.setup import Setup, call_hash
 from ertis_numba.errors import SonarError
 
 __all__ = ["Dialogue"]
@@ -19,7 +20,7 @@ _MOST_BYTES = 2**30
 _log = logging.getLogger("ertis_numba")
 
 
-class Dialogue(Line):
+class Dialogue(SerialLine):
     """A line on which commands are sent and answered.
 
     Nothing tells an answer from four bytes of a measurement but that nothing comes with it.
@@ -30,7 +31,7 @@ class Dialogue(Line):
     timeout_s : float
         How long an answer may take.
     stop : callable
-        See `Line`.
+        See `SerialLine`.
 
     Attributes
     ----------

@@ -7,6 +7,7 @@ import select
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import serial
 
@@ -20,7 +21,7 @@ try:
 except ImportError:  # not POSIX
     _CANNOT_OPEN = (OSError,)
 
-__all__ = ["Line", "sonar_error"]
+__all__ = ["SerialLine", "closed_error", "sonar_error"]
 
 _BAUD = 115_200  # which means nothing to USB
 _PIECE = 65_536  # bytes
@@ -48,7 +49,7 @@ _OPEN_ERRORS = {
 _log = logging.getLogger("ertis_numba")
 
 
-class Line:
+class SerialLine:
     """A serial port that nobody else has open.
 
     Only `close` may be called from another thread than the rest.
@@ -128,7 +129,7 @@ class Line:
         with self._lock:
             self._check()
             try:
-                self._port.write(data)
+                self._write(data)
             except serial.SerialTimeoutException:
                 raise sonar_error(f"{self.path} takes no commands; plug it out and in", errno.ETIMEDOUT) from None
             except OSError as error:
@@ -139,7 +140,7 @@ class Line:
         with self._lock:
             try:
                 if last and self._port.is_open:
-                    self._port.write(last)
+                    self._write(last)
             except OSError as error:
                 _log.debug("%s: %r was not sent: %s", self.path, last, error)
             finally:
@@ -154,7 +155,7 @@ class Line:
             return bytes(self._port.read(size))
         here, read = self._port.fileno(), 0
         for _ in range(_CHUNKS):
-            if not select.select([here], [], [], _SLICE_S)[0]:
+            if not _is_ready(here, to_write=False, within_s=_SLICE_S):
                 break
             came = os.readv(here, [self._buffer[read:size]])
             if not came:
@@ -164,9 +165,22 @@ class Line:
                 break
         return bytes(self._buffer[:read])
 
+    def _write(self, data: bytes) -> None:
+        """Write all of it, by means of this module: pyserial's own fail from the 1024th open file on."""
+        if os.name != "posix":
+            self._port.write(data)
+            return
+        here, rest, latest_s = self._port.fileno(), memoryview(data), time.monotonic() + _WRITE_S
+        while rest:
+            left_s = latest_s - time.monotonic()
+            if left_s <= 0 or not _is_ready(here, to_write=True, within_s=left_s):
+                raise serial.SerialTimeoutException
+            with suppress(BlockingIOError):
+                rest = rest[os.write(here, rest) :]
+
     def _check(self) -> None:
         if self.stop() or not self._port.is_open:
-            raise SonarError(f"{self.path} was closed; open it again")
+            raise closed_error(self.path)
 
     def _gone(self) -> SonarGoneError:
         return SonarGoneError(f"{self.path} was unplugged; plug it in again")
@@ -177,6 +191,21 @@ def sonar_error(text: str, code: int) -> SonarError:
     error = SonarError(text)
     error.errno = code
     return error
+
+
+def closed_error(path: str) -> SonarError:
+    """Return what is raised where a port is used after it was closed."""
+    return SonarError(f"{path} was closed; open it again")
+
+
+def _is_ready(descriptor: int, *, to_write: bool, within_s: float) -> bool:
+    """Whether it can be read or written, or has failed."""
+    if hasattr(select, "poll"):
+        poll = select.poll()
+        poll.register(descriptor, select.POLLOUT if to_write else select.POLLIN)
+        return bool(poll.poll(1000 * within_s))
+    readers, writers = ([], [descriptor]) if to_write else ([descriptor], [])  # only of the first 1024 files
+    return any(select.select(readers, writers, [], within_s))
 
 
 def _opened(path: str) -> serial.Serial:

@@ -1,5 +1,6 @@
 """Which serial ports there are, and which of them is meant."""
 
+import errno
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,8 +8,8 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from ertis_numba.devices.places import emulated_folder
-from ertis_numba.errors import SonarError
+from ertis_numba.devices.line import sonar_error
+from ertis_numba.devices.links import emulated_folder, is_held
 
 __all__ = ["Port", "find_again", "find_ports", "resolve"]
 
@@ -65,16 +66,16 @@ def resolve(port: str) -> Port:
     Raises
     ------
     SonarError
-        There is no such port, or several have this serial number.
+        There is no such port (its ``errno`` is ENOENT), or several have this serial number (EINVAL).
     """
     found = find_ports()
     named = [item for item in found if port in item.names]
     if len({item.path for item in named}) > 1:
-        raise SonarError(f"{port!r} are {len(named)} ports: {_listed(named)}; give the path of one")
+        raise sonar_error(f"{port!r} are {len(named)} ports: {_listed(named)}; give the path of one", errno.EINVAL)
     if named:
         return named[0]
     path = os.path.realpath(port)
-    if Path(path).exists() and _is_alive(Path(port)):
+    if Path(path).exists() and is_held(Path(port)):
         link = os.path.abspath(port) if Path(port).is_symlink() else ""  # noqa: PTH100  which follows no link
         same = [item for item in found if item.path == path]
         return replace(same[0], link=link or same[0].link) if same else Port(path=path, link=link)
@@ -85,7 +86,7 @@ def resolve(port: str) -> Port:
         if found
         else "none is plugged in: look at its cable, or start an emulated one with 'ertis emulate'"
     )
-    raise SonarError(f"there is no serial port {port!r}; {there_are}")
+    raise sonar_error(f"there is no serial port {port!r}; {there_are}", errno.ENOENT)
 
 
 def find_again(port: Port) -> Port:
@@ -94,7 +95,7 @@ def find_again(port: Port) -> Port:
     Raises
     ------
     SonarError
-        It is not there.
+        As `resolve`: it is not there.
     """
     if port.serial_number and not port.emulated:
         return replace(resolve(port.serial_number), link=port.link)
@@ -121,25 +122,5 @@ def _emulated_ports() -> Iterator[Port]:
     folder = emulated_folder()
     for link in sorted(folder.iterdir()) if folder.is_dir() else ():
         path = os.path.realpath(link)
-        if link.is_symlink() and not link.name.startswith(".") and Path(path).exists() and _is_alive(link):
+        if link.is_symlink() and not link.name.startswith(".") and Path(path).exists() and is_held(link):
             yield Port(path=path, link=str(link), serial_number=link.name, description="emulated eRTIS", emulated=True)
-
-
-def _is_alive(link: Path) -> bool:
-    """Whether a link leads to what it was made for, as all do but one that a killed emulator left.
-
-    Its pseudo terminal's number is soon that of somebody's shell. See `places.HeldLink`.
-    """
-    try:
-        lock = os.open(link.with_name(f".{link.name}.lock"), os.O_RDONLY)
-    except OSError:  # no link of an emulator
-        return True
-    import fcntl  # noqa: PLC0415  only POSIX has it, and pseudo terminals
-
-    try:
-        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(lock)
-    return False

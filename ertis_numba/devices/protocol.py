@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.devices.blocks import Block, Instant
-from ertis_numba.devices.commands import FOOTER, FRAME_BYTES, HEADER
+from ertis_numba.devices.blocks import COUNTERS, FOOTER, FRAME_BYTES, HEADER, Block, Instant
 from ertis_numba.devices.counting import BURST, CounterCheck
 
 __all__ = ["Block", "BlockParser", "Instant", "Receiver"]
@@ -71,19 +70,12 @@ class BlockParser:
         self.add(data, arrived)
         return list(iter(self.take, None))
 
-    def expire(self) -> list[Block]:
-        """Give up the block that has begun, since its deadline has passed; what came after may have begun another.
-
-        Returns
-        -------
-        list of Block
-            Always empty: what came is shorter than a block.
-        """
+    def expire(self) -> None:
+        """Give up the block that has begun, since its deadline has passed; what came after may have begun another."""
         if len(self._data) >= len(_HEADER):
             self._give_up("cut short")
         else:
             self._drop(len(self._data), self._reason)
-        return []
 
     def add(self, data: bytes, arrived: Instant) -> None:
         """Take bytes in; `take` the blocks then until there is none."""
@@ -112,7 +104,7 @@ class BlockParser:
             return None
         place = self._data.find(_HEADER, len(_HEADER), footer)
         while place >= 0:
-            if self._is_apart(place) and (self._counter(place) - self._counter(0)) % 2**32 <= _MOST_SKIPPED:
+            if self._is_apart(place) and (self._counter(place) - self._counter(0)) % COUNTERS <= _MOST_SKIPPED:
                 return "cut short"
             place = self._data.find(_HEADER, place + 1, footer)
         return None
@@ -247,7 +239,8 @@ class Receiver:
         Where none has begun, nothing more is waited for: what is held and fits the time is returned.
         """
         if self.missing:
-            return self._parser.expire()
+            self._parser.expire()
+            return []
         return self._settle(self._counters.finish())
 
     def finish(self) -> list[Block]:

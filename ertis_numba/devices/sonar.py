@@ -10,15 +10,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.devices.commands import FRAME_BYTES, Command, Setup, firmware_version
+from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
+from ertis_numba.devices.commands import Command, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
+from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
 from ertis_numba.devices.protocol import Block, Receiver
-from ertis_numba.errors import SonarError, SonarGoneError
+from ertis_numba.devices.setup import Setup
+from ertis_numba.errors import ArgumentError, SonarError, SonarGoneError
 
 __all__ = ["Sonar"]
 
-_COUNTS = 2**32
 _TRANSFER_BYTES_PER_S = 5e6  # at least
 _MARGIN_S = 0.5
 _RETRY_S = 0.05
@@ -67,7 +69,8 @@ class Sonar:
         ------
         SonarError
             The port is missing, in use, may not be used, is ambiguous, or no eRTIS is there. Its ``errno`` is ENOENT,
-            EBUSY, EACCES, ETIMEDOUT where nothing sensible is answered, or EINVAL where it is no serial port.
+            EBUSY, EACCES, ETIMEDOUT where nothing sensible is answered, or EINVAL where ``port`` is no serial port or
+            several.
         """
         return cls(resolve(port), timeout_s=timeout_s, passive=passive)
 
@@ -158,6 +161,8 @@ class Sonar:
 
         Raises
         ------
+        ArgumentError
+            It is to be emitted while the amplifier is off.
         SonarError
             No whole measurement came in time; the next one may be tried at once.
         SonarGoneError
@@ -165,6 +170,12 @@ class Sonar:
         """
         self._speak()
         (setup, receiver), deadline_s = self._state(), self.deadline_s
+        active = setup.active if active is None else active
+        if active and not setup.amplifier:
+            raise ArgumentError(
+                "active is True, but the sensor was set up with its amplifier off and would emit nothing; configure a "
+                "setup with amplifier=True"
+            )
         if self._is_armed:
             raise SonarError(
                 f"{self.port} is armed, and SYNC pulses measure; take what they do by listen(), or disarm()"
@@ -174,8 +185,8 @@ class Sonar:
         if self._is_late:  # should that measurement still come, its number tells
             self._line.ask(Command("B", self._next))
         receiver.expect(self._next)
-        self._line.send(Command("A", int(setup.active if active is None else active)).encode())
-        self._next, self._is_late = (self._next + 1) % _COUNTS, True  # whatever becomes of it, its number is used up
+        self._line.send(Command("A", int(active)).encode())
+        self._next, self._is_late = (self._next + 1) % COUNTERS, True  # whatever becomes of it, its number is used up
         began, read = time.monotonic(), 0
         while time.monotonic() - began <= deadline_s:
             data, arrived = self._line.receive(receiver.missing)
@@ -220,13 +231,12 @@ class Sonar:
         Raises
         ------
         SonarError
-            None came for so long.
+            None came for so long, or `close` was called before.
         SonarGoneError
             The sensor was unplugged.
         """
         (setup, receiver), deadline_s = self._state(), self.deadline_s
-        if not (self._is_armed or self._passive):
-            raise SonarError(f"{self.port} is not armed; call arm() first")
+        self._require_armed()
         timeout_s = max(timeout_s, deadline_s)
         latest_ns = latest_byte_ns = time.monotonic_ns()
         read = 0
@@ -253,7 +263,7 @@ class Sonar:
                 raise
         yield from map(self._counted, receiver.finish())
 
-    def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False, missed: int = 0) -> bool:
+    def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
         """Wait for a sensor that was unplugged, and set it up again as it was.
 
         It is found by its serial number, by its link, or else by its path. Its measurements are counted on.
@@ -263,8 +273,6 @@ class Sonar:
         within_s : float
         stop : callable
             Once it is true, this gives up.
-        missed : int
-            SYNC pulses that it has missed, whose numbers are left out.
 
         Returns
         -------
@@ -276,7 +284,6 @@ class Sonar:
         SonarGoneError
             It is not back within that time.
         """
-        self._next = (self._next + missed) % _COUNTS
         began = time.monotonic()
         last: SonarError | None = None
 
@@ -343,6 +350,12 @@ class Sonar:
         if self._passive:
             raise SonarError(f"{self.port} was opened to listen only; open it without passive")
 
+    def _require_armed(self) -> None:
+        if self._closing.is_set():
+            raise closed_error(self.port)
+        if not (self._is_armed or self._passive):
+            raise SonarError(f"{self.port} is not armed; call arm() first")
+
     def _state(self) -> tuple[Setup, Receiver]:
         if self._configured is None:
             raise SonarError(f"{self.port} is not configured; call configure() first")
@@ -350,7 +363,7 @@ class Sonar:
 
     def _counted(self, block: Block) -> Block:
         """Return a block after it was noted that the next number is due."""
-        self._next, self._is_late = (block.counter + 1) % _COUNTS, False
+        self._next, self._is_late = (block.counter + 1) % COUNTERS, False
         return block
 
     def _nothing_whole(self, read: int, setup: Setup, timeout_s: float) -> SonarError:

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.devices.blocks import CHANNELS
 
-__all__ = ["CHANNELS", "MEAN_OF", "Filter", "Splices"]
+__all__ = ["MEAN_OF", "Filter", "Splices"]
 
 Floats = NDArray[np.floating[Any]]
 
-CHANNELS = 32
 MEAN_OF = 31
 """Samples over which means of bits are taken."""
 

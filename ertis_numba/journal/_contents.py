@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
 from ertis_numba.journal._tables import selection
@@ -36,7 +36,7 @@ class Contents:
     def _load(self) -> None:
         rows = self._database.execute(selection("journal"))
         if len(rows) != 1:
-            raise DataError(f"{self.path} is damaged, it has no header; copy it again if you can")
+            raise DamagedError(f"{self.path} is damaged, it has no header; copy it again if you can")
         target, self.source, _ = checked(self.path, "the journal", rows[0])
         self.target = self.path.parent / os.fsdecode(target)
         for row in self._database.execute(selection("sensors", "ORDER BY id")):
@@ -47,13 +47,17 @@ class Contents:
         )
         for number, epoch, last, count in counts:
             if number not in names:
-                raise DataError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
+                raise DamagedError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
             self._last[names[number], epoch] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
-        ((n_rows,),) = self._database.execute("SELECT ifnull(max(id), 0) FROM measurements")
+        # Counted in two trees of the file, the index and the table: damage to one of them is noticed. Rows may be
+        # deleted from the front, so that the first number is not always 1; apart from each other, each takes one look.
+        ((n_rows,),) = self._database.execute(
+            "SELECT ifnull((SELECT max(id) FROM measurements) - (SELECT min(id) FROM measurements) + 1, 0)"
+        )
         if n_rows != self._n_entries:
-            raise DataError(
+            raise DamagedError(
                 f"{self.path} is damaged, it lists {self._n_entries} measurements and has {n_rows}; copy it again if "
                 "you can"
             )
@@ -70,7 +74,7 @@ class Contents:
             rows = self._database.execute(selection("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
         made = (checked(self.path, "a gap", row) for row in rows)
-        return tuple(Gap(names[number], *values) for number, *values in made)
+        return tuple(Gap(names[number], first, last, why, epoch) for number, epoch, first, last, why in made)
 
     def index(self, sensor: str | None = None) -> list[Key]:
         """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
@@ -88,13 +92,15 @@ class Contents:
 
         Raises
         ------
-        DataError
+        DamagedError
             It is not what was written.
+        DataError
+            It cannot be read.
         """
         with self._turn:
             rows = self._database.execute(_SELECTION, (key.place,))
         if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.epoch, key.sequence):
-            raise DataError(
+            raise DamagedError(
                 f"{self.path} has lost the record of measurement {key.sequence} of sensor {key.sensor}: it is "
                 "damaged; copy it again if you can"
             )
@@ -105,8 +111,10 @@ class Contents:
 
         Raises
         ------
+        DamagedError
+            A measurement is not what was written; `index` and `entry` get at the others.
         DataError
-            A measurement is damaged; `index` and `entry` get at the others.
+            The disk fails.
         """
         return (self.entry(key) for key in self.index(sensor))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from ertis_numba.errors import DataError, FormatVersionError, InUseError
+from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
 from ertis_numba.journal._tables import APPLICATION_ID, VERSION, layout
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
@@ -107,8 +107,10 @@ class Database:
         ------
         InUseError
             Another process has the journal.
+        DamagedError
+            The file is not what was written.
         DataError
-            The disk is full, fails or may not be written, the file is damaged or closed.
+            The disk is full, fails or may not be written, the file is closed.
         """
         with self._told():
             return self._connection.execute(statement, values).fetchall()
@@ -162,9 +164,10 @@ class Database:
                     f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
                 ) from error
             told = _TOLD.get(code, "cannot be used ({}); check the disk")
-            raise DataError(f"{self._path} {told.format(_line(error))}") from error
+            kind = DamagedError if code == sqlite3.SQLITE_CORRUPT else DataError
+            raise kind(f"{self._path} {told.format(_line(error))}") from error
         except UnicodeError as error:  # from texts that are damaged
-            raise DataError(f"{self._path} {_TOLD[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
+            raise DamagedError(f"{self._path} {_TOLD[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
 

@@ -192,7 +192,7 @@ class Journal(Contents):
             require_same(sensor, settings)
             self._accepted[sensor.name] = settings
         row = sensor.entry_row(entry, self._ids[sensor.name])
-        key = (sensor.name, entry.epoch)
+        key = (sensor.name, stamp.epoch)
         if stamp.sequence <= last.get(key, -1):
             raise ArgumentError(
                 f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in order, or "
@@ -201,19 +201,20 @@ class Journal(Contents):
         last[key] = stamp.sequence
         return row
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str) -> None:
-        """Say durably why sequence numbers of a sensor are missing, ``first`` and ``last`` included.
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+        """Say durably why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
 
         Raises
         ------
         ArgumentError
-            There is no such sensor, ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
+            There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
+            bytes.
         DataError
             The journal cannot be written.
         """
-        Gap(self._sensor(sensor).name, first, last, reason)
+        Gap(self._sensor(sensor).name, first, last, reason, epoch)
         with self._turn, self._database.transaction():
-            self._insert("gaps", (self._ids[sensor], first, last, reason))
+            self._insert("gaps", (self._ids[sensor], epoch, first, last, reason))
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         self._database.execute(insertion(table), (*values, row_crc32(values)))
@@ -237,27 +238,35 @@ class Journal(Contents):
 
     def remove(self) -> None:
         """Close the journal and remove it: what is in it is in a recording, or is nothing."""
-        self._database.leave_log()
-        self.path.unlink(missing_ok=True)
-        # Only where the disk was too full to take the log in; without the main file it means nothing.
-        for end in _BESIDE:
-            self.path.with_name(self.path.name + end).unlink(missing_ok=True)
-        self.close()
-        sync(self.path.parent)
+        with self._turn:
+            self._release()
+            self.path.unlink(missing_ok=True)
+            # Only where the disk was too full to take the log in; without the main file it means nothing.
+            for end in _BESIDE:
+                self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+            self.close()
+            sync(self.path.parent)
 
     def set_aside(self) -> Path:
         """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that."""
-        self._database.leave_log()
-        if self.path.with_name(f"{self.path.name}-wal").exists():
-            raise DataError(f"{self.path} cannot be set aside, its disk is full; free some space")
-        number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
-        while aside.exists():
-            number += 1
-            aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
-        self.path.rename(aside)
-        self.close()
-        sync(self.path.parent)
+        with self._turn:
+            self._release()
+            if self.path.with_name(f"{self.path.name}-wal").exists():
+                raise DataError(f"{self.path} cannot be set aside, its disk is full; free some space")
+            number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
+            while aside.exists():
+                number += 1
+                aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
+            self.path.rename(aside)
+            self.close()
+            sync(self.path.parent)
         return aside
+
+    def _release(self) -> None:
+        """Make the file ready to lose its name; it stays locked where the system lets an open file lose it."""
+        self._database.leave_log()
+        if os.name == "nt":
+            self.close()
 
 
 _INSERTION: Final = insertion("measurements")

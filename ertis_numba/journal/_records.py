@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError, SettingsError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import microphones, mounting, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
@@ -29,8 +29,7 @@ class Entry:
     Attributes
     ----------
     measurement : Measurement
-    epoch : int
-        Chosen at random whenever sequence numbers start again: sensor, epoch and sequence number are the key.
+        Sensor, epoch and sequence number are the key; choose an epoch at random whenever sequence numbers start again.
     monotonic_ns : int
         When it arrived, by a clock that nobody sets.
     crc32 : int, optional
@@ -38,13 +37,12 @@ class Entry:
     """
 
     measurement: Measurement
-    epoch: int
     monotonic_ns: int
     crc32: int | None = None
 
 
 class Key(NamedTuple):
-    """Which measurement a row is; ``place`` counts all of a journal in order of arrival, from 1."""
+    """Which measurement a row is; ``place`` counts all of a journal in order of arrival."""
 
     place: int
     sensor: str
@@ -54,15 +52,17 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Sequence numbers of a sensor that are missing, ``first`` and ``last`` included, and why."""
+    """Sequence numbers of a run of a sensor that are missing, ``first`` and ``last`` included, and why."""
 
     sensor: str
     first: int
     last: int
     reason: str
+    epoch: int
 
     def __post_init__(self) -> None:
         checks.gap(self.first, self.last, self.reason)
+        checks.whole("epoch", self.epoch, 0, _INT64[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +150,7 @@ class Sensor:
             entry.crc32 = zlib.crc32(words.data)
         values = (
             sensor_id,
-            checks.whole("epoch", entry.epoch, 0, _INT64[1]),
+            checks.whole("epoch", stamp.epoch, 0, _INT64[1]),
             checks.whole("sequence", stamp.sequence, 0, _INT64[1]),
             checks.whole("sync_count", stamp.sync_count, *_INT64),
             checks.whole("timestamp_ns", stamp.timestamp_ns, *_INT64),
@@ -174,15 +174,17 @@ class Sensor:
 
         Raises
         ------
-        DataError
+        DamagedError
             It is not what was written.
         """
         *values, words = row
         what = f"measurement {row[3]} of sensor {self.name}"
         _, epoch, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(path, what, values)
+        if not isinstance(words, bytes):  # the record of their type is damaged
+            words = b""
         got = zlib.crc32(words)
         if got != crc32 or len(words) != self.n_bytes:
-            raise DataError(
+            raise DamagedError(
                 f"{path}: {what} has CRC-32 {got:08x}, its record says {crc32:08x}: the journal is damaged; copy it "
                 "again if you can"
             )
@@ -195,9 +197,10 @@ class Sensor:
             sync_count=sync_count,
             timestamp_ns=time_ns,
             timestamp_uncertainty_ns=uncertainty_ns,
+            epoch=epoch,
         )
         array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
-        return Entry(Measurement(array, settings, stamp), epoch, monotonic_ns, crc32)
+        return Entry(Measurement(array, settings, stamp), monotonic_ns, crc32)
 
 
 def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
@@ -205,7 +208,7 @@ def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
     _, *values, wanted = row
     got = row_crc32(values)
     if got != wanted:
-        raise DataError(
+        raise DamagedError(
             f"{path}: the record of {what} has CRC-32 {got}, wanted {wanted!r}: the journal is damaged; copy it "
             "again if you can"
         )

@@ -1,5 +1,6 @@
 """What a journal holds: its tables and their version."""
 
+import struct
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ class Column:
 _ID = Column("id", "INTEGER", "order of arrival, from 1")
 _CHECK = Column("row_crc32", "INTEGER", "CRC-32 over the columns before it without id")
 _SENSOR = Column("sensor", "INTEGER", "id of the sensor")
+_EPOCH = Column("epoch", "INTEGER", "run of the sensor, chosen at random whenever sequence numbers start again")
 
 TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "journal": (
@@ -62,7 +64,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "measurements": (
         _ID,
         _SENSOR,
-        Column("epoch", "INTEGER", "chosen at random whenever sequence numbers start again"),
+        _EPOCH,
         Column("sequence", "INTEGER", "number given at capture; it rises within an epoch of a sensor"),
         Column("sync_count", "INTEGER", "pulse of the SYNC chain, equal for sensors that emitted together"),
         Column("timestamp_ns", "INTEGER", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
@@ -78,6 +80,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "gaps": (
         _ID,
         _SENSOR,
+        _EPOCH,
         Column("first", "INTEGER", "first missing sequence number"),
         Column("last", "INTEGER", "last missing sequence number"),
         Column("reason", "TEXT", "why they are missing"),
@@ -109,6 +112,30 @@ def selection(table: str, where: str = "") -> str:
     return f"SELECT {', '.join(column.name for column in TABLES[table])} FROM {table} {where}"  # noqa: S608  our own
 
 
-def row_crc32(values: Iterable[int | float | str | bytes]) -> int:
-    """Return the CRC-32 of a row: over its values as Python writes them, a line for each."""
-    return zlib.crc32("".join(f"{value!r}\n" for value in values).encode())
+def row_crc32(values: Iterable[float | str | bytes | None]) -> int:
+    """Return the CRC-32 of a row.
+
+    It is over the values one after the other: of each a letter for its type, the number of bytes as a little-endian
+    32-bit integer, and the bytes. The types are ``I`` for an integer, in decimal digits, after a ``-`` where it is
+    negative; ``R`` for a real number, as a little-endian double; ``T`` for text in UTF-8; ``B`` for bytes; and ``N``
+    for NULL, without bytes.
+    """
+    check = 0
+    for value in values:
+        letter, data = _bytes_of(value)
+        check = zlib.crc32(data, zlib.crc32(letter + struct.pack("<I", len(data)), check))
+    return check
+
+
+def _bytes_of(value: float | str | bytes | None) -> tuple[bytes, bytes]:
+    match value:
+        case None:
+            return b"N", b""
+        case int():
+            return b"I", b"%d" % value
+        case float():
+            return b"R", struct.pack("<d", value + 0.0)  # SQLite stores -0.0 as 0.0
+        case str():
+            return b"T", value.encode()
+        case _:
+            return b"B", value

@@ -2,11 +2,12 @@
 
 import bisect
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
-__all__ = ["UNKNOWN", "Missing", "Numbers"]
+__all__ = ["UNKNOWN", "Missing", "Numbers", "Runs"]
 
 Range = tuple[int, int]
-Missing = tuple[int, int, str]
+Hole = tuple[int, int, str]
 
 UNKNOWN = "not among the measurements given"
 """Reason of a gap of which nobody said more."""
@@ -14,8 +15,45 @@ UNKNOWN = "not among the measurements given"
 _END = 2**63  # beyond all sequence numbers
 
 
+class Missing(NamedTuple):
+    """Sequence numbers of a run of a sensor that are missing, ``first`` and ``last`` included, and why."""
+
+    first: int
+    last: int
+    reason: str
+    epoch: int = 0
+
+
+class Runs:
+    """The sequence numbers of a sensor, of each of its runs, and what is missing among them."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[int, Numbers] = {}
+
+    def add(self, number: int, epoch: int) -> None:
+        """Take the next number of a run."""
+        self._numbers.setdefault(epoch, Numbers()).add(number)
+
+    def missing(self, noted: Iterable[Missing]) -> list[Missing]:
+        """Return what is missing, in order of the runs: as they came, then those of which only gaps are known.
+
+        Parameters
+        ----------
+        noted : iterable of Missing
+            What somebody knows about.
+        """
+        known: dict[int, list[Hole]] = {}
+        for first, last, reason, epoch in noted:
+            known.setdefault(epoch, []).append((first, last, reason))
+        return [
+            Missing(*hole, epoch)
+            for epoch in (*self._numbers, *sorted(known.keys() - self._numbers.keys()))
+            for hole in self._numbers.get(epoch, Numbers()).missing(known.get(epoch, ()))
+        ]
+
+
 class Numbers:
-    """The sequence numbers of a sensor, as they come, and what is missing among them.
+    """The sequence numbers of one run of a sensor, as they come, and what is missing among them.
 
     Attributes
     ----------
@@ -39,11 +77,12 @@ class Numbers:
             self._rises = self._rises and number > self._last
         self._last = number
 
-    def missing(self, noted: Iterable[Missing]) -> list[Missing]:
+    def missing(self, noted: Iterable[Hole]) -> list[Hole]:
         """Return what is missing, in order: first, last and reason; neighbours with one reason are one.
 
-        Where the numbers rise, what is noted is missing if it lies outside of them or in a jump. Where they start
-        again, nothing shows which of two equal ones is meant, and all that is noted is missing.
+        Where the numbers rise, what is noted is missing if it lies outside of them or in a jump. Where they do not,
+        as in a recording whose writer gave no epochs, nothing shows which of two equal ones is meant, and all that is
+        noted is missing.
 
         Parameters
         ----------
@@ -59,7 +98,7 @@ class Numbers:
         return list(_joined(sorted(known + unknown)))
 
 
-def _disjoint(noted: Iterable[Missing]) -> Iterator[Missing]:
+def _disjoint(noted: Iterable[Hole]) -> Iterator[Hole]:
     end = -_END
     for first, last, reason in sorted(noted, key=lambda item: item[0]):
         if last > end:
@@ -87,8 +126,8 @@ def _less(given: Range, others: Sequence[Range]) -> Iterator[Range]:
         yield begin, end
 
 
-def _joined(missing: Iterable[Missing]) -> Iterator[Missing]:
-    held: Missing | None = None
+def _joined(missing: Iterable[Hole]) -> Iterator[Hole]:
+    held: Hole | None = None
     for item in missing:
         if held is not None and held[2] == item[2] and held[1] + 1 == item[0]:
             held = (held[0], item[1], item[2])

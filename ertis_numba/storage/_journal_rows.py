@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ertis_numba.errors import DataError
+from ertis_numba.errors import DamagedError
 from ertis_numba.journal import Entry, Journal
-from ertis_numba.storage._gaps import Missing, Numbers
+from ertis_numba.storage._gaps import Missing, Runs
 
 __all__ = ["Damage", "JournalRows"]
 
@@ -35,8 +35,10 @@ class JournalRows:
     def __init__(self, journal: Journal, sensor: str) -> None:
         self._journal = journal
         self.keys = journal.index(sensor)
-        self._noted = [(gap.first, gap.last, gap.reason) for gap in journal.gaps if gap.sensor == sensor]
-        self._numbers = Numbers()
+        self._noted = [
+            Missing(gap.first, gap.last, gap.reason, gap.epoch) for gap in journal.gaps if gap.sensor == sensor
+        ]
+        self._numbers = Runs()
         self.damaged: list[Damage] = []
 
     def __len__(self) -> int:
@@ -44,18 +46,18 @@ class JournalRows:
         return len(self.keys)
 
     def __iter__(self) -> Iterator[Entry]:
-        self._numbers, self.damaged = Numbers(), []
+        self._numbers, self.damaged = Runs(), []
         for index, key in enumerate(self.keys):
             try:
                 entry = self._journal.entry(key)
-            except DataError as error:
+            except DamagedError as error:  # others may pass: nothing is lost yet
                 self.damaged.append(Damage(index, key.sequence, str(error)))
                 continue
-            self._numbers.add(key.sequence)
+            self._numbers.add(key.sequence, key.epoch)
             yield entry
 
     @property
     def missing(self) -> list[Missing]:
-        """First, last and reason of what is missing, in order; with what is damaged."""
-        lost = [(item.sequence, item.sequence, _DAMAGED) for item in self.damaged]
+        """What is missing, in order; with what is damaged."""
+        lost = [Missing(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].epoch) for item in self.damaged]
         return self._numbers.missing([*lost, *self._noted])

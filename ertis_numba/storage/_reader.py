@@ -1,5 +1,6 @@
 """What the readers of both kinds of file share: opening, refusing, and taking rows one by one."""
 
+import errno
 import hashlib
 import operator
 import re
@@ -13,7 +14,7 @@ from typing import ClassVar, Generic, Self, TypeVar
 import h5py
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DataError, FormatVersionError, SettingsError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError, SettingsError
 from ertis_numba.frames import Stamp
 from ertis_numba.settings import Settings
 from ertis_numba.storage._rows import RowReader
@@ -24,6 +25,8 @@ __all__ = ["Reader", "file_kind", "plain", "sensor_names"]
 
 Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
+_SYSTEM_SAYS = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
+_PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -168,23 +171,27 @@ class Reader(ABC, Generic[Item]):
         return self.sensors[0] if sensor is None else sensor
 
     def _require_variables(self) -> None:
-        missing = [variable.name for variable in self._table if variable.name not in self._group]
+        missing = [
+            variable.name for variable in self._table if not variable.optional and variable.name not in self._group
+        ]
         if missing:
-            raise DataError(f"{self.path} has no {missing[0]!r} for sensor {self.sensor}; copy it again")
+            raise DamagedError(f"{self.path} has no {missing[0]!r} for sensor {self.sensor}; copy it again")
 
     def _require_shapes(self) -> None:
         sizes = {"time": len(self._rows), **self._sizes()}
         for variable in self._table:
+            if variable.optional and variable.name not in self._group:
+                continue
             wanted = tuple(sizes[dim] for dim in variable.dims if dim in sizes)
             shape = self._group[variable.name].shape
             if len(wanted) == len(shape) and shape != wanted:
-                raise DataError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
+                raise DamagedError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
 
     def _require_content(self) -> None:
         wanted = plain(self._group.attrs["content_sha256"])
         got = content_sha256(self._group, self._table)
         if got != wanted:
-            raise DataError(
+            raise DamagedError(
                 f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, its record says "
                 f"{str(wanted)[:8]}…: the file is damaged; copy it again"
             )
@@ -205,7 +212,10 @@ def _reading(file: h5py.File, path: Path) -> Iterator[None]:
     except _UNREADABLE as error:
         if not file:
             raise DataError(f"{path} is closed; open it again") from error
-        raise DataError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
+        told = _SYSTEM_SAYS.search(str(error))
+        if told and int(told[1]) in _PASSING:
+            raise DataError(f"{path} cannot be read ({told[2]}); check the disk") from error
+        raise DamagedError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
 
 
 def _open(path: Path) -> h5py.File:

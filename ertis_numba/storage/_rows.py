@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.atomic import require_room
-from ertis_numba.errors import DataError
+from ertis_numba.errors import DamagedError
 from ertis_numba.frames import Stamp
-from ertis_numba.storage._gaps import Numbers
+from ertis_numba.storage._gaps import Runs
 from ertis_numba.storage.schema import CHUNK_ROWS
 
 __all__ = ["RowReader", "RowWriter"]
@@ -22,8 +22,9 @@ _STAMP_FIELDS = {
     "time_uncertainty": "timestamp_uncertainty_ns",
     "sequence": "sequence",
     "sync_count": "sync_count",
+    "epoch": "epoch",
 }
-_STAMP_COLUMNS = ("time", "time_uncertainty", "sequence", "sync_count", "epoch", "crc32")
+_MOST_EPOCH = 2**63 - 1
 
 
 class RowWriter:
@@ -43,9 +44,7 @@ class RowWriter:
         self._columns: dict[str, list[float]] = {}
         self._n_stored = 0
         self._n_rows = 0
-        self._last: Stamp | None = None
-        self._epoch = 0
-        self.numbers = Numbers()
+        self.runs = Runs()
         self.check = 0
         """CRC-32 over all rows, to compare with what can be read back."""
 
@@ -54,22 +53,23 @@ class RowWriter:
         stored = np.ascontiguousarray(row, dtype=self._data.dtype)
         checks.shape(f"measurement {self._n_rows}", stored.shape, self._data.shape[1:])
         uncertainty_ns = checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1)
+        epoch = checks.whole("epoch", stamp.epoch, 0, _MOST_EPOCH)
         require_room(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
         # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
-        self._count(stamp)
+        self.runs.add(stamp.sequence, epoch)
         self.check = zlib.crc32(stored.data, self.check)
-        values = (
-            stamp.timestamp_ns,
-            uncertainty_ns,
-            stamp.sequence,
-            stamp.sync_count,
-            self._epoch,
-            zlib.crc32(stored.data),
-        )
-        for name, value in {**dict(zip(_STAMP_COLUMNS, values, strict=True)), **columns}.items():
+        stamps = {
+            "time": stamp.timestamp_ns,
+            "time_uncertainty": uncertainty_ns,
+            "sequence": stamp.sequence,
+            "sync_count": stamp.sync_count,
+            "epoch": epoch,
+            "crc32": zlib.crc32(stored.data),
+        }
+        for name, value in {**stamps, **columns}.items():
             self._columns.setdefault(name, []).append(value)
         if self._n_rows % CHUNK_ROWS == 0:
             self.flush()
@@ -85,12 +85,6 @@ class RowWriter:
 
     def __len__(self) -> int:
         return self._n_rows
-
-    def _count(self, stamp: Stamp) -> None:
-        if self._last is not None and stamp.sync_count < self._last.sync_count:
-            self._epoch += 1
-        self.numbers.add(stamp.sequence)
-        self._last = stamp
 
 
 class RowReader:
@@ -108,13 +102,13 @@ class RowReader:
 
         Raises
         ------
-        DataError
+        DamagedError
             It is not what was written.
         """
         row = np.asarray(self._data[index])
         wanted, got = int(self._group["crc32"][index]), zlib.crc32(row.data)
         if got != wanted:
-            raise DataError(
+            raise DamagedError(
                 f"measurement {index} has CRC-32 {got:08x}, its record says {wanted:08x}: the file is damaged; "
                 "copy it again"
             )

@@ -1,5 +1,6 @@
 """Recordings: measurements as they came from the microphones, and what is needed to process them."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, self_contained, storable
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.settings import Air, Settings
+from ertis_numba.storage._gaps import Missing
 from ertis_numba.storage._reader import Reader, plain
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
@@ -32,11 +34,12 @@ _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressur
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Sequence numbers that are missing, ``first`` and ``last`` included, and why."""
+    """Sequence numbers of a run of the sensor that are missing, ``first`` and ``last`` included, and why."""
 
     first: int
     last: int
     reason: str
+    epoch: int = 0
 
 
 class RecordingWriter(Writer[Measurement]):
@@ -85,13 +88,14 @@ class RecordingWriter(Writer[Measurement]):
         self._checked: dict[str, Settings] = {}
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
-        self._noted: dict[str, list[tuple[int, int, str]]] = {}
+        self._noted: dict[str, list[Missing]] = {}
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, epoch: int = 0) -> None:
         """Say why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
 
         They may also lie before the first measurement of the sensor or after its last one. What is there
-        after all is no gap; of other gaps, the reason is "not among the measurements given".
+        after all is no gap; of other gaps, the reason is "not among the measurements given". ``epoch`` is that of the
+        stamps of the run.
 
         Raises
         ------
@@ -99,7 +103,7 @@ class RecordingWriter(Writer[Measurement]):
             ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
         """
         checks.gap(first, last, reason)
-        self._noted.setdefault(sensor, []).append((first, last, reason))
+        self._noted.setdefault(sensor, []).append(Missing(first, last, reason, checks.whole("epoch", epoch, 0)))
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
         sensor = first.stamp.sensor
@@ -158,12 +162,13 @@ class RecordingWriter(Writer[Measurement]):
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         sensor = group.name.rpartition("/")[2]
-        gaps = rows.numbers.missing(self._noted.get(sensor, ()))
+        gaps = rows.runs.missing(self._noted.get(sensor, ()))
         values: dict[str, list[Any]] = {
             "gap": [0.0] * len(gaps),
-            "gap_first": [first for first, _, _ in gaps],
-            "gap_last": [last for _, last, _ in gaps],
-            "gap_reason": [reason.encode() for _, _, reason in gaps],
+            "gap_first": [gap.first for gap in gaps],
+            "gap_last": [gap.last for gap in gaps],
+            "gap_reason": [gap.reason.encode() for gap in gaps],
+            "gap_epoch": [gap.epoch for gap in gaps],
         }
         for name, column in values.items():
             group[name].resize((len(gaps),))
@@ -211,9 +216,11 @@ class RecordingReader(Reader[Measurement]):
 
     def _load(self) -> None:
         self._require_agreement()
-        columns = (self._group[f"gap_{name}"][:] for name in ("first", "last", "reason"))
+        columns = (self._group[f"gap_{name}"][:].tolist() for name in ("first", "last", "reason"))
+        epochs = self._group["gap_epoch"][:].tolist() if "gap_epoch" in self._group else itertools.repeat(0)
         self.gaps = tuple(
-            Gap(int(first), int(last), reason.decode()) for first, last, reason in zip(*columns, strict=True)
+            Gap(first, last, reason.decode(), epoch)
+            for (first, last, reason), epoch in zip(zip(*columns, strict=True), epochs, strict=False)
         )
         self.firmware = str(plain(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = (

@@ -62,6 +62,8 @@ class Variable:
     about : str
     units : str
         As UDUNITS writes it; empty for numbers without a unit.
+    optional : bool
+        Older files do not have it.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Variable:
     dtype: str
     about: str
     units: str = ""
+    optional: bool = False
 
 
 STAMPS: Final = (
@@ -76,7 +79,7 @@ STAMPS: Final = (
     Variable("time_uncertainty", ("time",), "<u4", "uncertainty of time", "ns"),
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
-    Variable("epoch", ("time",), "<i4", "how often sync_count has started again in this file"),
+    Variable("epoch", ("time",), "<i8", "run of the sensor that gave the sequence numbers"),
     Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm or energy, as its bytes lie in the file"),
 )
 
@@ -98,6 +101,7 @@ RECORDING: Final = (
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
     Variable("gap_reason", ("gap",), "str", "why they are missing"),
+    Variable("gap_epoch", ("gap",), "<i8", "run of the sensor that would have given the numbers", optional=True),
 )
 
 ENERGYSCAPE: Final = (
@@ -228,7 +232,7 @@ def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
 
 def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable]) -> None:
     for variable in table:
-        if variable.dtype:
+        if variable.dtype and (variable.name in group or not variable.optional):
             values = np.asarray(group[variable.name][()])
             digest.update(variable.name.encode() + values.tobytes())
 

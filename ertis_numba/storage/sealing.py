@@ -8,62 +8,27 @@ so that HDF5, which takes its process with it where a disk fails (h5py issue 914
 be killed at any moment and run again: the recording is the same.
 """
 
-import argparse
-import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
-from typing import ClassVar, TextIO
+from typing import ClassVar
 
 import numpy as np
 
 from ertis_numba.atomic import part_of, sync
-from ertis_numba.errors import DataError, ErtisError, InUseError
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import SUFFIX, Journal, Sensor
+from ertis_numba.journal import SUFFIX, Journal, Sealed, Sensor
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import RecordingReader, RecordingWriter, open_recording
 
-__all__ = ["IN_USE", "Sealed", "main", "seal"]
+__all__ = ["seal"]
 
-IN_USE = 75
-"""Exit code where another process has the journal: EX_TEMPFAIL of sysexits.h, try again later."""
-
-_FAILED, _INTERRUPTED = 1, 130
 _TOKEN = "sealing"  # noqa: S105  of the part file: who has the journal is the only one to write it
-_STEPS = 100  # in which progress is told
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Sealed:
-    """What became of a journal.
-
-    Attributes
-    ----------
-    journal : Path
-    recording : Path or None
-        None where nothing had been measured.
-    measurements : int
-        In the recording.
-    missing : int
-        Measurements that the recording says to be missing; of those, …
-    damaged : int
-        … were damaged in the journal.
-    set_aside : Path or None
-        Where the journal is now, if measurements in it are damaged; it is gone otherwise.
-    """
-
-    journal: Path
-    recording: Path | None
-    measurements: int = 0
-    missing: int = 0
-    damaged: int = 0
-    set_aside: Path | None = None
 
 
 def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
@@ -92,7 +57,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
-    if not path.exists() and before != path and before.is_file():  # killed after the journal went
+    if not path.exists() and before != path and _made_of(path, before):  # killed after the journal went
         return _told(path, before)
     with Journal.open(path) as journal:
         target = journal.target
@@ -113,6 +78,21 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             return _told(path, target, damaged=n_damaged, set_aside=journal.set_aside())
         journal.remove()
     return _told(path, target)
+
+
+def _origin(path: Path) -> str:
+    """Return what a recording says of the journal that it was made of."""
+    return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # which may be no text at all
+
+
+def _made_of(path: Path, recording: Path) -> bool:
+    """Whether a file is the recording that was made of a journal of this name, which is gone."""
+    try:
+        with open_recording(recording, sensor=sensor_names(recording)[0]) as reader:
+            history = str(reader.attributes.get("history", ""))
+    except (DataError, IndexError):
+        return False
+    return f"{history}; ".startswith(f"{_origin(path)}; ")
 
 
 class _Sealer(RecordingWriter):
@@ -145,7 +125,7 @@ def _write(journal: Journal, rows: dict[str, JournalRows], *, overwrite: bool, p
                 writer.note_gap(name, *gap)
         if not n_written:
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
-        writer.say("; ".join(_absent(rows)))
+        writer.say("; ".join([_origin(journal.path), *_absent(rows)]))
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
@@ -153,7 +133,7 @@ def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
     for name, held in rows.items():
         if len(held) == len(held.damaged):
             yield f"sensor {name} has no measurement"
-            yield from (f"{first} to {last}: {reason}" for first, last, reason in held.missing)
+            yield from (f"{first} to {last}: {reason}" for first, last, reason, _ in held.missing)
 
 
 def _holds(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
@@ -178,7 +158,7 @@ def _same(sensor: Sensor, rows: JournalRows, recording: RecordingReader) -> bool
         for entry, back in zip_longest(rows, recording):
             if entry is None or back is None or not _equal(entry.measurement, back):
                 return False
-        return [(gap.first, gap.last, gap.reason) for gap in recording.gaps] == rows.missing
+        return [(gap.first, gap.last, gap.reason, gap.epoch) for gap in recording.gaps] == rows.missing
 
 
 def _equal(one: Measurement, other: Measurement) -> bool:
@@ -195,55 +175,7 @@ def _told(path: Path, recording: Path, *, damaged: int = 0, set_aside: Path | No
     return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Seal a journal and return an exit code: 0 done, 1 failed or nothing was measured, `IN_USE`, 130 interrupted.
-
-    The path of the recording goes to stdout, errors in a line to stderr. With ``--json``, stdout has lines of one
-    object each: progress (``done``, ``of``), and at last what is in `Sealed`, or ``error`` and ``in_use``.
-    """
-    parser = argparse.ArgumentParser(
-        "python -m ertis_numba.storage.sealing", description=(__doc__ or "").partition("\n")[0]
-    )
-    parser.add_argument("journal", type=Path)
-    parser.add_argument("--force", action="store_true", help="replace a file of the recording's name")
-    parser.add_argument("--json", action="store_true", help="tell progress and result as lines of JSON")
-    given = parser.parse_args(arguments)
-    try:
-        sealed = seal(given.journal, overwrite=given.force, **({"progress": _tell_progress} if given.json else {}))
-    except KeyboardInterrupt:
-        return _INTERRUPTED
-    except (ErtisError, OSError, MemoryError) as error:
-        line = " ".join(str(error).split()) or type(error).__name__
-        if given.json:
-            _tell({"error": line, "in_use": isinstance(error, InUseError)})
-        else:
-            _say(line, sys.stderr)
-        return IN_USE if isinstance(error, InUseError) else _FAILED
-    if given.json:
-        _tell({name: str(value) if isinstance(value, Path) else value for name, value in asdict(sealed).items()})
-    elif sealed.recording is not None:
-        _say(str(sealed.recording), sys.stdout)
-    if sealed.recording is None:
-        _say(f"{sealed.journal}: no measurement was captured", sys.stderr)
-    elif sealed.set_aside is not None:
-        number = "1 measurement is" if sealed.damaged == 1 else f"{sealed.damaged} measurements are"
-        _say(f"{number} damaged; the journal is kept as {sealed.set_aside}", sys.stderr)
-    return _FAILED if sealed.recording is None else 0
-
-
-def _tell_progress(done: int, of: int) -> None:
-    if done == of or done % max(1, of // _STEPS) == 0:
-        _tell({"done": done, "of": of})
-
-
-def _tell(report: dict[str, object]) -> None:
-    _say(json.dumps(report), sys.stdout)
-
-
-def _say(text: str, stream: TextIO) -> None:
-    stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # file names may be no text at all
-    stream.flush()
-
-
 if __name__ == "__main__":
+    from ertis_numba.storage._sealing_process import main
+
     sys.exit(main())

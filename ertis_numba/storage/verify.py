@@ -1,12 +1,10 @@
 """What is missing in a recording or a journal, and what is damaged."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Stamp
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
@@ -30,8 +28,7 @@ class SensorReport:
         Sequence numbers that are missing, and why.
     damaged : tuple of Damage
     disordered : tuple of int
-        Places, counted from 0, of measurements whose sequence number is not above the one before, although they do
-        not start again.
+        Places, counted from 0, of measurements whose sequence number is not above the one before of the same epoch.
     fault : str
         Why nothing of this sensor can be read; empty elsewhere.
     """
@@ -63,7 +60,7 @@ def verify(path: str | Path) -> list[SensorReport]:
     Raises
     ------
     DataError
-        The file cannot be read at all, or another process has the journal.
+        The file cannot be read at all, the disk fails, or another process has the journal.
     """
     path = Path(path)
     if _is_journal(path):
@@ -94,33 +91,26 @@ def _of_recording(path: Path, sensor: str) -> SensorReport:
         for index, stamp in enumerate(stamps):
             try:
                 recording[index]
-            except DataError as error:
+            except DamagedError as error:
                 damaged.append(Damage(index, stamp.sequence, str(error)))
         return SensorReport(
             sensor=sensor,
             measurements=len(recording),
             gaps=recording.gaps,
             damaged=tuple(damaged),
-            disordered=_disordered(_starts(stamps)),
+            disordered=_disordered((stamp.epoch, stamp.sequence) for stamp in stamps),
         )
 
 
-def _starts(stamps: Iterable[Stamp]) -> Iterator[tuple[int, int]]:
-    """Yield how often the numbers have started again, as far as the SYNC count shows, and the number."""
-    last, starts = None, 0
-    for stamp in stamps:
-        starts += last is not None and stamp.sync_count < last
-        last = stamp.sync_count
-        yield starts, stamp.sequence
-
-
 def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
-    """Return the places of the numbers that do not rise, although they did not start again."""
-    return tuple(
-        index
-        for index, (before, (start, number)) in enumerate(pairwise(numbers), 1)
-        if start == before[0] and number <= before[1]
-    )
+    """Return the places of the numbers that are not above the one before of the same epoch."""
+    last: dict[int, int] = {}
+    found = []
+    for index, (epoch, number) in enumerate(numbers):
+        if number <= last.get(epoch, number - 1):
+            found.append(index)
+        last[epoch] = number
+    return tuple(found)
 
 
 def _of_journal(journal: Journal, sensor: str) -> SensorReport:

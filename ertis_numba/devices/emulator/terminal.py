@@ -1,13 +1,16 @@
 """The pseudo terminal of an emulated device, and what comes in through it."""
 
 import array
-import fcntl
 import os
 import re
-import termios
-import tty
+from contextlib import suppress
 
-__all__ = ["Lines", "Terminal"]
+with suppress(ImportError):  # not POSIX: see `links.require_terminals`
+    import fcntl
+    import termios
+    import tty
+
+__all__ = ["CommandReader", "Terminal"]
 
 _LONGEST_LINE = 256  # more without an end is no command
 _LINE = re.compile(rb"[^!\n]+(?=!)|!?[^!\n]*\n|![^!\n]*(?=!)")
@@ -60,7 +63,7 @@ class Terminal:
         os.close(self._slave)
 
 
-class Lines:
+class CommandReader:
     """Cuts what comes into command lines.
 
     A command ends with its line. The authors' code for Windows sends a measurement without an end: that is one as soon

@@ -11,14 +11,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, TextIO
 
-from ertis_numba.devices.faults import Faults, Stall, Unplug
-from ertis_numba.devices.mainboard import Mainboard, Quirks
-from ertis_numba.devices.outputs import Measurements, Output, Pieces, Words
-from ertis_numba.devices.places import HeldLink
-from ertis_numba.devices.registers import Registers
-from ertis_numba.devices.terminal import Terminal
+from ertis_numba.devices.emulator.faults import Faults, Stall, Unplug
+from ertis_numba.devices.emulator.mainboard import Mainboard, Quirks
+from ertis_numba.devices.emulator.measurements import Measurements, Output, Pieces, Words
+from ertis_numba.devices.emulator.registers import Registers
+from ertis_numba.devices.emulator.terminal import Terminal
+from ertis_numba.devices.links import HeldLink, require_terminals
 
-__all__ = ["Emulator", "Quirks"]
+__all__ = ["Emulator"]
 
 _SECOND_NS = 1_000_000_000
 _MOST_UNREAD = 1_000  # answers; then the device takes no more commands
@@ -77,6 +77,8 @@ class Emulator:
     ------
     ArgumentError
         There are no words, or not of uint32; or the link belongs to another.
+    SonarError
+        This system has no pseudo terminals.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class Emulator:
         quirks: Quirks | None = None,
         on_port: Callable[[str], None] | None = None,
     ) -> None:
+        require_terminals()
         self._measurements = Measurements(words, passive, name=name, faults=faults, log=log)
         self.name, self.link, self.quirks = name, link, quirks or Quirks()
         self._on_port = on_port

@@ -1,15 +1,38 @@
 """Where emulated devices are found: stable links to their ports, like those of ``/dev/serial/by-id``."""
 
 import os
+import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, SonarError
 
-__all__ = ["HeldLink", "emulated_folder"]
+try:
+    import fcntl
+except ImportError:  # not POSIX
+    _HAS_TERMINALS = False
+else:
+    _HAS_TERMINALS = True
+
+__all__ = ["HeldLink", "emulated_folder", "is_held", "require_terminals"]
+
+_LOOKS_S = 0.1  # how long at most a lock is waited for that may be of one who only looks
+_RETRY_S = 0.002
+
+
+def require_terminals() -> None:
+    """Refuse to emulate where there is nothing to emulate with.
+
+    Raises
+    ------
+    SonarError
+        This system has no pseudo terminals.
+    """
+    if not _HAS_TERMINALS:
+        raise SonarError("this system has no pseudo terminals; emulate sensors on Linux or macOS")
 
 
 def emulated_folder() -> Path:
@@ -40,9 +63,12 @@ class HeldLink:
     ------
     ArgumentError
         The link belongs to a device that runs, or there is something else of this name.
+    SonarError
+        This system has no pseudo terminals, and so nothing to lead to.
     """
 
     def __init__(self, path: Path) -> None:
+        require_terminals()
         self.path = path
         if os.path.lexists(path) and not (path.is_symlink() and str(path.readlink()).startswith("/dev/")):
             raise ArgumentError(f"link {path} exists and leads to no port; give another name")
@@ -52,8 +78,7 @@ class HeldLink:
         self.clear()
 
     def _locked(self) -> int:
-        import fcntl  # noqa: PLC0415  only POSIX has it, and pseudo terminals
-
+        latest_s = time.monotonic() + _LOOKS_S
         while True:
             lock = os.open(self._lock_path, os.O_CREAT | os.O_RDWR, 0o600)
             try:
@@ -63,10 +88,12 @@ class HeldLink:
                     if os.path.samestat(os.fstat(lock), self._lock_path.stat()):
                         return lock
             except BlockingIOError:
-                os.close(lock)
-                raise ArgumentError(
-                    f"link {self.path} belongs to an emulated device that runs; end that one, or give another name"
-                ) from None
+                if time.monotonic() > latest_s:
+                    os.close(lock)
+                    raise ArgumentError(
+                        f"link {self.path} belongs to an emulated device that runs; end that one, or give another name"
+                    ) from None
+                time.sleep(_RETRY_S)  # `is_held` holds it for an instant
             os.close(lock)
 
     def point_to(self, port: str) -> None:
@@ -85,3 +112,21 @@ class HeldLink:
         self.clear()
         self._lock_path.unlink(missing_ok=True)
         os.close(self._lock)
+
+
+def is_held(link: Path) -> bool:
+    """Whether a link leads to what it was made for, as all do but one that a killed emulator left.
+
+    Its pseudo terminal's number is soon that of somebody's shell. See `HeldLink`.
+    """
+    try:
+        lock = os.open(link.with_name(f".{link.name}.lock"), os.O_RDONLY)
+    except OSError:  # no link of an emulator
+        return True
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from ertis_numba import checks
-from ertis_numba.devices.commands import FRAME_BYTES
+from ertis_numba.devices.blocks import FRAME_BYTES
 
 __all__ = ["KINDS", "Fault", "Faults", "Spoilt", "Stall", "Unplug"]
 

@@ -2,7 +2,18 @@
 
 import numpy as np
 
-from ertis_numba.devices.commands import LENGTH_STEP, MOST_WORDS, PDM_RATES_HZ, Command
+from ertis_numba.devices.blocks import COUNTERS
+from ertis_numba.devices.commands import (
+    DAC_CODE_MAX,
+    DAC_RATES_HZ,
+    DAC_SAMPLES,
+    LENGTH_STEP,
+    MOST_NUMBER,
+    MOST_WORDS,
+    PDM_RATES_HZ,
+    PINS,
+    Command,
+)
 
 __all__ = ["FIRMWARE", "Registers"]
 
@@ -10,17 +21,15 @@ FIRMWARE = 0x00_01_00_00
 """Version that emulated devices answer, 1.0.0: bytes 2, 1 and 0."""
 
 _DONE = 1
-_MOST_SAMPLES = 65_535
-_MOST_CODE = 4_095
 _NUMBERS = {  # by command: which register takes the first number, and from where to where
     "G": ("n_bytes", 4 * LENGTH_STEP, 4 * MOST_WORDS),
     "F": ("clock", 0, 1),
-    "D": ("dac_rate_hz", 160_000, 2_000_000),
-    "E": ("n_codes", 64, _MOST_SAMPLES),
-    "I": ("emissions", 1, 2**32 - 1),
+    "D": ("dac_rate_hz", *DAC_RATES_HZ),
+    "E": ("n_codes", *DAC_SAMPLES),
+    "I": ("emissions", 1, MOST_NUMBER),
     "H": ("active", 0, 1),
     "K": ("amplifier", 0, 1),
-    "B": ("counter", 0, 2**32 - 1),
+    "B": ("counter", 0, COUNTERS - 1),
 }
 
 
@@ -51,7 +60,7 @@ class Registers:
         self.clock = 0
         self.dac_rate_hz = 450_000
         self.n_codes = 0
-        self.codes = np.zeros(_MOST_SAMPLES, dtype=np.uint16)
+        self.codes = np.zeros(DAC_SAMPLES[1], dtype=np.uint16)
         self.emissions = 1
         self.active = 0
         self.amplifier = 1
@@ -80,11 +89,11 @@ class Registers:
         if command.code in {"Y", "L"}:
             return FIRMWARE if command.code == "Y" else self.hash
         if command.code == "C":
-            good = first < self.n_codes and second <= _MOST_CODE
+            good = first < self.n_codes and second <= DAC_CODE_MAX
             if good:
                 self.codes[first] = second
         elif command.code == "J":
-            good = first in {0, 1} and second in {1, 2}
+            good = first in {0, 1} and second in PINS
             if good:
                 self.armed, self.pin = first, second
         else:

@@ -8,7 +8,7 @@ from typing import Self
 
 from ertis_numba import checks
 from ertis_numba.constants import SYNC_STEP_S
-from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.emulator.device import Emulator
 
 __all__ = ["SyncChain"]
 

@@ -4,11 +4,12 @@ from collections import deque
 from dataclasses import dataclass
 
 from ertis_numba import checks
+from ertis_numba.devices.blocks import COUNTERS
 from ertis_numba.devices.commands import Command, encode_answer
-from ertis_numba.devices.faults import Stall
-from ertis_numba.devices.outputs import Measurements, Output
-from ertis_numba.devices.registers import Registers
-from ertis_numba.devices.terminal import Lines
+from ertis_numba.devices.emulator.faults import Stall
+from ertis_numba.devices.emulator.measurements import Measurements, Output
+from ertis_numba.devices.emulator.registers import Registers
+from ertis_numba.devices.emulator.terminal import CommandReader
 from ertis_numba.errors import DataError
 
 __all__ = ["Mainboard", "Quirks"]
@@ -79,7 +80,7 @@ class Mainboard:
         self.outputs: deque[Output] = deque()
         self.refused = 0
         self._measurements = measurements
-        self._lines = Lines()
+        self._lines = CommandReader()
         self._left_ns: int | None = None  # when an unfinished line is taken
         self._recording: _Recording | None = None
 
@@ -114,7 +115,7 @@ class Mainboard:
             return False
         registers = self.registers
         counter = registers.counter
-        registers.counter = (counter + 1) % 2**32
+        registers.counter = (counter + 1) % COUNTERS
         self._recording = _Recording(
             due_ns=at_ns + registers.duration_ns,
             index=counter if index is None else index,

@@ -1,0 +1,7 @@
+"""Emulated sensors on pseudo terminals, with a SYNC line and with faults: what tests and ``ertis emulate`` speak to."""
+
+from ertis_numba.devices.emulator.device import Emulator
+from ertis_numba.devices.emulator.mainboard import Quirks
+from ertis_numba.devices.emulator.sync_chain import SyncChain
+
+__all__ = ["Emulator", "Quirks", "SyncChain"]

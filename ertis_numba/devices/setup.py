@@ -1,0 +1,183 @@
+"""What a sensor is told before it measures."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.devices.blocks import CHANNELS
+from ertis_numba.devices.commands import (
+    DAC_CODE_MAX,
+    DAC_RATES_HZ,
+    DAC_SAMPLES,
+    LENGTH_STEP,
+    MOST_NUMBER,
+    MOST_WORDS,
+    PDM_RATES_HZ,
+    PINS,
+    Command,
+)
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Array, Call, Settings
+from ertis_numba.waveform import call_samples
+
+__all__ = ["Setup", "call_codes", "call_hash"]
+
+
+def call_codes(call: Call) -> NDArray[np.uint16]:
+    """Return a call as the codes of the 12-bit converter, ``floor(2047 s + 2048)``: (sample,) uint16."""
+    return np.floor(2047 * call_samples(call) + 2048).astype(np.uint16)
+
+
+def call_hash(codes: NDArray[np.uint16]) -> int:
+    """Return the XOR of all codes, which is what a sensor answers to `L`."""
+    return int(np.bitwise_xor.reduce(codes, initial=0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Setup:
+    """All that a sensor is told before it measures; `Setup.of` takes it from settings.
+
+    Attributes
+    ----------
+    n_samples : int
+        Words of one measurement.
+    pdm_rate_hz : float
+        One of `PDM_RATES_HZ`.
+    codes : (sample,) uint16
+        The call.
+    dac_rate_hz : int
+        Rate at which it is played.
+    emissions : int
+        Calls per measurement.
+    active : bool
+        Whether the call is emitted, unless a single measurement says otherwise.
+    pin : {1, 2}
+        SYNC input.
+    amplifier : bool
+        Whether the high-voltage amplifier is on, without which nothing is emitted.
+
+    Raises
+    ------
+    ArgumentError
+        A sensor cannot do it.
+    """
+
+    n_samples: int
+    pdm_rate_hz: float
+    codes: NDArray[np.uint16]
+    dac_rate_hz: int
+    emissions: int = 1
+    active: bool = True
+    pin: int = 1
+    amplifier: bool = True
+
+    def __post_init__(self) -> None:
+        _check_length(self.n_samples)
+        if self.pdm_rate_hz not in PDM_RATES_HZ:
+            raise ArgumentError(
+                f"recording.pdm_rate_hz is {self.pdm_rate_hz:.10g}; a sensor's clocks are "
+                f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}: give one of them"
+            )
+        object.__setattr__(self, "dac_rate_hz", _dac_rate_hz(self.dac_rate_hz))
+        _check_codes(self.codes, self.dac_rate_hz)
+        checks.whole("emissions", self.emissions, 1, MOST_NUMBER)
+        checks.whole("pin", self.pin, *PINS)
+        if self.active and not self.amplifier:
+            raise ArgumentError(
+                "active is True with the amplifier off, which emits nothing; switch it on, or be passive"
+            )
+
+    @classmethod
+    def of(cls, settings: Settings, *, active: bool = True, pin: int = 1, emissions: int = 1) -> Self:
+        """Return what a sensor has to be told for ``settings``.
+
+        Where nothing is to be emitted the amplifier is off, too, though a call is loaded: ``dataclasses.replace(setup,
+        amplifier=True)`` lets single measurements be active.
+
+        Raises
+        ------
+        ArgumentError
+            A sensor cannot do it.
+        """
+        recording, call = settings.recording, settings.call
+        _check_array(settings.array)
+        return cls(
+            n_samples=recording.n_samples,
+            pdm_rate_hz=recording.pdm_rate_hz,
+            codes=call_codes(call),
+            dac_rate_hz=_dac_rate_hz(call.sample_rate_hz),
+            emissions=emissions,
+            active=active,
+            pin=pin,
+            amplifier=active,
+        )
+
+    @property
+    def n_bytes(self) -> int:
+        """Of the words of one measurement; a block has `FRAME_BYTES` more."""
+        return 4 * self.n_samples
+
+    def before_call(self) -> list[Command]:
+        """Return what comes first: nothing triggers, then lengths and rates."""
+        return [
+            Command("J", 0, self.pin),
+            Command("G", self.n_bytes),
+            Command("F", PDM_RATES_HZ.index(self.pdm_rate_hz)),
+            Command("D", self.dac_rate_hz),
+            Command("E", len(self.codes)),
+        ]
+
+    def call(self) -> list[Command]:
+        """Return the samples of the call, one command each."""
+        return [Command("C", index, code) for index, code in enumerate(self.codes.tolist())]
+
+    def after_call(self) -> list[Command]:
+        """Return what comes last; then the counter may be set and the trigger switched on."""
+        return [Command("I", self.emissions), Command("K", int(self.amplifier)), Command("H", int(self.active))]
+
+
+def _check_length(n_samples: int) -> None:
+    checks.whole("recording.n_samples", n_samples, 1)
+    if n_samples % LENGTH_STEP or n_samples > MOST_WORDS:
+        near = min(max(round(n_samples / LENGTH_STEP), 1) * LENGTH_STEP, MOST_WORDS)
+        raise ArgumentError(
+            f"recording.n_samples is {n_samples}; a sensor measures multiples of {LENGTH_STEP} up to "
+            f"{MOST_WORDS}: give {near}"
+        )
+
+
+def _check_array(array: Array) -> None:
+    layout = microphones(array)
+    if layout.word_bits != CHANNELS:
+        raise ArgumentError(f"array.word_bits is {layout.word_bits}; a sensor's words have {CHANNELS}: give that")
+    if len(layout.enabled) > CHANNELS:
+        raise ArgumentError(
+            f"array has {len(layout.enabled)} channels; a sensor has {CHANNELS}: give so many positions, or fewer"
+        )
+
+
+def _dac_rate_hz(rate_hz: float) -> int:
+    """Return a rate at which the converter can play."""
+    slowest_hz, fastest_hz = DAC_RATES_HZ
+    if not (float(rate_hz).is_integer() and slowest_hz <= rate_hz <= fastest_hz):
+        raise ArgumentError(
+            f"call.sample_rate_hz is {rate_hz:.10g}; give a whole number from {slowest_hz} to {fastest_hz}"
+        )
+    return int(rate_hz)
+
+
+def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
+    if codes.dtype != np.uint16 or codes.ndim != 1:
+        raise ArgumentError(f"codes are {codes.dtype} of shape {codes.shape}; give (sample,) uint16")
+    fewest, most = DAC_SAMPLES
+    if not fewest <= len(codes) <= most:
+        raise ArgumentError(
+            f"call has {len(codes)} samples; a sensor plays {fewest} to {most}: give a call.duration_s from "
+            f"{(fewest - 1) / rate_hz:.3g} to {(most - 1) / rate_hz:.3g}"
+        )
+    if codes.max() > DAC_CODE_MAX:
+        raise ArgumentError(f"codes reach {codes.max()}; a sensor's converter takes 0 to {DAC_CODE_MAX}")

@@ -1,0 +1,160 @@
+"""Sealing in a process of its own: HDF5 that meets a full disk takes its process with it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import IO, Any
+
+from ertis_numba.errors import DataError, InUseError
+
+__all__ = ["Sealed", "seal_apart"]
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """What became of a journal.
+
+    Attributes
+    ----------
+    journal : Path
+    recording : Path or None
+        None where nothing had been measured.
+    measurements : int
+        In the recording.
+    missing : int
+        Measurements that the recording says to be missing; of those, …
+    damaged : int
+        … were damaged in the journal.
+    set_aside : Path or None
+        Where the journal is now, if measurements in it are damaged; it is gone otherwise.
+    """
+
+    journal: Path
+    recording: Path | None
+    measurements: int = 0
+    missing: int = 0
+    damaged: int = 0
+    set_aside: Path | None = None
+
+    @property
+    def remark(self) -> str:
+        """What is not as its user would expect, in a line; empty where all is well."""
+        if self.recording is None:
+            return f"{self.journal}: no measurement was captured"
+        if self.set_aside is None:
+            return ""
+        number = "1 measurement is" if self.damaged == 1 else f"{self.damaged} measurements are"
+        return f"{number} damaged; the journal is kept as {self.set_aside}"
+
+
+def seal_apart(journal: Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
+    """Make the recording of a journal in a process of its own; see `ertis_numba.storage.sealing.seal`.
+
+    Ctrl-C in a terminal does not reach that process. Whatever ends it, the measurements are in the journal or in the
+    recording, and it can be called again.
+
+    Parameters
+    ----------
+    journal : Path
+    overwrite : bool
+        Replace a file of the recording's name, even if it holds something else.
+    progress : callable, optional
+        Called with the number of measurements that are written and that of all, at most some hundred times.
+
+    Raises
+    ------
+    InUseError
+        Another process has the journal.
+    DataError
+        It failed; the journal is still there.
+    OSError
+        No process can be started.
+    KeyboardInterrupt
+        The process was ended; the text of this error says where the measurements are.
+    """
+    # -P: a file in the current folder that is named like one of Python's must not be taken for it.
+    command = [sys.executable, "-P", "-m", "ertis_numba.storage._sealing_process", "--json"]
+    told: dict[str, Any] = {}
+    try:
+        reason = _run([*command, *(["--force"] if overwrite else []), "--", str(journal)], told, progress)
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(_where(journal, told)) from error
+    if "recording" in told:
+        return _sealed(told)
+    if told.get("in_use"):
+        raise InUseError(told["error"])
+    raise DataError(told.get("error") or f"{journal}: the process that seals it {reason}; seal it again")
+
+
+def _run(command: list[str], told: dict[str, Any], progress: Progress) -> str:
+    """Run a process, put the result that it tells into ``told``, and return how it ended."""
+    with subprocess.Popen(  # noqa: S603  this very package
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="backslashreplace",
+        start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
+    ) as process:
+        said: deque[str] = deque(maxlen=1)
+        listener = Thread(target=_listen, args=(process.stderr, said), daemon=True)
+        listener.start()
+        try:
+            _take(process.stdout, told, progress)
+        except BaseException:
+            _end(process)
+            _take(process.stdout, told, lambda _done, _of: None)
+            raise
+        process.wait()
+        listener.join()
+    return f"ended with {process.returncode}, " + (f"saying {said[0]!r}" if said else "saying nothing")
+
+
+def _listen(stream: IO[str] | None, said: deque[str]) -> None:
+    """Keep the last line: of a traceback, that is the error."""
+    said.extend(line.strip() for line in stream or () if line.strip())
+
+
+def _take(stream: IO[str] | None, told: dict[str, Any], progress: Progress) -> None:
+    """Pass progress on until the process has no more to tell."""
+    for line in stream or ():
+        try:
+            report = json.loads(line)
+        except ValueError:  # what is killed may have told half of it
+            continue
+        if "of" in report:
+            progress(report["done"], report["of"])
+        else:
+            told.update(report)
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """Ask a process to end, such that it leaves nothing half-written where that can be asked."""
+    if os.name == "posix":
+        process.send_signal(signal.SIGINT)
+    else:
+        process.terminate()
+
+
+def _sealed(told: dict[str, Any]) -> Sealed:
+    paths = {name: Path(told[name]) for name in ("journal", "recording", "set_aside") if told[name] is not None}
+    return Sealed(**told | paths)
+
+
+def _where(journal: Path, told: dict[str, Any]) -> str:
+    """Say where the measurements are after an interrupt, which may have come too late to matter."""
+    if "recording" not in told:
+        return f"the measurements are safe in {journal}; seal them by 'ertis recover {journal}'"
+    sealed = _sealed(told)
+    return sealed.remark or f"the measurements are in {sealed.recording}"

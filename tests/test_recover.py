@@ -1,0 +1,137 @@
+"""What a crash has left is recovered, and told; so is what a capture seals."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.capture import _seal
+from ertis_cli.main import cli
+
+from ertis_numba.errors import DataError, SonarError
+from ertis_numba.journal import sealer
+from ertis_numba.storage.verify import verify
+from tests.journals import crashed, create, entries
+from tests.test_journal_damage import spoil
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert done.exit_code == code, (done.stdout, done.stderr, done.exception)
+    return done
+
+
+def test_recover_a_folder(tmp_path):
+    (tmp_path / "sub").mkdir()
+    crashed(tmp_path)
+    crashed(tmp_path, entries(1), name="b.h5")
+    (tmp_path / "c.h5.journal").touch()
+    with create(tmp_path, name="used.h5"):
+        done = run("recover", tmp_path)
+    assert sorted(done.stderr.splitlines()) == [
+        f"{tmp_path}/b.h5: 1 measurement, 0 missing",
+        f"{tmp_path}/c.h5.journal: no measurement was captured; removed",
+        f"{tmp_path}/rec.h5: 3 measurements, 0 missing",
+        f"{tmp_path}/used.h5.journal: in use by a running capture; left alone",
+    ]
+    assert done.stdout == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.h5", "rec.h5", "sub", "used.h5.journal"]
+    assert verify(tmp_path / "rec.h5")[0].whole
+
+
+def test_recover_what_cannot_be_sealed(tmp_path):
+    path = crashed(tmp_path)
+    (tmp_path / "rec.h5").write_text("mine")
+    crashed(tmp_path, name="b.h5")
+    done = run("recover", tmp_path, "--json", "--quiet", code=1)
+    assert done.stderr == (
+        f"ertis: error: {tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force\n"
+    )
+    told = json.loads(done.stdout)["journals"]
+    assert [(report.get("measurements"), "error" in report) for report in told] == [(3, False), (None, True)]
+    assert run("recover", path, "--force", "--quiet").stderr == ""
+    assert verify(tmp_path / "rec.h5")[0].whole
+
+
+def test_recover_damaged_measurements(tmp_path):
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
+    told = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
+    assert told in run("recover", path).stderr
+
+
+def test_recover_nothing(tmp_path):
+    assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
+    assert run("recover", tmp_path, "--quiet").stderr == ""
+    assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}
+    assert "none.journal: No such file or directory" in run("recover", tmp_path / "none.journal", code=1).stderr
+
+
+def test_recover_from_a_folder_with_a_module_in_it(tmp_path, monkeypatch):
+    crashed(tmp_path)
+    (tmp_path / "h5py.py").write_text("raise SystemExit('the wrong one')")
+    monkeypatch.chdir(tmp_path)
+    assert run("recover", ".").stderr == "rec.h5: 3 measurements, 0 missing\n"
+
+
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_recover_is_interrupted(tmp_path, monkeypatch):
+    path = crashed(tmp_path)
+    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    done = run("recover", path, code=130)
+    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
+    monkeypatch.undo()
+    assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
+
+
+# The same at the end of a capture.
+
+
+LOST = SonarError("left: it was unplugged; plug it in")
+
+
+def test_a_capture_tells_of_damage(tmp_path, capsys):
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
+    _seal(path, LOST, overwrite=False)  # which is told by who calls it
+    assert capsys.readouterr().err == f"1 measurement is damaged; the journal is kept as {path}.damaged\n"
+    assert len(verify(tmp_path / "rec.h5")) == 1
+
+
+def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
+    path = crashed(tmp_path)
+    (tmp_path / "rec.h5").write_text("mine")
+    told = (
+        f"{tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force; "
+        f"the measurements are safe in {path}, seal them by 'ertis recover {path}'"
+    )
+    with pytest.raises(SonarError, match="left: it was unplugged"):
+        _seal(path, LOST, overwrite=False)
+    assert capsys.readouterr().err == f"ertis: error: {told}\n"
+    with pytest.raises(DataError) as error:
+        _seal(path, None, overwrite=False)
+    assert str(error.value) == told
+    assert capsys.readouterr().err == ""
+    _seal(path, None, overwrite=True)
+    assert verify(tmp_path / "rec.h5")[0].whole
+
+
+def test_a_capture_of_nothing(tmp_path):
+    for failure, wanted in ((None, "rec.h5.journal: no measurement was captured"), (LOST, "left: it was unplugged")):
+        create(tmp_path, []).close()
+        with pytest.raises((DataError, SonarError), match=wanted):
+            _seal(tmp_path / "rec.h5.journal", failure, overwrite=False)
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("failure", [None, LOST])
+def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, failure):
+    path = crashed(tmp_path)
+    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
+        _seal(path, failure, overwrite=False)
+    assert capsys.readouterr().err == f"the measurements are safe in {path}; seal them by 'ertis recover {path}'\n"
