@@ -6,13 +6,11 @@ import threading
 import time
 from dataclasses import dataclass
 
-from ertis_numba.devices.protocol import Block
+from ertis_numba.devices.blocks import COUNTERS, Block
 from ertis_numba.devices.sonar import Sonar
 from ertis_numba.errors import SonarError, SonarGoneError
 
 __all__ = ["Arrived", "Ended", "Event", "Failed", "Note", "Pace", "Reader", "Restarted", "Returned"]
-
-_COUNTS = 2**32  # of the counter
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +196,8 @@ class Reader(threading.Thread):
     def _count_on(self, block: Block) -> None:
         """Follow the sensor's own count."""
         if self._counter is not None:
-            step = (block.counter - self._counter) % _COUNTS
-            if step >= _COUNTS // 2:
+            step = (block.counter - self._counter) % COUNTERS
+            if step >= COUNTERS // 2:
                 self._put(Restarted(self._sensor))
                 step = 1
             self._count += step

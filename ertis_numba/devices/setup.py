@@ -88,7 +88,7 @@ class Setup:
         checks.whole("pin", self.pin, *PINS)
         if self.active and not self.amplifier:
             raise ArgumentError(
-                "active is True with the amplifier off, which emits nothing; switch it on, or be passive"
+                "active is True with the amplifier off, which emits nothing; switch it on, or give active=False"
             )
 
     @classmethod
