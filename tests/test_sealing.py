@@ -314,8 +314,11 @@ def test_apart_and_lost(tmp_path, instead, line, reason):
 @pytest.mark.parametrize("late", [False, True])
 def test_apart_and_interrupted(tmp_path, instead, late):
     path = crashed(tmp_path)
-    begun = 'echo \'{"done": 1, "of": 3}\''
-    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"{begun}; exec sleep 60")
+    steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
+    told, late_told = (json.dumps(json.dumps(step)) for step in steps)
+    slow = tmp_path / "slow.py"
+    slow.write_text(f"import time; print({told}, flush=True); time.sleep(5); print({late_told})")
+    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
 
     def interrupt(*_):
         raise KeyboardInterrupt
