@@ -1,6 +1,5 @@
 """Journals that are not what they should be are refused in a line, and a full disk takes nothing away."""
 
-import json
 import re
 import resource
 import shutil
@@ -107,28 +106,51 @@ def test_measurements_may_be_deleted_from_the_front(tmp_path, count):
         assert len(journal) == 4 - count
 
 
+def root_page(path, tree):
+    """The number of the first page of a table or an index."""
+    told = python(
+        "import sqlite3, sys\n"
+        "connection = sqlite3.connect(sys.argv[1])\n"
+        "print(*connection.execute('SELECT rootpage FROM sqlite_schema WHERE name = ?', sys.argv[2:]).fetchone())",
+        path,
+        tree,
+    )
+    return int(told.stdout)
+
+
 @pytest.mark.parametrize("tree", ["key", "measurements"])
 def test_rows_that_only_one_tree_has_lost(tmp_path, tree):
     """A page in which fewer cells are counted is a sound one, for SQLite."""
     settings = line(8, 8).replace(recording=Recording(n_samples=64))
     create(tmp_path, entries(20, settings=settings), settings=settings).close()
     path = tmp_path / "rec.h5.journal"
-    ((root,),) = json.loads(
-        python(
-            "import json, sqlite3, sys\n"
-            "connection = sqlite3.connect(sys.argv[1])\n"
-            "found = connection.execute('SELECT rootpage FROM sqlite_schema WHERE name = ?', sys.argv[2:])\n"
-            "print(json.dumps(found.fetchall()))",
-            path,
-            tree,
-        ).stdout
-    )
+    root = root_page(path, tree)
     damaged = bytearray(path.read_bytes())
     page = (root - 1) * PAGE_BYTES
     damaged[page + 3 : page + 5] = (19).to_bytes(2, "big")
     path.write_bytes(damaged)
     with pytest.raises(DamagedError, match="is damaged, it lists"):
         Journal.open(path)
+
+
+def test_a_page_that_sqlite_cannot_read(tmp_path):
+    """What is in it is damaged for ever; the rest is sealed."""
+    create(tmp_path, entries(20)).close()
+    path = tmp_path / "rec.h5.journal"
+    damaged = bytearray(path.read_bytes())
+    root = memoryview(damaged)[(root_page(path, "measurements") - 1) * PAGE_BYTES :]
+    second = int.from_bytes(root[14:16], "big")  # of the cells, after a header of 12 bytes and the place of the first
+    leaf = int.from_bytes(root[second : second + 4], "big")
+    damaged[(leaf - 1) * PAGE_BYTES] = 0  # no kind of page
+    root.release()
+    path.write_bytes(damaged)
+    with Journal.open(path) as journal:
+        keys = journal.index()
+        with pytest.raises(DamagedError, match=r"rec.h5.journal is damaged \(database disk image is malformed\); copy"):
+            journal.entry(keys[10])
+    sealed = seal(path)
+    assert 3 < sealed.damaged == sealed.missing < 10
+    assert sealed.measurements == 20 - sealed.damaged
 
 
 def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):

@@ -1,14 +1,17 @@
-"""What a crash has left is recovered, and told; so is what a capture seals."""
+"""What a crash has left is sealed in a process of its own, and told; so is what a capture has taken."""
 
 import json
+import shutil
+import sys
 
 import pytest
 from click.testing import CliRunner
 from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError, SonarError
-from ertis_numba.journal import sealer
+from ertis_numba.errors import DataError, InUseError, SonarError
+from ertis_numba.journal import seal_apart, sealer
+from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
 from tests.test_journal_damage import spoil
@@ -18,6 +21,89 @@ def run(*arguments, code=0):
     done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert done.exit_code == code, (done.stdout, done.stderr, done.exception)
     return done
+
+
+def test_apart(tmp_path):
+    with create(tmp_path, [*entries(4), *entries(1, sensor="right")]) as journal:
+        path = journal.path
+    shutil.copy(path, tmp_path / "kept")
+    told = []
+    sealed = seal_apart(path, progress=lambda *numbers: told.append(numbers))
+    assert told == [(number + 1, 5) for number in range(5)]
+    assert not path.exists()
+    shutil.copy(tmp_path / "kept", path)
+    assert sealed == seal(path)
+    assert [report.measurements for report in verify(tmp_path / "rec.h5")] == [4, 1]
+
+
+def test_apart_nothing_was_measured(tmp_path):
+    create(tmp_path, []).close()
+    sealed = seal_apart(tmp_path / "rec.h5.journal")
+    assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
+
+
+def test_apart_refused(tmp_path):
+    with create(tmp_path) as journal, pytest.raises(InUseError, match=r"rec.h5.journal is in use by another process"):
+        seal_apart(journal.path)
+    (tmp_path / "rec.h5").write_text("mine")
+    with pytest.raises(DataError, match="exists and holds something else"):
+        seal_apart(journal.path)
+    assert seal_apart(journal.path, overwrite=True).measurements == 3
+
+
+@pytest.fixture
+def instead(tmp_path, monkeypatch):
+    """What makes seal_apart run a line of shell where it would run Python; ``$0`` is that line's own file."""
+
+    def replace_python(line):
+        script = tmp_path / "python"
+        script.write_text(f"#!/bin/sh\n{line}\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sealer.sys, "executable", str(script))
+
+    return replace_python
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("kill -9 $$", "ended with -9, saying nothing; seal it again"),
+        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, saying nothing; seal it again"),
+        ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, saying 'KeyError: 1'; seal it"),
+        ("seq 100000 >&2; exit 3", "ended with 3, saying '100000'; seal it again"),  # more than a pipe holds
+        (
+            f"exec {sys.executable} -c 'import os, sys; sys.exit(str(os.getsid(0) == os.getpid()))'",
+            "ended with 1, saying 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
+        ),
+    ],
+)
+def test_apart_and_lost(tmp_path, instead, line, reason):
+    instead(line)
+    with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
+        seal_apart(crashed(tmp_path))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_apart_and_interrupted(tmp_path, instead, late):
+    path = crashed(tmp_path)
+    steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
+    told, late_told = (json.dumps(json.dumps(step)) for step in steps)
+    slow = tmp_path / "slow.py"
+    slow.write_text(f"import time; print({told}, flush=True); time.sleep(5); print({late_told})")
+    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as error:
+        seal_apart(path, progress=interrupt)
+    safe = f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
+    assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
+    assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
+    assert seal(path).measurements == 3
+
+
+# The command.
 
 
 def test_recover_a_folder(tmp_path):

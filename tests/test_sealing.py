@@ -13,7 +13,7 @@ from ertis_bench import kills
 
 from ertis_numba import atomic
 from ertis_numba.errors import ArgumentError, DataError, InUseError
-from ertis_numba.journal import Journal, seal_apart, sealer
+from ertis_numba.journal import Journal
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, Numbers
@@ -249,86 +249,6 @@ def test_it_goes_on_when_nobody_listens_any_more(tmp_path):
         process.stdout.close()
         process.stderr.close()
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
-
-
-def test_apart(tmp_path):
-    path, _ = two_sensors(tmp_path)
-    shutil.copy(path, tmp_path / "kept")
-    told = []
-    sealed = seal_apart(path, progress=lambda *numbers: told.append(numbers))
-    assert told == [(number + 1, 5) for number in range(5)]
-    assert not path.exists()
-    shutil.copy(tmp_path / "kept", path)
-    assert sealed == seal(path)
-    with open_recording(tmp_path / "rec.h5", sensor="left") as left:
-        assert len(left) == 3
-
-
-def test_apart_nothing_was_measured(tmp_path):
-    create(tmp_path, []).close()
-    sealed = seal_apart(tmp_path / "rec.h5.journal")
-    assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
-
-
-def test_apart_refused(tmp_path):
-    with create(tmp_path) as journal, pytest.raises(InUseError, match=r"rec.h5.journal is in use by another process"):
-        seal_apart(journal.path)
-    (tmp_path / "rec.h5").write_text("mine")
-    with pytest.raises(DataError, match="exists and holds something else"):
-        seal_apart(journal.path)
-    assert seal_apart(journal.path, overwrite=True).measurements == 3
-
-
-@pytest.fixture
-def instead(tmp_path, monkeypatch):
-    """What makes seal_apart run a line of shell where it would run Python; ``$0`` is that line's own file."""
-
-    def replace_python(line):
-        script = tmp_path / "python"
-        script.write_text(f"#!/bin/sh\n{line}\n")
-        script.chmod(0o755)
-        monkeypatch.setattr(sealer.sys, "executable", str(script))
-
-    return replace_python
-
-
-@pytest.mark.parametrize(
-    ("line", "reason"),
-    [
-        ("kill -9 $$", "ended with -9, saying nothing; seal it again"),
-        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, saying nothing; seal it again"),
-        ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, saying 'KeyError: 1'; seal it"),
-        ("seq 100000 >&2; exit 3", "ended with 3, saying '100000'; seal it again"),  # more than a pipe holds
-        (
-            f"exec {sys.executable} -c 'import os, sys; sys.exit(str(os.getsid(0) == os.getpid()))'",
-            "ended with 1, saying 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
-        ),
-    ],
-)
-def test_apart_and_lost(tmp_path, instead, line, reason):
-    instead(line)
-    with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
-        seal_apart(crashed(tmp_path))
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_apart_and_interrupted(tmp_path, instead, late):
-    path = crashed(tmp_path)
-    steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
-    told, late_told = (json.dumps(json.dumps(step)) for step in steps)
-    slow = tmp_path / "slow.py"
-    slow.write_text(f"import time; print({told}, flush=True); time.sleep(5); print({late_told})")
-    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt) as error:
-        seal_apart(path, progress=interrupt)
-    safe = f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
-    assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
-    assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
-    assert seal(path).measurements == 3
 
 
 def test_interrupted(tmp_path, monkeypatch):
