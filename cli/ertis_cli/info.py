@@ -112,6 +112,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "first": _iso(stamps[0].timestamp_ns),
         "last": _iso(stamps[-1].timestamp_ns),
         "missing": sum(gap.last - gap.first + 1 for gap in reader.gaps),
+        **({"firmware": reader.firmware} if reader.firmware else {}),
         "translation_m": reader.translation_m.tolist(),
         "rotation_xyzw": reader.rotation_xyzw.tolist(),
     }
