@@ -37,6 +37,8 @@ class Rehearsal:
         self._scene = scene
         self._image = functools.lru_cache(maxsize=_KEPT)(self._rendered)
         self._chain = functools.lru_cache(maxsize=8)(_chain)
+        # All renderings have the same noise, which takes as long as the rest of one.
+        self._noise = functools.lru_cache(maxsize=1)(_noise)
 
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
         """Return by how much an effect changes the images of all sensors at the most, in decibels.
@@ -70,7 +72,7 @@ class Rehearsal:
         signals = Engine(self._scene, sensor, active).signals(index)
         dbfs = sensor.electronics.noise_dbfs
         if "microphone_noise" in active and dbfs is not None:
-            signals += 10 ** (dbfs / 20) * np.random.default_rng(self._scene.seed).standard_normal(signals.shape)
+            signals += 10 ** (dbfs / 20) * self._noise(self._scene.seed, signals.shape)
         chain = self._chain(sensor.settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
         chain.process_signals(signals, image)
@@ -98,6 +100,10 @@ def image_change_db(
     near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(both))) + 1
     beside = np.maximum(scipy.ndimage.maximum_filter1d(both, near), floor)
     return float(20 * np.log10(1 + np.max(np.abs(after - before) / beside, initial=0.0)))
+
+
+def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).standard_normal(shape)
 
 
 def _chain(settings: Settings) -> FastChain:
