@@ -33,7 +33,9 @@ __all__ = ["capture"]
     help="Path, serial number or name of a sensor; several times for several sensors.",
 )
 @options.output("Recording to write; SERIAL_TIME.h5 by default.")
-@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor.")
+@click.option(
+    "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor, or SYNC pulses."
+)
 @click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
 @click.option(
     "--trigger",
