@@ -4,9 +4,10 @@ import os
 import secrets
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ertis_numba.devices.bits import BitCheck
 from ertis_numba.devices.commands import LENGTH_STEP
 from ertis_numba.storage import open_recording
 
-__all__ = ["LONG", "ONE_SENSOR", "SHORT", "Extent", "run", "small_disk", "wire"]
+__all__ = ["LONG", "ONE_SENSOR", "PARTS", "SHORT", "Extent", "run", "small_disk", "wire"]
 
 _ROOT = Path(__file__).parents[2]
 ONE_SENSOR = _ROOT / "data" / "synthetic" / "reflectors.h5"
@@ -55,37 +56,34 @@ SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills
 LONG = Extent(duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200)
 
 
-def run(*, say: Callable[[str], None], long: bool = False, seed: int | None = None) -> dict[str, Any]:
-    """Try everything and return the report."""
+def run(
+    *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Try everything, or only some of `PARTS`, and return the report."""
     extent = LONG if long else SHORT
     seed = secrets.randbits(31) if seed is None else seed
     say(f"seed {seed}")
-    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long}
-    with tempfile.TemporaryDirectory(prefix="ertis-") as place:
-        folder = Path(place)
-        platform = folder / "platform.toml"
-        platform.write_text(captures.platform(4, n_measurements=5).to_toml())
-        say(f"capturing at 20 Hz for {extent.duration_s:g} s")
-        report["sustained"] = captures.sustained(
-            ONE_SENSOR, _new(folder, "sustained"), duration_s=extent.duration_s, rate_hz=20.0
-        )
-        say(f"{extent.n_groups} pulses to four sensors")
-        report["chain"] = captures.chain(platform, _new(folder, "chain"), n_groups=extent.n_groups, rate_hz=10.0)
-        say(f"{extent.n_blocks} faulty blocks")
-        report["wire"] = wire(extent.n_blocks, seed)
-        report["wire_splices"] = wire(extent.n_blocks, seed, splices=True)
-        say(f"{extent.n_unplugs} times without its plug")
-        report["unplugs"] = captures.unplugs(ONE_SENSOR, _new(folder, "plug"), seed=seed, count=extent.n_unplugs)
-        say(f"{extent.n_kills} captures killed")
-        report["kills"] = captures.kills(ONE_SENSOR, _new(folder, "kills"), seed=seed, count=extent.n_kills)
-        say(f"{extent.n_kills} writers of a journal killed")
-        report["journals"] = kills.appending(_new(folder, "journals"), seed=seed, count=extent.n_kills)
-        say(f"{extent.n_seal_kills} sealings killed")
-        report["seals"] = kills.sealing(_new(folder, "sealing"), seed=seed, count=extent.n_seal_kills)
-        say(f"a disk of {_DISK_MB} MB")
-        with small_disk(_new(folder, "disk")) as disk:
-            report["disk_full"] = None if disk is None else captures.disk_full(ONE_SENSOR, folder, disk)
+    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long, "only": list(only)}
+    for name, (about, part) in PARTS.items():
+        if only and name not in only:
+            continue
+        say(about.format(**asdict(extent)))
+        with tempfile.TemporaryDirectory(prefix="ertis-") as folder:
+            report[name] = part(extent, Path(folder), seed)
     return report
+
+
+def _chain(extent: Extent, folder: Path, _: int) -> dict[str, Any]:
+    platform = folder / "platform.toml"
+    platform.write_text(captures.platform(4, n_measurements=5).to_toml())
+    return captures.chain(platform, folder, n_groups=extent.n_groups, rate_hz=10.0)
+
+
+def _disk_full(_: Extent, folder: Path, __: int) -> dict[str, Any] | None:
+    disk = folder / "disk"
+    disk.mkdir()
+    with small_disk(disk) as mounted:
+        return None if mounted is None else captures.disk_full(ONE_SENSOR, folder, mounted)
 
 
 def wire(n_blocks: int, seed: int, *, splices: bool = False) -> dict[str, Any]:
@@ -93,7 +91,10 @@ def wire(n_blocks: int, seed: int, *, splices: bool = False) -> dict[str, Any]:
     with open_recording(ONE_SENSOR) as recording:
         words = recording[0].words
     check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ, splices=splices)
-    return asdict(wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check))
+    found = wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check)
+    # Not by asdict, which makes pairs the keys of a Counter.
+    values = {each.name: getattr(found, each.name) for each in fields(found)}
+    return {name: dict(value) if isinstance(value, Counter) else value for name, value in values.items()}
 
 
 @contextmanager
@@ -111,7 +112,33 @@ def small_disk(folder: Path) -> Iterator[Path | None]:
             subprocess.run(["umount", str(folder)], check=True)  # noqa: S603, S607
 
 
-def _new(folder: Path, name: str) -> Path:
-    made = folder / name
-    made.mkdir()
-    return made
+PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
+    "sustained": (
+        "capturing at 20 Hz for {duration_s:g} s",
+        lambda extent, folder, _: captures.sustained(ONE_SENSOR, folder, duration_s=extent.duration_s, rate_hz=20.0),
+    ),
+    "chain": ("{n_groups} pulses to four sensors", _chain),
+    "wire": ("{n_blocks} blocks over a line with faults", lambda extent, _, seed: wire(extent.n_blocks, seed)),
+    "splices": (
+        "{n_blocks} blocks again, and splices are looked for",
+        lambda extent, _, seed: wire(extent.n_blocks, seed, splices=True),
+    ),
+    "unplugs": (
+        "{n_unplugs} times without its plug",
+        lambda extent, folder, seed: captures.unplugs(ONE_SENSOR, folder, seed=seed, count=extent.n_unplugs),
+    ),
+    "kills": (
+        "{n_kills} captures killed",
+        lambda extent, folder, seed: captures.kills(ONE_SENSOR, folder, seed=seed, count=extent.n_kills),
+    ),
+    "journals": (
+        "{n_kills} writers of a journal killed",
+        lambda extent, folder, seed: kills.appending(folder, seed=seed, count=extent.n_kills),
+    ),
+    "seals": (
+        "{n_seal_kills} sealings killed",
+        lambda extent, folder, seed: kills.sealing(folder, seed=seed, count=extent.n_seal_kills),
+    ),
+    "disk_full": ("a small disk", _disk_full),
+}
+"""What is tried: what to say of it, and how."""

@@ -127,14 +127,19 @@ def ptx(**given: Any) -> None:
 @bench.command()
 @click.option("--long", is_flag=True, help="An hour rather than a minute.")
 @click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")
+@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. sustained, chain, wire, …")
 @_update
 @options.quiet
 @options.as_json
-def reliability(**given: Any) -> None:
+def reliability(*, only: tuple[str, ...], **given: Any) -> None:
     """Try what goes wrong: faults on the wire, pulled plugs, kill -9, full disks; nothing is timed."""
     from ertis_bench import reliability as benchmark
 
-    _run("reliability", benchmark, **given)
+    from ertis_numba import checks
+
+    for part in only:
+        checks.choice("--only", part, benchmark.PARTS)
+    _run("reliability", benchmark, only=only, **given)
 
 
 @bench.command()
