@@ -1,5 +1,6 @@
 """Captures from emulated sensors on real pseudo terminals: what is stored is what was sent, whatever happens."""
 
+import contextlib
 import io
 import json
 import os
@@ -120,6 +121,9 @@ def test_what_is_stored_is_what_was_sent(captures, words):
             assert measurement.stamp.sequence == number
             assert measurement.stamp.sync_count >= number  # ticks that a busy machine has missed are left out
         times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
+        sent_ns = [json.loads(entry)["time_ns"] for entry in capture.log.getvalue().splitlines()]
+        late_ms = (times_ns + 1e9 * SETTINGS.recording.duration_s - sent_ns) / 1e6
+        assert np.median(late_ms) == pytest.approx(0, abs=6)  # read as soon as it is sent, when all is recorded
         assert np.median(np.diff(times_ns)) / 1e6 == pytest.approx(50, abs=20)  # on a busy machine, too
         assert all(0 < stamp.timestamp_uncertainty_ns < 1e8 for stamp in recording.stamps())
         assert recording.settings.recording == SETTINGS.recording
@@ -159,6 +163,14 @@ def test_measurements_that_are_missing_are_gaps(captures):
     assert [text.split(":")[1] for _, text in capture.notes] == [
         " no whole measurement within 0.53 s; 0 of 131084 bytes came"
     ] * 4
+
+
+def test_commands_that_come_too_early_are_left_out_and_counted(captures):
+    capture = captures(rate_hz=400.0, n=4)
+    capture.session.run(capture.journal)
+    counts = capture.session.counts["one"]
+    assert (counts.stored, counts.lost) == (4, 0)
+    assert counts.skipped == capture.stored[-1].sync_count - 3 > 3
 
 
 def test_a_capture_by_pulses_ends_though_the_last_is_lost(captures):
@@ -305,6 +317,13 @@ def run(tmp_path, *arguments):
     return process.returncode, [json.loads(line) for line in out.splitlines()], err
 
 
+def has_open(process, path):
+    """Whether a process has a file open."""
+    with contextlib.suppress(OSError):  # it may close one just now
+        return any(os.path.realpath(each) == path for each in Path(f"/proc/{process.pid}/fd").iterdir())
+    return False
+
+
 def test_the_command(tmp_path, sensor, words):
     code, lines, err = run(tmp_path, "--port", str(sensor.link), "-n", "3", "--rate", "20", "--json")
     assert code == 0, err
@@ -334,6 +353,21 @@ def test_a_signal_ends_it_with_a_complete_file(tmp_path, sensor, number, argumen
     with open_recording(tmp_path / "rec.h5") as recording:
         assert len(recording) == lines[-1]["stored"] == len(lines) - 1 >= 3
     assert err == ""
+
+
+@pytest.mark.parametrize("after_s", [0.01, 0.2, 0.4])
+def test_a_signal_while_it_starts_ends_it_and_leaves_nothing(tmp_path, sensor, after_s):
+    """Libraries that are being loaded must not swallow it, nor break over it."""
+    process = start(tmp_path, "--port", str(sensor.link), "-o", "rec.h5")
+    while not has_open(process, sensor.port):
+        assert process.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(after_s)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode in {0, 130}, err  # 0 where it had begun to measure
+    assert "Traceback" not in err
+    assert process.returncode == 0 or not list(tmp_path.glob("rec.h5*"))
 
 
 def test_what_takes_measurements_in_never_loads_hdf5(tmp_path, sensor):

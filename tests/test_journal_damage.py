@@ -20,7 +20,7 @@ from ertis_numba.settings import Recording
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.files import line
-from tests.journals import ENVIRONMENT, create, entries, python, same
+from tests.journals import ENVIRONMENT, crashed, create, entries, python, same
 
 SPOIL = """
 import sqlite3, sys
@@ -227,6 +227,29 @@ def test_one_damaged_bit_never_passes(tmp_path):
             refusals.append(str(error))
     assert len(refusals) > 100
     assert all(str(path) in refusal and "\n" not in refusal for refusal in refusals)
+
+
+@pytest.mark.parametrize("n_bytes", [0, 1, 4096])
+def test_a_journal_that_was_cut_short_keeps_its_log(tmp_path, n_bytes):
+    """SQLite would throw away what is all that is left."""
+    path = crashed(tmp_path)
+    log = path.with_name(f"{path.name}-wal")
+    before = log.read_bytes()
+    with path.open("r+b") as file:
+        file.truncate(n_bytes)
+    for use in (Journal.open, seal):
+        with pytest.raises(
+            DamagedError, match=r"bytes, too few to go with its log .*-wal: it was cut short; copy both"
+        ):
+            use(path)
+    assert log.read_bytes() == before
+
+
+def test_a_journal_that_was_removed_takes_no_more(tmp_path):
+    with create(tmp_path, entries(2)) as journal:
+        journal.path.unlink()
+        with pytest.raises(InUseError, match="was removed or replaced by another process; look again"):
+            journal.append(entries(1, first=20))
 
 
 def test_settings_of_a_journal_that_cannot_be_used(tmp_path):

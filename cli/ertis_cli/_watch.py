@@ -1,12 +1,13 @@
 """What is told while measurements are captured, and what ends that."""
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -21,23 +22,49 @@ __all__ = ["Signals", "Watch", "report", "stopped_by_signals"]
 
 _REFRESH_S = 0.25
 _ALIVE = 0.05  # share of ones, and of zeros, of a microphone that is
+_TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Signals:
-    """What asked this program to end, and what is to be done about it."""
+    """What asked this program to end, and what is to be done about it.
+
+    A signal never breaks into what runs: libraries that are being loaded would swallow it, or break over it. What was
+    asked for is done by `obey`, or by what is to be called from then on.
+    """
 
     def __init__(self) -> None:
         self.came: list[int] = []
-        self.stop: Callable[[], None] | None = None
+        self._stop: Callable[[], None] | None = None
+        self._first_s = math.inf
 
     def __call__(self, number: int, _: object) -> None:
         self.came.append(number)
-        if self.stop is None or len(self.came) > 1:  # before there is anything to save, or who asks twice means it
-            if number == signal.SIGINT:
-                raise KeyboardInterrupt
-            sys.exit(128 + number)
-        self.stop()
+        now_s = time.monotonic()
+        if self._stop is None:
+            return
+        if now_s - self._first_s > _TWICE_S:  # who asks again means it
+            self.end()
+        self._first_s = min(self._first_s, now_s)
+        self._stop()
+
+    def obey(self, stop: Callable[[], None]) -> None:
+        """End if that was asked for meanwhile; call ``stop`` where it is from now on.
+
+        Raises
+        ------
+        KeyboardInterrupt, SystemExit
+            It was.
+        """
+        self._stop = stop
+        if self.came:
+            self.end()
+
+    def end(self) -> NoReturn:
+        """End as the first signal asked."""
+        if self.came[0] == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.exit(128 + self.came[0])
 
 
 @contextmanager
@@ -151,12 +178,19 @@ def report(target: Path, session: "Session", took: dict[str, float], *, quiet: b
     for sensor, each in counts.items():
         for reason, count in each.missing.items():
             options.say(f"{sensor}: {count} missing, {reason}", quiet=quiet)
+        if each.skipped:
+            options.say(
+                f"{sensor}: {each.skipped} commands were left out, as it was still busy with the one before; give a "
+                "lower --rate",
+                quiet=quiet,
+            )
     if as_json:
         report: dict[str, Any] = {
             sensor: {
                 "stored": each.stored,
                 "missing": dict(each.missing),
                 "unplugged": each.unplugged,
+                "skipped": each.skipped,
             }
             for sensor, each in counts.items()
         }

@@ -138,13 +138,16 @@ def capture(
         checks = _checks(sonars, settings, splices=refuse_splices) if check_bits else {}
         for name, sonar in sonars.items():
             sonar.configure(setup, bits=checks[name].check if check_bits else None)
+        signals.obey(session.stop)
         path = target.with_name(f"{target.name}{SUFFIX}")
         journal = stack.enter_context(
             Journal.create(path, target=target.name, source=f"capture of {', '.join(sonars)}")
         )
-        signals.stop = session.stop
         failure = watch.run(session, journal, checks)
         asked_to_end = list(signals.came)
+        if asked_to_end and not len(journal):
+            journal.remove()
+            signals.end()
         stack.close()
         _seal(path, failure, overwrite=force)
     report(target, session, watch.took, quiet=quiet, as_json=as_json)

@@ -43,6 +43,7 @@ class Failed:
 
     sensor: str
     count: int
+    tick: int
     reason: str
     """For the recording: short."""
 
@@ -179,11 +180,11 @@ class Reader(threading.Thread):
             try:
                 block = self._sonar.measure()
             except SonarGoneError as error:
-                self._put(Failed(self._sensor, self._count, "the sensor was unplugged", str(error)))
+                self._put(Failed(self._sensor, self._count, tick, "the sensor was unplugged", str(error)))
                 self._come_back()
                 latest_s = time.monotonic()
             except SonarError as error:
-                self._put(Failed(self._sensor, self._count, "it did not arrive in time", str(error)))
+                self._put(Failed(self._sensor, self._count, tick, "it did not arrive in time", str(error)))
                 if time.monotonic() - latest_s > self._patience_s:
                     raise
             else:

@@ -49,11 +49,14 @@ class Counts:
     missing : Counter of str
         Numbers that are missing, by reason.
     unplugged : int
+    skipped : int
+        Commands that were not given, as the sensor was still busy with the one before.
     """
 
     stored: int = 0
     missing: Counter[str] = field(default_factory=Counter)
     unplugged: int = 0
+    skipped: int = 0
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
     """When the latest were stored, by `time.monotonic`."""
 
@@ -76,6 +79,7 @@ class _Track:
 
     sequence: int | None = None  # of the latest that is stored or known to be missing
     first_pulse: int | None = None
+    tick: int = -1  # of the latest command
     why: str = ""  # measurements are missing, where that is known
     passed: bool = False  # whether a pulse beyond the last that is wanted has come
 
@@ -230,8 +234,10 @@ class Session:
                 case Arrived(tick=None):
                     ready += self._pulses.add(event.sensor, event, event.count, event.block.arrived.monotonic_ns)
                 case Arrived(tick=int(tick)):
+                    self._note_tick(event.sensor, tick)
                     ready.append((event, tick))
                 case Failed():
+                    self._note_tick(event.sensor, event.tick)
                     self._store(sink, ready)
                     ready = []
                     self._miss_until(sink, event.sensor, event.count + 1, event.reason)
@@ -252,6 +258,11 @@ class Session:
                         self._on_note(sensor, str(error))
         ready += self._pulses.release(time.monotonic_ns())
         self._store(sink, ready)
+
+    def _note_tick(self, sensor: str, tick: int) -> None:
+        track = self._tracks[sensor]
+        self.counts[sensor].skipped += tick - track.tick - 1
+        track.tick = tick
 
     def _begin_anew(self, sensor: str, why: str) -> list[tuple[Arrived, int]]:
         """Return what was held of a sensor; what it counts from now on is compared with the others anew."""

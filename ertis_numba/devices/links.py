@@ -119,6 +119,8 @@ def is_held(link: Path) -> bool:
 
     Its pseudo terminal's number is soon that of somebody's shell. See `HeldLink`.
     """
+    if not link.name:
+        return True
     try:
         lock = os.open(link.with_name(f".{link.name}.lock"), os.O_RDONLY)
     except OSError:  # no link of an emulator

@@ -59,9 +59,15 @@ class Database:
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
         with self._told():
-            before = path.stat()
+            self._file = before = path.stat()
             if not before.st_size and not empty:  # to lock it would make a database of it
                 raise DataError(f"{path} is empty; give a journal that 'ertis capture' left")
+            log = path.with_name(f"{path.name}-wal")
+            if before.st_size < PAGE_BYTES and log.exists() and log.stat().st_size:  # SQLite would throw the log away
+                raise DamagedError(
+                    f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; copy "
+                    "both again"
+                )
             uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
             # Who uses a journal sees to it that two threads do not use it at once.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
@@ -93,6 +99,16 @@ class Database:
         for statement in _SETUP:
             self.execute(statement)
         return is_new
+
+    def require_name(self) -> None:
+        """Refuse to go on with a file that has lost its name: what is written to it could not be found again.
+
+        Raises
+        ------
+        InUseError
+            It has.
+        """
+        self._require_there(self._file)
 
     def _require_there(self, before: os.stat_result) -> None:
         """Refuse a file that has lost its name: who had locked it may have sealed and removed it."""

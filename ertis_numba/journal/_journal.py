@@ -170,6 +170,8 @@ class Journal(Contents):
         DataError
             The disk is full, nearly so, or fails. What was appended before is still there, and more can be
             appended once there is room.
+        InUseError
+            Somebody has removed the journal, or put another in its place.
         """
         with self._turn:
             last = dict(self._last)
@@ -177,6 +179,7 @@ class Journal(Contents):
             sizes_bytes = [row[-1].nbytes for row in rows]
             seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
             _room.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
+            self._database.require_name()
             with self._database.transaction():
                 for row in rows:
                     self._database.execute(_INSERTION, row)
