@@ -87,6 +87,12 @@ def test_disorder_is_told(tmp_path):
     assert "1 out of order (at 3)" in run("verify", path, code=3).stdout
 
 
+def test_a_number_that_comes_twice_is_told(tmp_path):
+    write_recording(tmp_path / "rec.h5", measurements(1, 2, 2, 3))
+    done = run("verify", tmp_path / "rec.h5", code=3)
+    assert "whole" not in done.stdout
+
+
 def test_numbers_that_start_again(tmp_path):
     with create(tmp_path, entries(2, first=8, epoch=1)) as journal:
         journal.append(entries(2, first=0, epoch=2))
