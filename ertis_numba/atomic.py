@@ -9,11 +9,11 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["check_target", "part_of", "replacing", "require_room", "sync"]
+__all__ = ["SPARE_BYTES", "check_target", "part_of", "replacing", "require_room", "sync"]
 
 # HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
 # 914), so writing stops while there is still room for its tables.
-_SPARE_BYTES = 8_000_000
+SPARE_BYTES = 8_000_000
 
 
 def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
@@ -53,9 +53,9 @@ def require_room(folder: Path, n_bytes: int) -> None:
         The disk is full, or nearly so.
     """
     free = shutil.disk_usage(folder).free
-    if free < n_bytes + _SPARE_BYTES:
+    if free < n_bytes + SPARE_BYTES:
         raise DataError(
-            f"{folder} has {free / 1e6:.1f} MB free, wanted {n_bytes / 1e6:.1f} MB and {_SPARE_BYTES / 1e6:.0f} MB "
+            f"{folder} has {free / 1e6:.1f} MB free, wanted {n_bytes / 1e6:.1f} MB and {SPARE_BYTES / 1e6:.0f} MB "
             "to spare; free some space or write elsewhere"
         )
 

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from ertis_numba.atomic import SPARE_BYTES
 from ertis_numba.errors import DataError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
 __all__ = ["left", "recording_bytes", "require"]
 
-_SPARE_BYTES: Final = 9_000_000  # what sealing wants to keep free while it writes, and a little more
+_SPARE_BYTES: Final = SPARE_BYTES + 1_000_000  # what sealing wants to keep free while it writes, and a little more
 _SENSOR_BYTES: Final = 150_000  # a recording's tables: 90 kB were measured, and the settings may be longer
 _ROW_BYTES: Final = 150  # in these tables
 
