@@ -10,8 +10,10 @@
     │   ├── FormatVersionError           a file was written by a newer version
     │   └── InUseError                   a journal belongs to another process
     ├── DeviceError (RuntimeError)       the compute device asked for is not there
-    └── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
-        └── SonarGoneError               it was unplugged
+    ├── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
+    │   └── SonarGoneError               it was unplugged
+    └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
+        └── RefusedError                 it does not let this one in, or not do what was asked
 
 Each class also inherits the builtin that a caller would catch without knowing this package.
 """
@@ -24,6 +26,8 @@ __all__ = [
     "ErtisError",
     "FormatVersionError",
     "InUseError",
+    "NetworkError",
+    "RefusedError",
     "SettingsError",
     "SonarError",
     "SonarGoneError",
@@ -68,3 +72,11 @@ class SonarError(ErtisError, OSError):
 
 class SonarGoneError(SonarError):
     """A sensor was unplugged."""
+
+
+class NetworkError(ErtisError, OSError):
+    """Another node cannot be reached, or does not answer as it should."""
+
+
+class RefusedError(NetworkError):
+    """Another node does not let this one in, or does not do what was asked."""

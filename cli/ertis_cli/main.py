@@ -22,11 +22,16 @@ COMMANDS = {
     ),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
+    "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
+    "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
     "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),
+    "record": ("ertis_cli.record:record", "Be the central node that stores what sensors send."),
     "recover": ("ertis_cli.recover:recover", "Make recordings of what a crash has left."),
+    "serve": ("ertis_cli.serve:serve", "Be the central node that makes images of what sensors send."),
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
+    "status": ("ertis_cli.status:status", "Show how a central node is."),
     "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),
 }
 """Where each command is, and what its help says first: commands are imported when they are run."""

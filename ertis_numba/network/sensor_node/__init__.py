@@ -1,0 +1,1 @@
+"""The sensor node: keeps measurements until the central node has acknowledged them."""

@@ -1,0 +1,156 @@
+"""How a central node is: what `ertis status` shows, applications subscribe to, and metrics are made of."""
+
+from collections import deque
+from typing import Annotated, Literal
+
+import msgspec
+
+__all__ = [
+    "ArchiveStatus",
+    "Latencies",
+    "Percentiles",
+    "ProcessingStatus",
+    "SensorStatus",
+    "Status",
+    "SubscriberStatus",
+    "WorkerStatus",
+]
+
+
+class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
+    """How long something took, of the latest times that it happened; 0 where it never did."""
+
+    p50_ms: float = 0.0
+    p90_ms: float = 0.0
+    p99_ms: float = 0.0
+    max_ms: float = 0.0
+
+
+class Latencies:
+    """Collects times, of which the latest count.
+
+    Parameters
+    ----------
+    size : int
+        How many count.
+    """
+
+    def __init__(self, size: int = 1024) -> None:
+        self._times_ms: deque[float] = deque(maxlen=size)
+
+    def add(self, time_ms: float) -> None:
+        """Take a time."""
+        self._times_ms.append(time_ms)
+
+    def percentiles(self) -> Percentiles:
+        """Return what they come to."""
+        ordered = sorted(self._times_ms)
+        if not ordered:
+            return Percentiles()
+        last = len(ordered) - 1
+        p50, p90, p99 = (round(ordered[round(share * last)], 3) for share in (0.5, 0.9, 0.99))
+        return Percentiles(p50_ms=p50, p90_ms=p90, p99_ms=p99, max_ms=round(ordered[-1], 3))
+
+
+class SensorStatus(msgspec.Struct, kw_only=True):
+    """One sensor, since the central node was started.
+
+    ``received = published + sum(dropped.values()) + in_flight`` where there is processing; ``received`` counts each
+    measurement once.
+    """
+
+    connected: bool = False
+    epoch: int = 0
+    settled: int = -1
+    rate_hz: float = 0.0
+    received: int = 0
+    received_bytes: int = 0
+    stored: int = 0
+    published: int = 0
+    in_flight: int = 0
+    dropped: dict[str, int] = {}
+    missing: dict[str, int] = {}
+    """Sequence numbers that the sensor node, or this one, says to be missing, by reason."""
+    repeated: int = 0
+    """Measurements that came again and were held already."""
+    conflicts: int = 0
+    """Of those, such that were not the same; both are kept."""
+    queue: int = 0
+    """Waiting for a worker, or for the disk."""
+    image_latency: Percentiles = Percentiles()
+    """From its arrival at this node to the image leaving it."""
+
+
+class ArchiveStatus(msgspec.Struct, kw_only=True):
+    """What stores measurements."""
+
+    folder: str
+    recording: str = ""
+    """That is being written."""
+    journal_bytes: int = 0
+    free_bytes: int = 0
+    room_bytes: int = 0
+    """That can still be stored, about."""
+    sealed: int = 0
+    sealing: int = 0
+    sealing_failed: int = 0
+    commit: Percentiles = Percentiles()
+    ack: Percentiles = Percentiles()
+    """From the arrival of a measurement to its ack being sent."""
+
+
+class WorkerStatus(msgspec.Struct, kw_only=True):
+    """One worker."""
+
+    pid: int
+    state: Literal["starting", "idle", "busy"]
+    done: int = 0
+
+
+class SubscriberStatus(msgspec.Struct, kw_only=True):
+    """One application node."""
+
+    name: str
+    products: tuple[str, ...]
+    sensors: tuple[str, ...] | None = None
+    sent: int = 0
+    dropped: int = 0
+
+
+class ProcessingStatus(msgspec.Struct, kw_only=True):
+    """What makes images."""
+
+    address: str = ""
+    """Where applications subscribe."""
+    choice: str = ""
+    """How measurements share the cores, and why, in a line."""
+    workers: list[WorkerStatus] = []
+    respawned: int = 0
+    retried: int = 0
+    quarantined: int = 0
+    publisher_respawned: int = 0
+    process_time: Percentiles = Percentiles()
+    subscribers: list[SubscriberStatus] = []
+    groups: dict[str, int] = {}
+    """Closed groups: ``complete``, and by flag."""
+
+
+class Status(msgspec.Struct, kw_only=True):
+    """A central node."""
+
+    version: str
+    pid: int
+    host: str
+    address: str
+    state: Literal["storage", "processing", "fault", "closing"]
+    fault: str = ""
+    uptime_s: float = 0.0
+    time_ns: int = 0
+    memory_bytes: int = 0
+    peers: int = 0
+    keys: bool = False
+    """Whether nodes have to have keys."""
+    refused: Annotated[dict[str, int], "by reason"] = {}
+    sensors: dict[str, SensorStatus] = {}
+    archive: ArchiveStatus | None = None
+    processing: ProcessingStatus | None = None
