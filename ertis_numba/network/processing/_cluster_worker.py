@@ -1,0 +1,97 @@
+"""What the workers of a cluster run: pipelines stay in their processes from one measurement to the next."""
+
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.network.processing.slots import POINTS_BYTES
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing.chain import Chain
+    from ertis_numba.network.processing.notes import Prepared
+
+__all__ = ["Made", "prepare", "process"]
+
+_KEPT: Final = 8  # pipelines of a worker; the one that was used longest ago goes
+_WORDS = np.dtype("<f4")
+
+_turn = threading.Lock()
+_chains: "OrderedDict[tuple[str, str], Chain]" = OrderedDict()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Made:
+    """What came of a measurement.
+
+    Attributes
+    ----------
+    image : (direction, range) float32 or float16
+    points : (point, 4) float32
+        None of them unless they were asked for.
+    took_s : float
+    worker : str
+        Address of the one that made it.
+    """
+
+    image: NDArray[Any]
+    points: NDArray[np.float32]
+    took_s: float
+    worker: str
+
+
+def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
+    """Make the pipeline of a kind of measurements, unless it is there; return what it is, or why there can be none."""
+    try:
+        chain = _chain(settings, device)
+        threads = _threads()
+        took_s, _ = chain.times_s(threads, 1)
+    except (ArgumentError, DataError, DeviceError, MemoryError) as error:
+        return str(error) or type(error).__name__
+    return chain.prepared(kind, took_s, took_s)
+
+
+def process(settings: str, device: str, dtype: str, words: bytes, *, points: bool) -> "Made | str":
+    """Return what is made of a measurement, or why there is nothing that could be."""
+    begun_s = time.perf_counter()
+    try:
+        chain = _chain(settings, device)
+        image = chain.image(words, threads=_threads())
+    except DataError as error:
+        return str(error)
+    found = chain.points(image, POINTS_BYTES // 16) if points else np.empty((0, 4), _WORDS)
+    energy = image.energy if dtype == "float32" else image.energy.astype(np.float16)
+    return Made(energy, found, time.perf_counter() - begun_s, _address())
+
+
+def _chain(settings: str, device: str) -> "Chain":
+    from ertis_numba.network.processing.chain import Chain  # noqa: PLC0415  in processes of the cluster alone
+
+    key = (settings, device)
+    with _turn:
+        if key not in _chains:
+            _chains[key] = Chain(settings, device)
+        _chains.move_to_end(key)
+        while len(_chains) > _KEPT:  # who is processing with it has it until that is done
+            _chains.popitem(last=False)
+        return _chains[key]
+
+
+def _threads() -> int:
+    """Return how many threads one measurement may have, where a worker is given several at once."""
+    from distributed import get_worker  # noqa: PLC0415  there is one where this runs
+
+    from ertis_numba import kernels  # noqa: PLC0415
+
+    return max(1, kernels.load("auto").max_threads // max(1, get_worker().state.nthreads))
+
+
+def _address() -> str:
+    from distributed import get_worker  # noqa: PLC0415
+
+    return str(get_worker().address)

@@ -1,0 +1,106 @@
+"""What a worker, of this machine or of a cluster, does with a measurement."""
+
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.network.processing.notes import Prepared
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+from ertis_numba.stages.points import PointExtractor
+
+__all__ = ["Chain"]
+
+_TIMED: Final = 5  # measurements, whose median counts
+
+
+class Chain:
+    """A pipeline for one kind of measurements, from their bytes to images and points; threads may share it.
+
+    Parameters
+    ----------
+    settings : str
+        As TOML.
+    device : {"auto", "cpu", "cuda", "numpy"}
+
+    Attributes
+    ----------
+    pipeline : Pipeline
+    shape : (direction, range)
+        Of its images.
+    """
+
+    def __init__(self, settings: str, device: str) -> None:
+        self.pipeline = Pipeline(Settings.from_toml(settings, "settings of a sensor"), device=device)
+        self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
+        layout = microphones(self.pipeline.settings.array)
+        self._dtype = np.dtype(f"<u{layout.word_bits // 8}")
+        self._words_shape = (self.pipeline.settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
+        self._extractor: PointExtractor | None = None
+        self._turn = threading.Lock()
+
+    def image(
+        self, words: "bytes | memoryview", out: NDArray[np.float32] | None = None, *, threads: int | None = None
+    ) -> Energyscape:
+        """Return the image of a measurement that is given as bytes.
+
+        Raises
+        ------
+        DataError
+            They are not as many as the settings say.
+        """
+        if len(words) != int(np.prod(self._words_shape)) * self._dtype.itemsize:
+            raise DataError(f"a measurement has {len(words)} bytes, which its settings do not say; say Hello again")
+        array = np.frombuffer(words, self._dtype).reshape(self._words_shape)
+        return self.pipeline.process(Measurement(array, self.pipeline.settings), out, threads=threads)
+
+    def points(self, image: Energyscape, most: int) -> NDArray[np.float32]:
+        """Return the points of an image, ``(point, 4)``: x, y, z in m and the energy; the strongest come first."""
+        with self._turn:  # its tables are made when somebody wants points for the first time
+            if self._extractor is None:
+                self._extractor = PointExtractor(self.pipeline.settings)
+        cloud = self._extractor(image)
+        rows: NDArray[np.float32] = np.column_stack([cloud.position_m, cloud.energy]).astype("<f4")[:most]
+        return rows
+
+    def times_s(self, threads: int, at_once: int) -> tuple[float, float]:
+        """Return how long one measurement takes on all threads, and as one of several at once that share them."""
+        silence = np.zeros(self._words_shape, self._dtype).tobytes()
+        out = np.empty(self.shape, np.float32)
+        wide_s = _median_s(lambda: self.image(silence, out, threads=threads))
+        if at_once == 1:
+            return wide_s, wide_s
+        share = max(1, threads // at_once)
+        return wide_s, _median_s(lambda: self.image(silence, out, threads=share))
+
+    def prepared(self, kind: int, wide_s: float, many_s: float) -> Prepared:
+        """Return what the central node needs to know of it."""
+        axes = (self.pipeline.grid.azimuth_rad, self.pipeline.grid.elevation_rad, self.pipeline.range_m)
+        azimuth_rad, elevation_rad, range_m = (axis.astype("<f8").tobytes() for axis in axes)
+        return Prepared(
+            kind=kind,
+            settings=self.pipeline.settings.to_toml(),
+            azimuth_rad=azimuth_rad,
+            elevation_rad=elevation_rad,
+            range_m=range_m,
+            shape=self.shape,
+            wide_s=wide_s,
+            many_s=many_s,
+        )
+
+
+def _median_s(work: Callable[[], Any]) -> float:
+    took_s = []
+    for _ in range(_TIMED + 1):
+        begun_s = time.perf_counter()
+        work()
+        took_s.append(time.perf_counter() - begun_s)
+    return statistics.median(took_s[1:])

@@ -1,0 +1,151 @@
+"""Jobs on a real dask cluster of this machine, through the interface that local workers have, too."""
+
+import os
+import select
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+
+import ertis_numba as ertis
+from ertis_numba.network.messages import Data
+from ertis_numba.network.processing.cluster import Cluster
+from ertis_numba.network.processing.options import Options
+from ertis_numba.network.processing.runner import Done, Job, Kind, KindFailed, KindReady, Lost
+
+RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
+LONG_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def measurement():
+    with ertis.open_recording(RECORDING) as recording:
+        yield recording[0]
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, worker_dashboard_address=None, silence_logs=50
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def cluster(scheduler):
+    runner = Cluster(Options(cluster=scheduler, deadline_s=30.0), lambda _: None)
+    yield runner
+    runner.close()
+
+
+def events_of(runner, count=1):
+    found, end_s = [], time.monotonic() + LONG_S
+    while len(found) < count and time.monotonic() < end_s:
+        for fd in select.select(list(runner.fds()), [], [], 0.1)[0]:
+            found += runner.ready(fd)
+        found += runner.tick(time.monotonic(), 10.0)
+    assert len(found) >= count, "the cluster took longer than a minute"
+    return found
+
+
+def kind_of(measurement, number=0, settings=None):
+    return Kind(number, (settings or measurement.settings).to_toml(), measurement.words.nbytes)
+
+
+def job_of(measurement, number, kind, *, points=False):
+    data = Data(
+        sensor="front", epoch=1, sequence=number, sync_count=0, timestamp_ns=0, uncertainty_ns=0, monotonic_ns=0,
+        temperature_c=20.0, humidity_percent=50.0, pressure_pa=101325.0, crc32=0,
+    )  # fmt: skip
+    return Job(number, data, measurement.words, kind, 0, points=points)
+
+
+def test_images_are_those_of_a_pipeline_here(cluster, measurement):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    assert not cluster.takes(kind)
+    assert isinstance(events_of(cluster)[0], KindReady)
+    assert cluster.takes(kind)
+    with ertis.Pipeline(measurement.settings) as pipeline:
+        wanted = pipeline.process(measurement).energy
+    jobs = [job_of(measurement, number, kind, points=number == 1) for number in range(2)]
+    for job in jobs:
+        cluster.submit(job)
+    done = events_of(cluster, 2)
+    assert all(isinstance(event, Done) for event in done)
+    for event in done:
+        assert np.array_equal(event.job.slot.view.image_as(wanted.shape, np.float32), wanted)
+        assert (event.job.n_points > 0) == event.job.points
+        cluster.give_back(event.job.slot)
+    assert sum(worker.done for worker in cluster.status()) == 2
+    assert "2 workers" in cluster.choice
+
+
+def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    events_of(cluster)
+    number = 0
+    while cluster.takes(kind):
+        cluster.submit(job_of(measurement, number, kind))
+        number += 1
+    assert number in {1, 2}  # the second worker may not have been seen yet
+    for event in events_of(cluster, number):
+        cluster.give_back(event.job.slot)
+
+
+def test_settings_that_no_pipeline_can_use_are_told(cluster, measurement):
+    processing = measurement.settings.processing.replace(directions="no/such/grid.csv")
+    cluster.prepare(kind_of(measurement, 1, measurement.settings.replace(processing=processing)))
+    (event, *_) = events_of(cluster)
+    assert isinstance(event, KindFailed)
+    assert "grid.csv" in event.text
+
+
+def test_words_that_do_not_fit_are_told(cluster, measurement):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    events_of(cluster)
+    cluster.submit(Job(7, job_of(measurement, 7, kind).data, measurement.words[:-1], kind, 0))
+    (event, *_) = events_of(cluster)
+    assert isinstance(event, Lost)
+    assert not event.again
+    assert "bytes" in event.text
+
+
+def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    events_of(cluster)
+    victim = cluster.status()[0].pid
+    cluster.submit(job_of(measurement, 0, kind))
+    os.kill(victim, signal.SIGKILL)
+    for number in range(1, 4):
+        (event, *_) = events_of(cluster)
+        assert isinstance(event, Done)
+        cluster.give_back(event.job.slot)
+        cluster.submit(job_of(measurement, number, kind))
+    (event, *_) = events_of(cluster)
+    assert isinstance(event, Done)
+
+
+def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
+    runner = Cluster(Options(cluster=scheduler, deadline_s=1e-6), lambda _: None)
+    kind = kind_of(measurement)
+    runner.prepare(kind)
+    events_of(runner)
+    runner.submit(job_of(measurement, 0, kind))
+    (event,) = runner.tick(time.monotonic(), 10.0)
+    assert isinstance(event, Lost)
+    assert event.again
+    assert not runner.tick(time.monotonic(), 10.0)
+    runner.close()
+
+
+def test_a_scheduler_that_is_not_there_is_told_in_a_line(monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.processing.cluster._CONNECT_S", 0.5)
+    with pytest.raises(ertis.NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        Cluster(Options(cluster="tcp://127.0.0.1:9"), lambda _: None)
