@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import Settings
 
-__all__ = ["Energyscape", "Measurement", "Peak", "Reflector", "Stamp"]
+__all__ = ["Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +87,48 @@ class Energyscape:
     def is_planar(self) -> bool:
         """Whether all directions lie in the horizontal plane."""
         return not np.any(self.elevation_rad)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Where an image has reflectors, as points.
+
+    Attributes
+    ----------
+    position_m : (point, axis) float32
+        Sensor frame: x forward, y left, z up; the strongest point first.
+    energy : (point,) float32
+        Envelope amplitude, as in `Energyscape`.
+    settings : Settings
+    stamp : Stamp
+    translation_m : (x, y, z)
+        Where the sensor is on its platform.
+    rotation_xyzw : (x, y, z, w)
+        The unit quaternion that turns the sensor frame into the platform's.
+    """
+
+    position_m: NDArray[np.float32]
+    energy: NDArray[np.float32]
+    settings: Settings
+    stamp: Stamp = Stamp()
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def __len__(self) -> int:
+        return len(self.energy)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
+        return replace(self, **changes)
+
+    def on_platform_m(self) -> NDArray[np.float32]:
+        """Return the positions in the platform's frame: (point, axis) float32."""
+        axis, w = np.array(self.rotation_xyzw[:3]), self.rotation_xyzw[3]
+        position_m = self.position_m.astype(np.float64)
+        # v + 2 w (q × v) + 2 q × (q × v), the rotation of v by the unit quaternion (q, w)
+        across = 2 * np.cross(axis, position_m)
+        turned = position_m + w * across + np.cross(axis, across)
+        return np.asarray(turned + np.array(self.translation_m), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

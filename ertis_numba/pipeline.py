@@ -99,7 +99,9 @@ class Pipeline:
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
 
-    def process(self, measurement: Measurement, out: NDArray[np.float32] | None = None) -> Energyscape:
+    def process(
+        self, measurement: Measurement, out: NDArray[np.float32] | None = None, *, threads: int | None = None
+    ) -> Energyscape:
         """Return the energyscape of one measurement.
 
         Parameters
@@ -107,6 +109,8 @@ class Pipeline:
         measurement : Measurement
         out : (direction, range) float32, optional
             Where the energy goes; a new array by default. Besides it, only the spectra are allocated anew.
+        threads : int, optional
+            Those of the pipeline by default, and at most those of its device.
 
         Raises
         ------
@@ -114,11 +118,11 @@ class Pipeline:
             The measurement's array, call, record or air, or its words, are not those of the pipeline's
             settings.
         ArgumentError
-            ``out`` has another shape or type.
+            ``out`` has another shape or type, or there are fewer threads.
         """
         words = self._words_of(measurement)
         energy = self._chain.new_image() if out is None else self._checked_out(out)
-        self._chain.process(words, energy)
+        self._chain.process(words, energy, threads=threads)
         return self._energyscape(energy, measurement)
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:

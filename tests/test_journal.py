@@ -17,6 +17,8 @@ from ertis_numba.frames import Measurement
 from ertis_numba.journal import TABLES, VERSION, Gap, Journal
 from ertis_numba.journal._database import LOG_BYTES
 from ertis_numba.settings import Air, Array, Recording, Settings
+from ertis_numba.storage import open_recording
+from ertis_numba.storage.sealing import seal
 from tests.files import line
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python, same
 
@@ -350,6 +352,108 @@ def test_closed(tmp_path):
     journal.close()
     with pytest.raises(DataError, match=r"rec.h5.journal is closed; open it again"):
         journal.append(entries(1, first=20))
+
+
+def version(path):
+    return int.from_bytes(path.read_bytes()[60:64], "big")  # as SQLite's file format says
+
+
+def test_what_others_hold_can_be_discarded(tmp_path):
+    """Of each sensor by itself, whose rows lie between those of the others."""
+    given = both()
+    with create(tmp_path, given) as journal:
+        for last, run in ((9, EPOCH), (11, EPOCH), (50, EPOCH + 1)):
+            journal.note_gap("left", 3, last, "x", epoch=run)
+        assert journal.find("left", EPOCH, 12)[1:] == ("left", EPOCH, 12)
+        assert journal.discard("left", EPOCH, 10) == 1
+        assert journal.discard("left", EPOCH, 9) == 0
+        assert len(journal) == 4
+        with pytest.raises(DataError, match="has no measurement 10 of sensor left; copy it again if you can"):
+            journal.find("left", EPOCH, 10)
+        with pytest.raises(ArgumentError, match=r"sensor 'top' is not in .*; add it first"):
+            journal.discard("top", EPOCH, 10)
+        with pytest.raises(ArgumentError, match="measurement 12 of sensor left comes after 12"):
+            journal.append(entries(1, first=12))
+    assert version(journal.path) == VERSION
+    with Journal.open(journal.path) as journal:
+        assert len(journal) == 4
+        assert [same(*pair) for pair in zip(journal.entries(), given[1:], strict=True)] == [True] * 4
+        assert [(gap.last, gap.epoch) for gap in journal.gaps] == [(11, EPOCH), (50, EPOCH + 1)]
+        journal.discard("left", EPOCH, 11)  # 12 stays, and the 0 and 1 of the right one before and after it
+        assert [key[1:] for key in journal.index()] == [("right", EPOCH, 0), ("left", EPOCH, 12), ("right", EPOCH, 1)]
+        assert journal.discard("left", EPOCH, 99) + journal.discard("right", EPOCH, 99) == 3
+        journal.append(entries(1, first=100))
+    with Journal.open(journal.path) as journal:
+        assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [100]
+
+
+def test_a_journal_of_which_nothing_was_discarded_is_one_for_older_packages(tmp_path):
+    with create(tmp_path) as journal:
+        assert version(journal.path) in (0, 1)
+    assert version(journal.path) == 1
+
+
+def test_what_is_left_is_sealed(tmp_path):
+    with create(tmp_path, both()) as journal:
+        journal.discard("left", EPOCH, 10)
+        journal.discard("right", EPOCH, 0)
+    sealed = seal(journal.path)
+    assert (sealed.measurements, sealed.missing, sealed.damaged) == (3, 0, 0)
+    assert [measurement.stamp.sequence for measurement in open_recording(sealed.recording, sensor="left")] == [11, 12]
+
+
+def test_room_that_was_discarded_is_used_again(tmp_path):
+    """What is deleted is not overwritten, and the file does not grow."""
+    settings = line(32, 32).replace(recording=Recording(n_samples=65_536))
+    given = entries(60, settings=settings)
+    with create(tmp_path, given[:10], settings=settings) as journal:
+        for number, entry in enumerate(given[10:], 10):
+            journal.append([entry])
+            journal.discard("left", EPOCH, entry.measurement.stamp.sequence - 10)
+            assert len(journal) == 10, number
+    assert journal.path.stat().st_size < 20 * 4 * 65_536
+
+
+DISCARD = """
+import sys
+from pathlib import Path
+from ertis_numba.journal import Journal
+from tests.journals import EPOCH, entries
+with Journal.open(Path(sys.argv[1])) as journal:
+    for number in range(int(sys.argv[2]), 10**9):
+        for sensor in ("left", "right"):
+            journal.append(entries(1, sensor=sensor, first=number))
+            journal.discard(sensor, EPOCH, number - 5)
+            print(sensor, number, flush=True)
+"""
+
+
+def test_killed_while_it_discards(tmp_path):
+    """What was appended and not discarded is there; what was discarded never comes back."""
+    create(tmp_path, both()).close()
+    path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
+    for _ in range(6):
+        with subprocess.Popen(
+            [sys.executable, "-c", DISCARD, path, str(max(last.values()) + 2)],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as process:
+            for line_, _number in zip(process.stdout, range(25), strict=False):
+                sensor, number = line_.split()
+                last[sensor] = int(number)
+            process.kill()
+            for line_ in process.stdout:
+                if line_.endswith("\n"):
+                    sensor, number = line_.split()
+                    last[sensor] = int(number)
+        with Journal.open(path) as journal:
+            held = {name: [key.sequence for key in journal.index(name)] for name in last}
+            assert len(list(journal.entries())) == len(journal)
+        for sensor, numbers in held.items():
+            assert set(range(max(numbers[0], last[sensor] - 4), last[sensor] + 1)) <= set(numbers)
+            assert numbers[0] >= last[sensor] - 4
+            last[sensor] = numbers[-1]
 
 
 @pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])

@@ -20,7 +20,7 @@ from ertis_numba.settings import Recording
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.files import line
-from tests.journals import ENVIRONMENT, crashed, create, entries, python, same
+from tests.journals import ENVIRONMENT, EPOCH, crashed, create, entries, python, same
 
 SPOIL = """
 import sqlite3, sys
@@ -118,11 +118,14 @@ def root_page(path, tree):
     return int(told.stdout)
 
 
+@pytest.mark.parametrize("discarded", [0, 3])
 @pytest.mark.parametrize("tree", ["key", "measurements"])
-def test_rows_that_only_one_tree_has_lost(tmp_path, tree):
+def test_rows_that_only_one_tree_has_lost(tmp_path, tree, discarded):
     """A page in which fewer cells are counted is a sound one, for SQLite."""
     settings = line(8, 8).replace(recording=Recording(n_samples=64))
-    create(tmp_path, entries(20, settings=settings), settings=settings).close()
+    with create(tmp_path, entries(20 + discarded, settings=settings), settings=settings) as journal:
+        if discarded:
+            journal.discard("left", EPOCH, 9 + discarded)
     path = tmp_path / "rec.h5.journal"
     root = root_page(path, tree)
     damaged = bytearray(path.read_bytes())
@@ -133,9 +136,12 @@ def test_rows_that_only_one_tree_has_lost(tmp_path, tree):
         Journal.open(path)
 
 
-def test_a_page_that_sqlite_cannot_read(tmp_path):
+@pytest.mark.parametrize("discarded", [0, 1])
+def test_a_page_that_sqlite_cannot_read(tmp_path, discarded):
     """What is in it is damaged for ever; the rest is sealed."""
-    create(tmp_path, entries(20)).close()
+    with create(tmp_path, entries(20 + discarded, first=10 - discarded)) as journal:
+        if discarded:
+            journal.discard("left", EPOCH, 9)
     path = tmp_path / "rec.h5.journal"
     damaged = bytearray(path.read_bytes())
     root = memoryview(damaged)[(root_page(path, "measurements") - 1) * PAGE_BYTES :]
@@ -315,8 +321,8 @@ def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, aga
 
 def test_newer_version(tmp_path):
     create(tmp_path).close()
-    spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 2")
-    with pytest.raises(FormatVersionError, match="has format version 2, this package reads up to 1; update"):
+    spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 3")
+    with pytest.raises(FormatVersionError, match="has format version 3, this package reads up to 2; update"):
         Journal.open(tmp_path / "rec.h5.journal")
 
 

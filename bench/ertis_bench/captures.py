@@ -22,7 +22,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.storage import open_recording, sensor_names
 
-__all__ = ["chain", "disk_full", "kills", "platform", "sustained", "unplugs"]
+__all__ = ["chain", "disk_full", "emulated", "kills", "platform", "sent_by_emulators", "sustained", "unplugs"]
 
 _ERTIS = (sys.executable, "-m", "ertis_cli")
 _WAIT_S = 120.0  # for anything that ought to end by itself
@@ -40,10 +40,10 @@ def platform(n_sensors: int, *, n_measurements: int) -> Scene:
 def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) -> Line:
     """Capture from one sensor, triggered by pulses, and tell what was lost and what it cost."""
     target = folder / "sustained.h5"
-    with _emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
+    with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
         lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
     final = lines[-1]
-    found = _checked(target, lines[:-1], _sent(folder))
+    found = _checked(target, lines[:-1], sent_by_emulators(folder))
     return {
         "seconds": duration_s,
         "rate_hz": rate_hz,
@@ -58,9 +58,9 @@ def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) 
 def chain(source: Path, folder: Path, *, n_groups: int, rate_hz: float) -> Line:
     """Capture from several sensors in one SYNC chain, and tell how many groups are complete, and how many mixed."""
     target = folder / "chain.h5"
-    with _emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
+    with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
         lines = _captured(ports, target, "--trigger", "sync", "-n", str(n_groups))
-    sent = _sent(folder)
+    sent = sent_by_emulators(folder)
     found = _checked(target, lines[:-1], sent)
     indices: dict[int, list[int]] = defaultdict(list)
     for (sensor, _), (check, sync_count) in found["rows"].items():
@@ -86,9 +86,9 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
         away_s = random_.uniform(0.2, 1.0)
         moments += ["--unplug", f"{at_s:.3f}:{away_s:.3f}"]
         at_s += away_s + 2.5
-    with _emulated(source, folder, "--sync-rate", "20", *moments) as ports:
+    with emulated(source, folder, "--sync-rate", "20", *moments) as ports:
         lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
-    found = _checked(target, lines[:-1], _sent(folder))
+    found = _checked(target, lines[:-1], sent_by_emulators(folder))
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
     events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
     plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
@@ -108,7 +108,7 @@ def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     random_ = random.Random(seed)  # noqa: S311  as above
     reported = lost = wrong = unreadable = 0
     moments: Counter[str] = Counter()
-    with _emulated(source, folder) as ports:
+    with emulated(source, folder) as ports:
         for number in range(count):
             target = folder / f"killed-{number}.h5"
             lines = _killed(ports, target, after_s=random_.uniform(0.0, 1.2), moments=moments)
@@ -117,7 +117,7 @@ def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
                 unreadable += bool(lines)
                 continue
             try:
-                found = _checked(target, lines, _sent(folder))
+                found = _checked(target, lines, sent_by_emulators(folder))
             except DataError:
                 unreadable += 1
                 continue
@@ -140,12 +140,12 @@ def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
 def disk_full(source: Path, folder: Path, disk: Path) -> Line:
     """Capture to a small disk until it is full, and tell what the command said and what is there."""
     target = disk / "full.h5"
-    with _emulated(source, folder) as ports:
+    with emulated(source, folder) as ports:
         done = _run("capture", *_ports(ports), "-o", str(target), "--rate", "20", "--duration", "60", "--json")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     stored = [line for line in lines if line["event"] == "stored"]
     _run("recover", str(disk), "--quiet")
-    found = _checked(target, stored, _sent(folder))
+    found = _checked(target, stored, sent_by_emulators(folder))
     return {
         "exit code": done.returncode,
         "said": done.stderr.strip().splitlines()[-1].replace(str(disk), "DISK"),
@@ -156,7 +156,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
 
 
 @contextmanager
-def _emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
+def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
     """Yield links to the ports of emulated sensors, which end with the block; they log to ``sent.ndjson``."""
     log = folder / "sent.ndjson"
     log.unlink(missing_ok=True)
@@ -214,7 +214,7 @@ def _recover(folder: Path) -> None:
         _run("recover", str(folder), "--quiet")
 
 
-def _sent(folder: Path) -> dict[tuple[str, int], int]:
+def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:
     """Return the number of the words of each sensor and CRC-32 that an emulator has sent untouched."""
     entries = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines() if line.endswith("}")]
     return {(each["name"], each["crc32"]): each["index"] for each in entries if "crc32" in each}

@@ -10,6 +10,7 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
+from ertis_bench.network_tables import network, network_faults
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.reliability_tables import reliability
@@ -24,6 +25,8 @@ __all__ = [
     "factorisation",
     "gpu",
     "gpu_short",
+    "network",
+    "network_faults",
     "paper",
     "place",
     "ptx",
@@ -317,6 +320,8 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "factorisation": {"factorisation": factorisation},
     "ptx": {"ptx": ptx},
     "reliability": {"reliability": reliability},
+    "network": {"network": network},
+    "network-faults": {"network-faults": network_faults},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }

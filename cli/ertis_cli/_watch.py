@@ -3,6 +3,7 @@
 import math
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,8 +16,9 @@ from ertis_cli import options
 
 if TYPE_CHECKING:
     from ertis_numba.capture import Session
+    from ertis_numba.capture.session import Sink
     from ertis_numba.devices.bits import BitCheck
-    from ertis_numba.journal import Entry, Journal
+    from ertis_numba.journal import Entry
 
 __all__ = ["Signals", "Watch", "report", "stopped_by_signals"]
 
@@ -80,27 +82,32 @@ def stopped_by_signals() -> Iterator[Signals]:
 
 
 class Watch:
-    """What is told while a capture runs: lines of JSON, notes, and one line that is written again and again."""
+    """What is told while a capture runs: lines of JSON, notes, and one line that is written again and again.
+
+    Threads may share it.
+    """
+
+    word = "stored"  # what has become of a measurement that is told of
 
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         self._quiet, self._as_json = quiet, as_json
+        self._turn = threading.Lock()
         self._line = sys.stderr.isatty() and not quiet
         self._next_s = 0.0
         self.took: dict[str, float] = {}
         self._session: Session | None = None
         self._checks: dict[str, BitCheck] = {}
 
-    def run(self, session: "Session", journal: "Journal", checks: "dict[str, BitCheck]") -> Exception | None:
-        """Run a session, and return what has ended it before its time."""
+    def run(self, session: "Session", sink: "Sink", checks: "dict[str, BitCheck]", *, where: str) -> Exception | None:
+        """Run a session, and return what has ended it before its time; ``where`` says where the measurements are."""
         self._session, self._checks = session, checks
         begun_s, cpu_s = time.monotonic(), time.process_time()
         try:
-            session.run(journal)
+            session.run(sink)
         except (OSError, ValueError) as error:  # what was stored is sealed whatever happened
             return error
         except (KeyboardInterrupt, SystemExit):
-            path = journal.path
-            click.echo(f"the measurements so far are safe in {path}; seal them by 'ertis recover {path}'", err=True)
+            click.echo(where, err=True)
             raise
         finally:
             self.took = {"seconds": time.monotonic() - begun_s, "cpu_s": time.process_time() - cpu_s}
@@ -113,10 +120,11 @@ class Watch:
         if self._as_json:
             for entry in entries:
                 stamp = entry.measurement.stamp
-                options.print_json(
+                self._print(
                     {
-                        "event": "stored",
+                        "event": self.word,
                         "sensor": stamp.sensor,
+                        "epoch": stamp.epoch,
                         "sequence": stamp.sequence,
                         "sync_count": stamp.sync_count,
                         "time_ns": stamp.timestamp_ns,
@@ -134,14 +142,18 @@ class Watch:
     def note(self, sensor: str, text: str) -> None:
         """Tell what happened to a sensor."""
         if self._as_json:
-            options.print_json({"event": "note", "sensor": sensor, "text": text})
+            self._print({"event": "note", "sensor": sensor, "text": text})
         self._say(f"{sensor}: {text}")
 
     def back(self, sensor: str, away_s: float) -> None:
         """Tell that a sensor was unplugged and measures again."""
         if self._as_json:
-            options.print_json({"event": "back", "sensor": sensor, "away_s": round(away_s, 3)})
+            self._print({"event": "back", "sensor": sensor, "away_s": round(away_s, 3)})
         self._say(f"{sensor}: is back after {away_s:.1f} s")
+
+    def _print(self, event: dict[str, Any]) -> None:
+        with self._turn:
+            options.print_json(event)
 
     def _say(self, text: str) -> None:
         options.say(("\r\x1b[K" if self._line else "") + text, quiet=self._quiet)
@@ -152,12 +164,17 @@ class Watch:
             return ""
         counts = session.counts.values()
         parts = [
-            f"{sum(each.stored for each in counts)} stored",
+            f"{sum(each.stored for each in counts)} {self.word}",
             " ".join(f"{each.rate_hz:.1f}" for each in counts) + " Hz",
             f"{sum(each.lost for each in counts)} lost",
+            *self._more(),
             *(f"{sensor}: {text}" for sensor, text in self._health()),
         ]
         return "   ".join(parts)[:160]
+
+    def _more(self) -> Iterator[str]:
+        """Yield what else there is to tell."""
+        yield from ()
 
     def _health(self) -> Iterator[tuple[str, str]]:
         """Yield how many microphones of each sensor give ones and zeros."""
@@ -168,8 +185,16 @@ class Watch:
                 yield sensor, f"{alive}/{len(density)} microphones"
 
 
-def report(target: Path, session: "Session", took: dict[str, float], *, quiet: bool, as_json: bool) -> None:
-    """Tell what has come of it."""
+def report(
+    target: Path | str,
+    session: "Session",
+    took: dict[str, float],
+    *,
+    quiet: bool,
+    as_json: bool,
+    more: dict[str, Any] | None = None,
+) -> None:
+    """Tell what has come of it; ``more`` is for programs, too."""
     counts = session.counts
     several = len(counts) > 1
     stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))
@@ -199,4 +224,5 @@ def report(target: Path, session: "Session", took: dict[str, float], *, quiet: b
             {"event": "captured", "output": str(target), "stored": stored, "lost": lost, "sensors": report}
             | {name: round(value, 3) for name, value in took.items()}
             | ({"groups": groups_report} if groups_report else {})
+            | (more or {})
         )

@@ -144,6 +144,51 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
 
 @bench.command()
 @click.option(
+    "--duration", "duration_s", type=float, default=60.0, show_default=True, metavar="S", help="Of each part."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, metavar="S", help="Of the words.")
+@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. storage, processing, …")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    metavar="DIR",
+    help="Where there is room for what is stored, 220 MB for each second.",
+)
+@_update
+@options.quiet
+@options.as_json
+def network(*, only: tuple[str, ...], **given: Any) -> None:
+    """Store and make images of what sensor nodes send, with keys; every word and image is checked."""
+    from ertis_bench import network as benchmark
+
+    from ertis_numba import checks
+
+    for part in only:
+        checks.choice("--only", part, benchmark.PARTS)
+    checks.positive("--duration", given["duration_s"])
+    _run("network", benchmark, only=only, **given)
+
+
+@bench.command()
+@click.option("--long", is_flag=True, help="Two hours rather than two minutes.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")
+@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. centrals, nodes, keys, …")
+@_update
+@options.quiet
+@options.as_json
+def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
+    """Try what goes wrong in a network: kill -9, bad disks and cables, wrong keys, overload; nothing is timed."""
+    from ertis_bench import network_faults as benchmark
+
+    from ertis_numba import checks
+
+    for part in only:
+        checks.choice("--only", part, benchmark.PARTS)
+    _run("network-faults", benchmark, only=only, **given)
+
+
+@bench.command()
+@click.option(
     "--results",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("bench/results"),

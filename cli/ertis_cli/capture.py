@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ertis_cli import options
-from ertis_cli._watch import Watch, report, stopped_by_signals
+from ertis_cli import _network, options
+from ertis_cli._sending import Sending
+from ertis_cli._watch import Signals, Watch, report, stopped_by_signals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
+    from ertis_numba.capture import Session
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import Sonar
@@ -33,6 +35,21 @@ __all__ = ["capture"]
     help="Path, serial number or name of a sensor; several times for several sensors.",
 )
 @options.output("Recording to write; SERIAL_TIME.h5 by default.")
+@click.option("--to", "address", metavar="ADDRESS", help="Central node to send to, instead of writing a recording.")
+@click.option(
+    "--spool",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="With --to: keep measurements there until the central node has them; in memory by default.",
+)
+@_network.key
+@_network.server_key
+@click.option(
+    "--mounting",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Where sensors are: a scene, or its [[sensors]].",
+)
 @click.option(
     "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor, or SYNC pulses."
 )
@@ -62,7 +79,7 @@ __all__ = ["capture"]
     default=30.0,
     show_default=True,
     metavar="S",
-    help="How long a sensor may be silent or away.",
+    help="How long a sensor may be silent or away; how long to wait for the central node at the end.",
 )
 @click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse words that cannot be PDM.")
 @click.option("--refuse-splices", is_flag=True, help="Refuse words that seem cut and joined, too.")
@@ -74,6 +91,11 @@ def capture(
     *,
     ports: tuple[str, ...],
     target: Path | None,
+    address: str | None,
+    spool: Path | None,
+    key: str | None,
+    server_key: str | None,
+    mounting: Path | None,
     n: int | None,
     duration: float | None,
     trigger: Literal["command", "sync"],
@@ -100,6 +122,10 @@ def capture(
     Each measurement is durable, in a journal beside the recording, before it is told of; the recording appears
     complete at the end. Ctrl-C ends a capture after the measurement that has begun. What a crash leaves,
     'ertis recover' seals. With --json there is a line for each measurement.
+
+    With --to, measurements are sent to a central node ('ertis record' or 'ertis serve') instead, and kept until it has
+    them. With --spool they are durable before they are told of, and what a crash leaves there is sent by the next
+    capture.
     """
     from ertis_numba.devices.setup import Setup
 
@@ -110,18 +136,22 @@ def capture(
         _print_commands(setup, as_json=as_json)
         return
     _require_one_each(ports, names)
+    _require_one_place(address, target, for_address=(spool, key, server_key))
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
     from ertis_numba.devices.sonar import Sonar
-    from ertis_numba.journal import SUFFIX, Journal
 
     if target is not None:
         check_target(target, overwrite=force)
-    watch = Watch(quiet=quiet, as_json=as_json)
+    send = None if address is None else Sending(address, spool, quiet=quiet, as_json=as_json)
+    watch = Watch(quiet=quiet, as_json=as_json) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
+        if send is not None:
+            stack.enter_context(send.node(_network.client_keys(key, server_key)))
         sonars = _named(ports, names, [stack.enter_context(Sonar.open(port, passive=listen_only)) for port in ports])
         target = target or Path(_default_name(list(sonars)))
-        check_target(target, overwrite=force)
+        if send is None:
+            check_target(target, overwrite=force)
         session = Session(
             sonars,
             settings,
@@ -130,6 +160,7 @@ def capture(
             n=n,
             duration_s=duration,
             patience_s=patience,
+            mounting=_mounting(mounting, sonars),
             on_stored=watch.stored,
             on_note=watch.note,
             on_back=watch.back,
@@ -139,22 +170,50 @@ def capture(
         for name, sonar in sonars.items():
             sonar.configure(setup, bits=checks[name].check if check_bits else None)
         signals.obey(session.stop)
-        path = target.with_name(f"{target.name}{SUFFIX}")
-        journal = stack.enter_context(
-            Journal.create(path, target=target.name, source=f"capture of {', '.join(sonars)}")
-        )
-        failure = watch.run(session, journal, checks)
+        if send is None:
+            failure = _record(session, watch, checks, target, signals=signals, stack=stack, overwrite=force)
+        else:
+            failure = send.run(session, checks, patience_s=patience)
         asked_to_end = list(signals.came)
-        if asked_to_end and not len(journal):
-            journal.remove()
-            signals.end()
-        stack.close()
-        _seal(path, failure, overwrite=force)
-    report(target, session, watch.took, quiet=quiet, as_json=as_json)
+    report(
+        target if send is None else send.address,
+        session,
+        watch.took,
+        quiet=quiet,
+        as_json=as_json,
+        more=None if send is None else send.report,
+    )
     if failure is not None:
         raise failure
     if asked_to_end and (n is not None or duration is not None):
         sys.exit(128 + asked_to_end[0])
+
+
+def _record(
+    session: "Session",
+    watch: Watch,
+    checks: "dict[str, BitCheck]",
+    target: Path,
+    *,
+    signals: Signals,
+    stack: ExitStack,
+    overwrite: bool,
+) -> Exception | None:
+    """Capture into a recording, and return what has ended that before its time."""
+    from ertis_numba.journal import SUFFIX, Journal
+
+    path = target.with_name(f"{target.name}{SUFFIX}")
+    journal = stack.enter_context(
+        Journal.create(path, target=target.name, source=f"capture of {', '.join(session.counts)}")
+    )
+    where = f"the measurements so far are safe in {path}; seal them by 'ertis recover {path}'"
+    failure = watch.run(session, journal, checks, where=where)
+    if signals.came and not len(journal):
+        journal.remove()
+        signals.end()
+    stack.close()
+    _seal(path, failure, overwrite=overwrite)
+    return failure
 
 
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
@@ -181,6 +240,24 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
         click.echo(sealed.remark, err=True)
 
 
+def _mounting(
+    path: Path | None, sensors: "Iterable[str]"
+) -> "dict[str, tuple[Sequence[float], Sequence[float]]] | None":
+    """Return where sensors are, which a scene says when it begins."""
+    if path is None:
+        return None
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.simulation.scene import load_scene
+
+    known = {sensor.name: sensor for sensor in load_scene(path).sensors}
+    for name in sensors:
+        if name not in known:
+            raise ArgumentError(
+                f"{path} says nothing of sensor {name!r}; add it, or call it one of {', '.join(known)} by --name"
+            )
+    return {name: (known[name].path().position_at(0.0).tolist(), known[name].quaternion().tolist()) for name in sensors}
+
+
 def _checks(names: "Iterable[str]", settings: "Settings", *, splices: bool) -> "dict[str, BitCheck]":
     """Return what looks at the words of each sensor."""
     import numpy as np
@@ -192,6 +269,13 @@ def _checks(names: "Iterable[str]", settings: "Settings", *, splices: bool) -> "
     enabled = np.zeros(32, dtype=bool)
     enabled[: len(given)] = given
     return {name: BitCheck(recording.n_samples, recording.pdm_rate_hz, enabled, splices=splices) for name in names}
+
+
+def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
+    if address is None and any(for_address):
+        raise click.UsageError("--spool, --key and --server-key are about a central node; give --to, too")
+    if address is not None and target is not None:
+        raise click.UsageError("--to and --output both say where measurements go; give one of them")
 
 
 def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:

@@ -22,17 +22,27 @@ __all__ = ["Counts", "Session", "Sink"]
 
 _WAITING_BYTES = 40_000_000  # of blocks that wait for the disk; then sensors wait
 _RECENT_S = 3.0  # over which the rate is told
+_AT_ORIGIN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+_NO_ROOM = "there was no room for it"
 _GROUPS = 16  # that are still open: sensors deliver what they measured together at different times
 
 
 class Sink(Protocol):
-    """Where measurements become durable, such as a `Journal`."""
+    """Where measurements become durable, such as a `Journal`, or are kept until another node has them."""
 
-    def add_sensor(self, name: str, settings: Settings, *, firmware: str = "") -> None:
+    def add_sensor(
+        self,
+        name: str,
+        settings: Settings,
+        *,
+        firmware: str = "",
+        translation_m: Sequence[float] = ...,
+        rotation_xyzw: Sequence[float] = ...,
+    ) -> None:
         """Tell of a sensor before its first measurement."""
 
-    def append(self, entries: Sequence[Entry]) -> None:
-        """Store measurements; when this returns they are durable."""
+    def append(self, entries: Sequence[Entry]) -> Sequence[Entry] | None:
+        """Store measurements; when this returns they are durable: all of them, or those that it returns."""
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
         """Store which of a sensor's numbers are missing, and why."""
@@ -105,6 +115,8 @@ class Session:
     duration_s : float, optional
     patience_s : float
         How long a sensor may be silent or unplugged before it is given up.
+    mounting : dict of str to (translation_m, rotation_xyzw), optional
+        Where sensors are, as in `ertis_numba.journal.Journal.add_sensor`; at the origin by default.
     epoch : int, optional
         Number of this run, without which the sequence of another could not be told from this one's; drawn by default.
     on_stored : callable, optional
@@ -123,7 +135,7 @@ class Session:
         Pulses of which all sensors have delivered, and others.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  how to measure, when to end, and whom to tell
         self,
         sonars: Mapping[str, Sonar],
         settings: Settings,
@@ -133,6 +145,7 @@ class Session:
         n: int | None = None,
         duration_s: float | None = None,
         patience_s: float = 30.0,
+        mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
         epoch: int | None = None,
         on_stored: Callable[[list[Entry]], None] = lambda _: None,
         on_note: Callable[[str, str], None] = lambda _sensor, _text: None,
@@ -142,7 +155,7 @@ class Session:
         checks.choice("trigger", trigger, ("command", "sync"))
         if not sonars:
             raise ArgumentError("no sensor is given to capture from; give at least one")
-        self._sonars, self._settings = dict(sonars), settings
+        self._sonars, self._settings, self._mounting = dict(sonars), settings, dict(mounting or {})
         self._synced = trigger == "sync"
         self._rate_hz = checks.between("rate", rate_hz, 1e-3, 1e3)
         self._n = None if n is None else checks.whole("n", n, 1)
@@ -198,7 +211,14 @@ class Session:
 
     def _begin(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
         for sensor, sonar in self._sonars.items():
-            sink.add_sensor(sensor, self._settings, firmware=sonar.firmware)
+            translation_m, rotation_xyzw = self._mounting.get(sensor, _AT_ORIGIN)
+            sink.add_sensor(
+                sensor,
+                self._settings,
+                firmware=sonar.firmware,
+                translation_m=translation_m,
+                rotation_xyzw=rotation_xyzw,
+            )
         if self._synced:
             for sonar in self._sonars.values():
                 if not sonar.passive:
@@ -274,7 +294,11 @@ class Session:
         entries = [entry for event, number in ready if (entry := self._entry(sink, event, number)) is not None]
         if not entries:
             return
-        sink.append(entries)
+        stored = sink.append(entries)
+        if stored is not None:
+            for sensor in (entry.measurement.stamp.sensor for entry in entries if entry not in stored):
+                self.counts[sensor].missing[_NO_ROOM] += 1
+            entries = list(stored)
         for entry in entries:
             stamp = entry.measurement.stamp
             counts = self.counts[stamp.sensor]

@@ -1,8 +1,21 @@
 """Where measurements become durable before anything else is done with them. The only door to sqlite3."""
 
 from ertis_numba.journal._journal import SUFFIX, Journal
-from ertis_numba.journal._records import Entry, Gap, Key, Sensor
+from ertis_numba.journal._records import Entry, Gap, Key, Sensor, require_same
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal.sealer import Sealed, seal_apart
 
-__all__ = ["SUFFIX", "TABLES", "VERSION", "Column", "Entry", "Gap", "Journal", "Key", "Sealed", "Sensor", "seal_apart"]
+__all__ = [
+    "SUFFIX",
+    "TABLES",
+    "VERSION",
+    "Column",
+    "Entry",
+    "Gap",
+    "Journal",
+    "Key",
+    "Sealed",
+    "Sensor",
+    "require_same",
+    "seal_apart",
+]

@@ -10,7 +10,7 @@ from typing import Final, Self
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
-from ertis_numba.journal._tables import selection
+from ertis_numba.journal._tables import WHOLE_VERSION, selection
 
 __all__ = ["Contents"]
 
@@ -51,16 +51,28 @@ class Contents:
             self._last[names[number], epoch] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
-        # Counted in two trees of the file, the index and the table: damage to one of them is noticed. Rows may be
-        # deleted from the front, so that the first number is not always 1; apart from each other, each takes one look.
-        ((n_rows,),) = self._database.execute(
-            "SELECT ifnull((SELECT max(id) FROM measurements) - (SELECT min(id) FROM measurements) + 1, 0)"
-        )
+        n_rows = self._count_rows()
         if n_rows != self._n_entries:
             raise DamagedError(
                 f"{self.path} is damaged, it lists {self._n_entries} measurements and has {n_rows}; copy it again if "
                 "you can"
             )
+
+    def _count_rows(self) -> int:
+        """Count measurements in the table, as the index was: damage to one of these two trees is noticed."""
+        ((version,),) = self._database.execute("PRAGMA user_version")
+        if version == WHOLE_VERSION:
+            # Rows may be deleted from the front, so that the first number is not always 1; apart from each other, each
+            # takes one look.
+            rows = self._database.execute(
+                "SELECT ifnull((SELECT max(id) FROM measurements) - (SELECT min(id) FROM measurements) + 1, 0)"
+            )
+        else:  # numbers have holes: every page of the table is looked at, without the words
+            try:
+                rows = self._database.execute("SELECT count(*) FROM measurements NOT INDEXED")
+            except DamagedError:  # of some pages; who reads what is in them is told so, and the others are sound
+                return self._n_entries
+        return int(rows[0][0])
 
     @property
     def sensors(self) -> Mapping[str, Sensor]:
@@ -86,6 +98,25 @@ class Contents:
             )
         names = {number: name for name, number in self._ids.items()}
         return sorted(Key(place, names[number], *rest) for place, number, *rest in rows)
+
+    def find(self, sensor: str, epoch: int, sequence: int) -> Key:
+        """Return where a measurement is.
+
+        Raises
+        ------
+        DamagedError
+            There is none of this number.
+        """
+        with self._turn:
+            rows = self._database.execute(
+                "SELECT id FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence = ?",
+                (self._ids[self._sensor(sensor).name], epoch, sequence),
+            )
+        if not rows:
+            raise DamagedError(
+                f"{self.path} has no measurement {sequence} of sensor {sensor}; copy it again if you can"
+            )
+        return Key(rows[0][0], sensor, epoch, sequence)
 
     def entry(self, key: Key) -> Entry:
         """Return a measurement, whose words are read-only.

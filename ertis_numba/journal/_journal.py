@@ -12,7 +12,7 @@ from ertis_numba.journal import _room
 from ertis_numba.journal._contents import Contents
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
-from ertis_numba.journal._tables import insertion, row_crc32
+from ertis_numba.journal._tables import VERSION, insertion, row_crc32
 from ertis_numba.settings import Settings
 
 __all__ = ["SUFFIX", "Journal"]
@@ -218,6 +218,52 @@ class Journal(Contents):
         Gap(self._sensor(sensor).name, first, last, reason, epoch)
         with self._turn, self._database.transaction():
             self._insert("gaps", (self._ids[sensor], epoch, first, last, reason))
+
+    def discard(self, sensor: str, epoch: int, up_to: int) -> int:
+        """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
+
+        From the first time on, the numbers of rows have holes, as those of several sensors lie between each other; so
+        whoever opens the journal counts rows instead, and a package that cannot refuses it (format version 2).
+
+        Parameters
+        ----------
+        sensor : str
+        epoch : int
+        up_to : int
+            The last sequence number to be deleted. Of a gap that goes on beyond it, everything stays.
+
+        Returns
+        -------
+        int
+            Measurements that were deleted.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such sensor.
+        DataError
+            The journal cannot be written.
+        """
+        known = self._sensor(sensor)
+        which = self._ids[known.name], epoch, up_to
+        with self._turn:
+            # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
+            self._database.execute("PRAGMA secure_delete = OFF")
+            self._database.require_name()
+            with self._database.transaction():
+                if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
+                    self._database.execute(f"PRAGMA user_version = {VERSION}")
+                ((n_deleted,),) = self._database.execute(
+                    "SELECT count(*) FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence <= ?",
+                    which,
+                )
+                self._database.execute(
+                    "DELETE FROM measurements WHERE sensor = ? AND epoch = ? AND sequence <= ?", which
+                )
+                self._database.execute("DELETE FROM gaps WHERE sensor = ? AND epoch = ? AND last <= ?", which)
+            self._n_entries -= n_deleted
+            self._held_bytes -= n_deleted * known.n_bytes
+        return int(n_deleted)
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         self._database.execute(insertion(table), (*values, row_crc32(values)))

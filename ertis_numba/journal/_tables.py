@@ -6,12 +6,26 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["APPLICATION_ID", "TABLES", "VERSION", "Column", "insertion", "layout", "row_crc32", "selection"]
+__all__ = [
+    "APPLICATION_ID",
+    "TABLES",
+    "VERSION",
+    "WHOLE_VERSION",
+    "Column",
+    "insertion",
+    "layout",
+    "row_crc32",
+    "selection",
+]
 
 APPLICATION_ID: Final = 0x6552544A
 """``eRTJ``: what SQLite keeps in the header of the file, beside the version."""
 
-VERSION: Final = 1
+VERSION: Final = 2
+"""The highest of a journal: 1 until measurements are discarded from it, 2 from then on."""
+
+WHOLE_VERSION: Final = 1
+"""Of a journal whose rows have no holes in their numbers, but for what is missing from the front."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +112,7 @@ def layout() -> Iterable[str]:
         yield f"CREATE TABLE {table} ({kinds})"
     yield "CREATE UNIQUE INDEX key ON measurements (sensor, epoch, sequence)"
     yield f"PRAGMA application_id = {APPLICATION_ID}"
-    yield f"PRAGMA user_version = {VERSION}"
+    yield f"PRAGMA user_version = {WHOLE_VERSION}"
 
 
 def insertion(table: str) -> str:

@@ -56,7 +56,13 @@ class Sealed:
         return f"{number} damaged; the journal is kept as {self.set_aside}"
 
 
-def seal_apart(journal: Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
+def seal_apart(
+    journal: Path,
+    *,
+    overwrite: bool = False,
+    gently: bool = False,
+    progress: Progress = lambda _done, _of: None,
+) -> Sealed:
     """Make the recording of a journal in a process of its own; see `ertis_numba.storage.sealing.seal`.
 
     Ctrl-C in a terminal does not reach that process. Whatever ends it, the measurements are in the journal or in the
@@ -67,6 +73,8 @@ def seal_apart(journal: Path, *, overwrite: bool = False, progress: Progress = l
     journal : Path
     overwrite : bool
         Replace a file of the recording's name, even if it holds something else.
+    gently : bool
+        Let others have the processors and the disk first.
     progress : callable, optional
         Called with the number of measurements that are written and that of all, at most some hundred times.
 
@@ -85,7 +93,8 @@ def seal_apart(journal: Path, *, overwrite: bool = False, progress: Progress = l
     command = [sys.executable, "-P", "-m", "ertis_numba.storage._sealing_process", "--json"]
     told: dict[str, Any] = {}
     try:
-        reason = _run([*command, *(["--force"] if overwrite else []), "--", str(journal)], told, progress)
+        chosen = [*(["--force"] if overwrite else []), *(["--gently"] if gently else [])]
+        reason = _run([*command, *chosen, "--", str(journal)], told, progress)
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_where(journal, told)) from error
     if "recording" in told:

@@ -322,7 +322,7 @@ class Group(Message, frozen=True, kw_only=True):
         As in `Image`.
     group : int
         Pulse of the SYNC chain, as all sensors count it.
-    sensors : tuple of str
+    members : tuple of (sensor, epoch, sequence)
         Those that have come.
     missing : tuple of str
         Those that have not.
@@ -336,10 +336,15 @@ class Group(Message, frozen=True, kw_only=True):
     number: Count
     dropped: Count
     group: Int64
-    sensors: Annotated[tuple[Name, ...], Meta(max_length=40)]
-    missing: Annotated[tuple[Name, ...], Meta(max_length=40)]
+    members: Annotated[tuple[tuple[Name, Count, Count], ...], Meta(max_length=32)]
+    missing: Annotated[tuple[Name, ...], Meta(max_length=32)]
     spread_ns: Count
     flags: tuple[Literal["incomplete", "clock", "pulse"], ...] = ()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of those that have come."""
+        return tuple(sensor for sensor, _, _ in self.members)
 
 
 class AskStatus(Message, frozen=True, kw_only=True):

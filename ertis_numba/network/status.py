@@ -129,6 +129,8 @@ class ProcessingStatus(msgspec.Struct, kw_only=True):
     retried: int = 0
     quarantined: int = 0
     publisher_respawned: int = 0
+    publisher_pid: int = 0
+    """Of the process that serves applications; 0 while there is none."""
     process_time: Percentiles = Percentiles()
     subscribers: list[SubscriberStatus] = []
     groups: dict[str, int] = {}

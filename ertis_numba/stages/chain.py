@@ -24,8 +24,10 @@ class Chain(Protocol):
         """The range axis of the image: (range,) float64."""
         ...
 
-    def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
+    def process(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
+    ) -> None:
+        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word), on as many threads or the usual."""
         ...
 
     def process_batch(

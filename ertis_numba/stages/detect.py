@@ -13,12 +13,14 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import matched_filter
 
-__all__ = ["find_peaks"]
+__all__ = ["ONE_SIDED", "PULSE_M", "find_peaks", "neighbours_of"]
 
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
-_PULSE_M = 0.04  # length of a compressed pulse down to -40 dB
-_ONE_SIDED = 0.25  # mean offset of neighbours, by their reach, that tells the edge of a grid
+PULSE_M = 0.04
+"""Length of a compressed pulse down to -40 dB."""
+ONE_SIDED = 0.25
+"""Mean offset of neighbours, by their reach, that tells the edge of a grid."""
 
 
 def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float = -30.0) -> list[Peak]:
@@ -45,7 +47,7 @@ def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float 
     top = image.energy.size if top is None else checks.whole("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    neighbours = _neighbours(directions)
+    neighbours = neighbours_of(directions)
     floor = float(np.max(image.energy, initial=0.0)) * 10 ** (min_level_db / 20)
     places = _local_maxima(image.energy, neighbours, floor)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
@@ -76,10 +78,20 @@ def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float 
     ]
 
 
-def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return for each direction the nearest others: (direction, neighbour), itself where there are too few.
+def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return for each direction itself and the nearest others.
 
     In a plane these are the ones next to it; elsewhere the eight around it.
+
+    Parameters
+    ----------
+    directions : (direction, axis) float64
+        Unit vectors.
+
+    Returns
+    -------
+    (direction, neighbour) int64
+        Fewer neighbours where there are too few directions.
     """
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
     _, nearest = scipy.spatial.KDTree(directions).query(directions, k=min(count + 1, len(directions)))
@@ -121,7 +133,7 @@ class _PointSpread:
     def __init__(self, settings: Settings) -> None:
         speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
         self._positions_m = microphones(settings.array).enabled_positions_m
-        self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + _PULSE_M
+        self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
         # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
         spacing_hz = speed_m_s / (6 * self.reach_m)
         n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
@@ -183,7 +195,7 @@ def _quadric_top(offsets: NDArray[np.float64], rises: NDArray[np.float64]) -> tu
     """
     none = np.zeros(3), 0.0
     reach = np.max(np.linalg.norm(offsets, axis=1))
-    if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > _ONE_SIDED * reach:
+    if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > ONE_SIDED * reach:
         return none
     _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
     n_axes = 2 if sizes[1] > 0.2 * sizes[0] else 1

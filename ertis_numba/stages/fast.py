@@ -189,9 +189,11 @@ class FastChain:
         self._n_busy = 0
         self._closed = False
 
-    def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
-        self._finish(self._begin(words, out, self._threads))
+    def process(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
+    ) -> None:
+        """See `Chain.process`."""
+        self._finish(self._begin(words, out, self._threads if threads is None else threads))
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]

@@ -96,8 +96,14 @@ class PaperChain:
     def close(self) -> None:
         """See `Chain.close`; there is nothing to give back."""
 
-    def process(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word)."""
+    def process(
+        self,
+        words: NDArray[np.unsignedinteger[Any]],
+        out: NDArray[np.float32],
+        *,
+        threads: int | None = None,  # noqa: ARG002  its own is the only one
+    ) -> None:
+        """See `Chain.process`."""
         signals = self._demodulate(_unpacked(words, self._channels))
         spectra = scipy.fft.rfft(signals, self._n_fft)
         spectra *= self._template

@@ -4,13 +4,16 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
+from ertis_numba.atomic import part_of
 from ertis_numba.errors import ErtisError, InUseError
-from ertis_numba.storage.sealing import seal
+from ertis_numba.journal import SUFFIX
+from ertis_numba.storage._gently import Pace, shrinking
+from ertis_numba.storage.sealing import TOKEN, seal
 
 __all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NOTHING", "main"]
 
@@ -36,10 +39,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("journal", type=Path)
     parser.add_argument("--force", action="store_true", help="replace a file of the recording's name")
+    parser.add_argument("--gently", action="store_true", help="let others have the processors and the disk first")
     parser.add_argument("--json", action="store_true", help="tell progress and result as lines of JSON")
     given = parser.parse_args(arguments)
+    recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
+    pace = Pace(part_of(recording, TOKEN)) if given.gently else None
+
+    def progress(done: int, of: int) -> None:
+        if pace is not None:
+            pace()
+        if given.json:
+            _tell_progress(done, of)
+
     try:
-        sealed = seal(given.journal, overwrite=given.force, **({"progress": _tell_progress} if given.json else {}))
+        with shrinking(given.journal) if given.gently else nullcontext():
+            sealed = seal(given.journal, overwrite=given.force, progress=progress)
     except KeyboardInterrupt:
         return INTERRUPTED
     except (ErtisError, OSError, MemoryError) as error:

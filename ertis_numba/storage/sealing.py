@@ -24,9 +24,10 @@ from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import RecordingReader, RecordingWriter, open_recording
 
-__all__ = ["seal"]
+__all__ = ["TOKEN", "seal"]
 
-_TOKEN = "sealing"  # noqa: S105  of the part file: who has the journal is the only one to write it
+TOKEN = "sealing"  # noqa: S105
+"""Of the part file: who has the journal is the only one to write it."""
 
 Progress = Callable[[int, int], None]
 
@@ -61,7 +62,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         return _told(path, before)
     with Journal.open(path) as journal:
         target = journal.target
-        part_of(target, _TOKEN).unlink(missing_ok=True)
+        part_of(target, TOKEN).unlink(missing_ok=True)
         if not len(journal):
             journal.remove()
             return Sealed(path, None)
@@ -96,7 +97,7 @@ def _made_of(path: Path, recording: Path) -> bool:
 
 
 class _Sealer(RecordingWriter):
-    _part_token: ClassVar[str | None] = _TOKEN
+    _part_token: ClassVar[str | None] = TOKEN
 
     def say(self, history: str) -> None:
         """Say what happened to the measurements."""

@@ -1,1 +1,6 @@
-"""The central node: takes measurements in, stores them, hands them on to be processed."""
+"""The central node: takes what sensor nodes send, stores it, and hands it on to processing."""
+
+from ertis_numba.network.central_node._archive import Archive
+from ertis_numba.network.central_node._node import CentralNode
+
+__all__ = ["Archive", "CentralNode"]

@@ -1,1 +1,8 @@
 """The sensor node: keeps measurements until the central node has acknowledged them."""
+
+from ertis_numba.network.sensor_node._link import Central
+from ertis_numba.network.sensor_node._node import SensorNode
+from ertis_numba.network.sensor_node._spool import SensorCounts
+from ertis_numba.network.sensor_node._wire import Settled
+
+__all__ = ["Central", "SensorCounts", "SensorNode", "Settled"]

@@ -1,0 +1,278 @@
+"""What a central node does on this machine: stores, makes images, and is given too much to do; with keys."""
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ertis_bench import machine
+from ertis_bench.network_faults_kills import judged
+from ertis_bench.network_faults_processing import Serve, accounts, expected_of, percentile, some_words
+from ertis_bench.network_oracle import read_diaries
+from ertis_bench.network_processes import Process, central, survivors, until
+from ertis_bench.network_receiver import Look, read_received
+from ertis_bench.network_sender import SETTINGS, Job
+from ertis_numba.errors import DataError
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
+from ertis_numba.settings import Settings
+
+__all__ = ["PARTS", "processing", "run", "storage"]
+
+_WARM_UP_S: Final = 3.0
+_SENDERS: Final = 2  # processes that are sensor nodes: each has its share of the sensors
+_BYTES: Final = 4 * SETTINGS.recording.n_samples
+Found = dict[str, Any]
+Keys = tuple[str, str]
+
+
+def run(
+    *,
+    say: Callable[[str], None],
+    duration_s: float = 60.0,
+    seed: int = 1,
+    only: Sequence[str] = (),
+    folder: Path | None = None,
+) -> dict[str, Any]:
+    """Measure everything, or only some of `PARTS`, and return the report.
+
+    Parameters
+    ----------
+    say : callable
+    duration_s : float
+        Of each.
+    seed : int
+    only : sequence of str
+    folder : Path, optional
+        Where there is room for what is stored, 220 MB for each second; the system's folder for such things by default.
+    """
+    rows = []
+    for name, (about, part) in PARTS.items():
+        if only and name not in only:
+            continue
+        say(about)
+        with tempfile.TemporaryDirectory(prefix="ertis-", dir=folder) as place:
+            rows.append(part(Path(place), duration_s, seed))
+    return {"machine": machine.describe(), "duration_s": duration_s, "seed": seed, "only": list(only), "rows": rows}
+
+
+def _keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
+    """Make keys, and return options of a central node, what a sensor or an application is told, and an admin's."""
+    pairs = {name: KeyPair.new(name) for name in ("central", "node", "boss")}
+    secret = {name: pair.save(folder / "keys")[0] for name, pair in pairs.items()}
+    allowed = (
+        Permission(name="node", public=pairs["node"].public, role="sensor", serials=tuple(sensors)),
+        Permission(name="boss", public=pairs["boss"].public, role="admin"),
+    )
+    AllowList(keys=allowed).save(folder / "allow.toml")
+    options = ["--key", str(secret["central"]), "--allow", str(folder / "allow.toml")]
+    server = pairs["central"].public
+    return options, (str(secret["node"]), server), ClientKeys(pair=pairs["boss"], server=server)
+
+
+def _shared(sensors: Sequence[str], n_senders: int) -> list[tuple[str, ...]]:
+    return [tuple(sensors[first::n_senders]) for first in range(min(n_senders, len(sensors)))]
+
+
+class _Load:
+    """Processor time of processes, and of what they have started."""
+
+    def __init__(self, **processes: list[int]) -> None:
+        self._pids = processes
+        self._begun = {name: _cpu_s(pids) for name, pids in processes.items()}
+        self._begun_s = time.monotonic()
+
+    def percent(self) -> dict[str, float]:
+        """Return how much of a core each has taken since."""
+        lasted_s = time.monotonic() - self._begun_s
+        return {name: 100 * (_cpu_s(pids) - self._begun[name]) / lasted_s for name, pids in self._pids.items()}
+
+
+def _cpu_s(pids: Sequence[int]) -> float:
+    return sum(Process.cpu_s_of(pid) for pid in pids)
+
+
+def storage(
+    folder: Path, duration_s: float, seed: int, *, n_sensors: int = 8, rate_hz: float = 20.0, n_senders: int = _SENDERS
+) -> Found:
+    """Store what sensors send, and read all of it again."""
+    sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
+    options, given, _ = _keys(folder, sensors)
+    archive, mark = folder / "recordings", f"storage{time.monotonic_ns()}"
+    archive.mkdir()
+    count, start_s = round(duration_s * rate_hz), time.monotonic() + 3.0
+    with ExitStack() as stack:
+        node = stack.enter_context(central("record", folder, "-o", str(archive), *options, mark=mark))
+        address = node.wait_for("listening")["address"]
+        jobs = [
+            Job(
+                address=address,
+                diary=str(folder / f"sender-{number}.ndjson"),
+                sensors=share,
+                rate_hz=rate_hz,
+                count=count,
+                seed=seed + number,
+                small=False,
+                keys=given,
+                start_s=start_s,
+                patience_s=120.0,
+            )
+            for number, share in enumerate(_shared(sensors, n_senders))
+        ]
+        senders = [stack.enter_context(job.start()) for job in jobs]
+        for sender in senders:
+            sender.wait_for("begun")
+        time.sleep(max(0.0, start_s - time.monotonic()))
+        load = _Load(**{"central node": [node.pid], "sensor nodes": [each.pid for each in senders]})
+        time.sleep(max(0.0, start_s + duration_s - 1.0 - time.monotonic()))
+        cpu_percent = load.percent()
+        for sender in senders:
+            if not sender.wait_for("sent", timeout_s=duration_s + 180.0)["flushed"]:
+                raise DataError(f"not all was acked; {sender.last_words()}")
+        node.stop(timeout_s=900.0)
+        until(lambda: not survivors(mark))
+    diaries = [Path(job.diary) for job in jobs]
+    sent = read_diaries(diaries)
+    times_ms = sent.ack_times_ms()
+    lasted_s = (max(sent.arrived_ns.values()) - min(sent.arrived_ns.values())) / 1e9
+    return {
+        "part": "storage",
+        "sensors": n_sensors,
+        "rate_hz": rate_hz,
+        "megabytes_per_s": n_sensors * rate_hz * _BYTES / 1e6,
+        "rate_reached_hz": (count - 1) / lasted_s,
+        "p50_ms": percentile(times_ms, 0.5),
+        "p99_ms": percentile(times_ms, 0.99),
+        "slowest_ms": percentile(times_ms, 1.0),
+        "cpu_percent": cpu_percent,
+    } | judged(folder, archive, diaries)
+
+
+def processing(
+    folder: Path,
+    duration_s: float,
+    seed: int,
+    *,
+    directions: str,
+    n_sensors: int,
+    rate_hz: float,
+    goal: str,
+    part: str = "processing",
+    credit: int = 2,
+) -> Found:
+    """Make images of what sensors send, and compare them in an application."""
+    sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
+    options, given, boss = _keys(folder, sensors)
+    settings = _settings(directions)
+    words = some_words(SETTINGS, folder / "words.npy", seed=seed)
+    expected = expected_of(settings, np.load(words), folder / "expected.npz")
+    diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
+    with ExitStack() as stack:
+        serve = stack.enter_context(Serve.running(folder, "--directions", directions, *options, keys=boss))
+        boss_keys = (str(folder / "keys" / "boss.secret.toml"), boss.server)
+        look = Look(address=serve.publish, diary=str(images), expected=str(expected), keys=boss_keys, credit=credit)
+        receiver = stack.enter_context(look.start())
+        receiver.wait_for("subscribed")
+        job = Job(address=serve.listen, diary=str(warm), sensors=tuple(sensors), rate_hz=5.0, words=str(words))
+        job = job.replace(small=False, keys=given, seed=seed)
+        with job.replace(count=round(5.0 * _WARM_UP_S)).start() as first:  # pipelines are made before it counts
+            first.wait_for("sent", timeout_s=120.0)
+        until(lambda: bool(read_received(images).numbers), timeout_s=120.0)
+        time.sleep(_WARM_UP_S)
+        before = read_diaries([warm])
+        serve.settle(len(before.kept))
+        begun = accounts(serve, before, read_received(images))
+        sender = stack.enter_context(
+            job.replace(diary=str(diary), rate_hz=rate_hz, count=round(duration_s * rate_hz)).start()
+        )
+        sender.wait_for("begun")
+        family = [pid for pid in survivors(serve.mark) if pid != serve.node.pid]
+        load = _Load(
+            **{
+                "central node": [serve.node.pid],
+                "its workers and publisher": family,
+                "sensor nodes": [sender.pid],
+                "application": [receiver.pid],
+            }
+        )
+        end_s = time.monotonic() + duration_s - 1.0
+        while time.monotonic() < end_s:
+            serve.look(timeout_s=1.0)
+        cpu_percent = load.percent()
+        sender.wait_for("sent", timeout_s=duration_s + 60.0)
+        sent = read_diaries([warm, diary])
+        serve.settle(len(sent.kept))
+        time.sleep(0.5)
+        receiver.signal(15)
+        receiver.wait()
+        received = read_received(images)
+        found = _since(begun, accounts(serve, sent, received))
+        status = serve.latest
+        serve.node.stop()
+    measured = read_diaries([diary]).offered
+    times_ms = [time_ms for key, time_ms in received.times_ms.items() if key in measured]
+    choice = "" if status is None or status.processing is None else status.processing.choice
+    return found | {
+        "part": part,
+        "directions": directions,
+        "sensors": n_sensors,
+        "rate_hz": rate_hz,
+        "goal": goal,
+        "choice": choice,
+        "p50_ms": percentile(times_ms, 0.5),
+        "p90_ms": percentile(times_ms, 0.9),
+        "p99_ms": percentile(times_ms, 0.99),
+        "slowest_ms": percentile(times_ms, 1.0),
+        "cpu_percent": cpu_percent,
+    }
+
+
+def _since(begun: Found, found: Found) -> Found:
+    """Return accounts without what was there before pipelines were made; faults count all the same."""
+    since = {name: found[name] - begun[name] for name in ("sent", "received", "published", "images", "skipped")}
+    dropped = {name: count - begun["dropped"].get(name, 0) for name, count in found["dropped"].items()}
+    return found | since | {"dropped": {name: count for name, count in dropped.items() if count}}
+
+
+def _settings(directions: str) -> Settings:
+    return SETTINGS.replace(processing=SETTINGS.processing.replace(directions=directions))
+
+
+def _overload(folder: Path, duration_s: float, seed: int) -> Found:
+    """Send twice as much as was published when there was more than enough."""
+    (folder / "calibration").mkdir()
+    (folder / "overload").mkdir()
+    goal = "received = published + dropped; latency bounded"
+    options: dict[str, Any] = {"directions": "3000", "n_sensors": 4, "goal": goal, "part": "overload 2×", "credit": 8}
+    most = processing(folder / "calibration", 8.0, seed, rate_hz=40.0, **options)
+    times = most["images"] / max(1, most["sent"])
+    rate_hz = round(2 * times * 40.0, 1)
+    return processing(folder / "overload", duration_s, seed, rate_hz=rate_hz, **options)
+
+
+PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
+    "storage": ("8 sensors × 20 Hz are stored", storage),
+    "processing": (
+        "90 directions, 4 sensors × 10 Hz",
+        lambda folder, duration_s, seed: processing(
+            folder,
+            duration_s,
+            seed,
+            directions="90",
+            n_sensors=4,
+            rate_hz=10.0,
+            goal="0 dropped; p50 < 40 ms, p99 < 120 ms",
+        ),
+    ),
+    "images": (
+        "3000 directions, 1 sensor × 20 Hz",
+        lambda folder, duration_s, seed: processing(
+            folder, duration_s, seed, directions="3000", n_sensors=1, rate_hz=20.0, goal="0 dropped (the paper: 10 Hz)"
+        ),
+    ),
+    "overload": ("twice as much as can be done", _overload),
+}
+"""What is measured: what to say of it, and how."""

@@ -1,0 +1,65 @@
+"""Where a sender writes what it does; whatever ends it, what it wrote is there."""
+
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+from ertis_numba.frames import Measurement
+
+__all__ = ["Diary", "Key", "Row"]
+
+
+class Key(NamedTuple):
+    """Which measurement."""
+
+    sensor: str
+    epoch: int
+    sequence: int
+
+
+class Row(NamedTuple):
+    """What must not change on the way."""
+
+    crc32: int
+    sync_count: int
+    timestamp_ns: int
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> "Row":
+        """Return that of a measurement, whose CRC-32 is made here."""
+        stamp = measurement.stamp
+        return cls(zlib.crc32(measurement.words.data), stamp.sync_count, stamp.timestamp_ns)
+
+
+class Diary:
+    """Where a sender writes what it does, line by line.
+
+    Parameters
+    ----------
+    path : Path
+        It is appended to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
+
+    def offered(self, key: Key, row: Row, monotonic_ns: int) -> None:
+        """Write that a measurement is going to be handed over."""
+        self._write("offered", *key, *row, monotonic_ns)
+
+    def kept(self, key: Key) -> None:
+        """Write that it was accepted."""
+        self._write("kept", *key)
+
+    def settled(self, sensor: str, epoch: int, settled: int, status: str, monotonic_ns: int) -> None:
+        """Write what the sender was told."""
+        self._write("settled", sensor, epoch, settled, status, monotonic_ns)
+
+    def dropped(self, sensor: str, epoch: int, sequence: int, reason: str) -> None:
+        """Write that the sender was told of one that was thrown away."""
+        self._write("dropped", sensor, epoch, sequence, reason)
+
+    def _write(self, *words: object) -> None:
+        os.write(self._file, f"{json.dumps(words)}\n".encode())  # at once and in one piece

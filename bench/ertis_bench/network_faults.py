@@ -1,0 +1,161 @@
+"""What goes wrong in a network, and what becomes of it: killed nodes, bad disks, lost messages, strangers, overload."""
+
+import secrets
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ertis_bench import (
+    machine,
+    network_faults_hosts,
+    network_faults_keys,
+    network_faults_kills,
+    network_faults_links,
+    network_faults_peers,
+    network_faults_processing,
+)
+from ertis_bench.reliability import small_disk
+
+__all__ = ["LONG", "PARTS", "SHORT", "Extent", "run"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extent:
+    """How much is tried.
+
+    Attributes
+    ----------
+    n_kills : int
+        Of central nodes, and as many of sensor nodes.
+    n_seal_kills, n_worker_kills : int
+    away_s : float
+        How long a central node is away.
+    meddled_s, cable_s : float
+        How long messages are lost, and packets.
+    n_captures : int
+        Kills while emulated sensors are captured from.
+    n_hostile, n_fuzzed : int
+        Connections and messages.
+    overload_s, slow_s : float
+        How long there is too much to do, and how long there are slow applications.
+    n_pulses : int
+        Of a SYNC chain.
+    """
+
+    n_kills: int
+    n_seal_kills: int
+    n_worker_kills: int
+    away_s: float
+    meddled_s: float
+    cable_s: float
+    n_captures: int
+    n_hostile: int
+    n_fuzzed: int
+    overload_s: float
+    slow_s: float
+    n_pulses: int
+
+
+SHORT = Extent(
+    n_kills=20, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2, n_hostile=200,
+    n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40,
+)  # fmt: skip
+LONG = Extent(
+    n_kills=1_000, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0, n_captures=50,
+    n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
+)  # fmt: skip
+
+
+def run(
+    *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Try everything, or only some of `PARTS`, and return the report."""
+    extent = LONG if long else SHORT
+    seed = secrets.randbits(31) if seed is None else seed
+    say(f"seed {seed}")
+    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long, "only": list(only)}
+    for name, (about, part) in PARTS.items():
+        if only and name not in only:
+            continue
+        say(about.format(**asdict(extent)))
+        with tempfile.TemporaryDirectory(prefix="ertis-") as folder:
+            report[name] = part(extent, Path(folder), seed)
+    return report
+
+
+def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
+    disk = folder / "disk"
+    disk.mkdir()
+    with small_disk(disk) as mounted:
+        return None if mounted is None else network_faults_links.disk_full(folder, mounted, seed=seed)
+
+
+PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
+    "centrals": (
+        "{n_kills} central nodes killed",
+        lambda extent, folder, seed: network_faults_kills.centrals(folder, seed=seed, count=extent.n_kills),
+    ),
+    "nodes": (
+        "{n_kills} sensor nodes killed",
+        lambda extent, folder, seed: network_faults_kills.nodes(folder, seed=seed, count=extent.n_kills),
+    ),
+    "captures": (
+        "{n_captures} captures and central nodes killed",
+        lambda extent, folder, seed: network_faults_hosts.captures(folder, seed=seed, count=extent.n_captures),
+    ),
+    "sealings": (
+        "{n_seal_kills} sealings killed",
+        lambda extent, folder, seed: network_faults_kills.sealings(folder, seed=seed, count=extent.n_seal_kills),
+    ),
+    "workers": (
+        "{n_worker_kills} workers killed",
+        lambda extent, folder, seed: network_faults_processing.workers(folder, seed=seed, count=extent.n_worker_kills),
+    ),
+    "disk_full": ("a small disk", _disk_full),
+    "disk_fails": (
+        "a disk that fails",
+        lambda _, folder, seed: network_faults_links.disk_fails(folder, seed=seed),
+    ),
+    "away": (
+        "{away_s:g} s without the central node",
+        lambda extent, folder, seed: network_faults_links.away(folder, seed=seed, away_s=extent.away_s, how="killed"),
+    ),
+    "stopped": (
+        "{away_s:g} s in which it stands still",
+        lambda extent, folder, seed: network_faults_links.away(folder, seed=seed, away_s=extent.away_s, how="stopped"),
+    ),
+    "meddled": (
+        "{meddled_s:g} s of lost, repeated and late acks",
+        lambda extent, folder, seed: network_faults_links.meddled(folder, seed=seed, duration_s=extent.meddled_s),
+    ),
+    "hosts": (
+        "{cable_s:g} s over a bad cable between two hosts",
+        lambda extent, folder, seed: network_faults_hosts.hosts(folder, seed=seed, duration_s=extent.cable_s),
+    ),
+    "hostile": (
+        "{n_hostile} hostile connections",
+        lambda extent, folder, seed: network_faults_peers.hostile(folder, seed=seed, count=extent.n_hostile),
+    ),
+    "keys": ("all wrong keys", lambda _, folder, seed: network_faults_keys.keys(folder, seed=seed)),
+    "fuzzed": (
+        "{n_fuzzed} malformed messages",
+        lambda extent, folder, seed: network_faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
+    ),
+    "overload": (
+        "{overload_s:g} s of twice as much as can be done",
+        lambda extent, folder, seed: network_faults_processing.overload(
+            folder, seed=seed, duration_s=extent.overload_s
+        ),
+    ),
+    "subscribers": (
+        "{slow_s:g} s with slow and dead applications",
+        lambda extent, folder, seed: network_faults_processing.subscribers(folder, seed=seed, duration_s=extent.slow_s),
+    ),
+    "groups": (
+        "{n_pulses} pulses, lost, double, and with a wrong clock",
+        lambda extent, folder, seed: network_faults_processing.groups(folder, seed=seed, count=extent.n_pulses),
+    ),
+}
+"""What is tried: what to say of it, and how."""

@@ -1,0 +1,187 @@
+"""Nodes of a network that are killed: nothing that was acked, or kept in a spool, may be lost or stored twice."""
+
+import os
+import random
+import secrets
+import signal
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench.network_oracle import Sent, compare, read_diaries, read_folder
+from ertis_bench.network_processes import Process, central, free_address, survivors, until
+from ertis_bench.network_sender import Job
+from ertis_numba.errors import DataError
+
+__all__ = ["Record", "centrals", "judged", "nodes", "sealings", "tracebacks"]
+
+_GONE_S: Final = 30.0  # for what a killed process has started
+_ROTATE_MB: Final = 4
+_RING_BYTES: Final = 500_000_000
+Found = dict[str, Any]
+
+
+class Record:
+    """``ertis record`` that is started again and again, at one address, into one folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the harness; recordings go to ``recordings`` in it.
+    *options : str
+
+    Attributes
+    ----------
+    archive : Path
+    address : str
+    mark : str
+        By which all that it has started is found.
+    """
+
+    def __init__(self, folder: Path, *options: str, archive: Path | None = None) -> None:
+        self.folder, self._options = folder, options
+        self.archive = archive or folder / "recordings"
+        self.archive.mkdir(exist_ok=True)
+        self.address, self.mark = free_address(), secrets.token_hex(8)
+
+    def start(self) -> Process:
+        """Start it; it need not listen yet."""
+        return central(
+            "record", self.folder, "-o", str(self.archive), *self._options, listen=self.address, mark=self.mark
+        )
+
+    def finish(self, senders: list[Process], *, timeout_s: float = 120.0) -> Found:
+        """Start it once more, let senders end, which brings all that they still have, and let it seal.
+
+        Returns
+        -------
+        dict
+            ``unsettled``, senders that did not get rid of all; ``orphans``, processes that ought to have ended.
+        """
+        unsettled = 0
+        with self.start() as last:
+            last.wait_for("listening")
+            for sender in senders:
+                sender.signal(signal.SIGTERM)
+            for sender in senders:
+                unsettled += not sender.wait_for("sent", timeout_s=timeout_s)["flushed"]
+                sender.wait()
+            code = last.stop(timeout_s=timeout_s)
+            if code:
+                raise DataError(f"ertis record ended with {code}; {last.last_words()}")
+        until(lambda: not survivors(self.mark), timeout_s=_GONE_S)
+        return {"unsettled": unsettled, "orphans": len(survivors(self.mark))}
+
+
+def tracebacks(folder: Path) -> int:
+    """Return how many there are in what processes of a harness have said."""
+    return sum(path.read_text(errors="replace").count("Traceback (most") for path in folder.glob("*.txt"))
+
+
+def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path] | None = None) -> Found:
+    """Compare what was sent with what was stored.
+
+    Parameters
+    ----------
+    folder, archive : Path
+        Of the harness, and of the recordings.
+    diaries : list of Path
+    kept : list of Path, optional
+        Those whose senders promise that all they keep is stored; all by default. Of others, what was acked.
+    """
+    sent = read_diaries(diaries)
+    surely: Sent = sent if kept is None else read_diaries(kept)
+    promised = surely.kept | sent.acked()
+    return compare(sent, read_folder(archive), promised) | {
+        "offered": len(sent.offered),
+        "acked": len(sent.acked()),
+        "tracebacks": tracebacks(folder),
+    }
+
+
+def centrals(folder: Path, *, seed: int, count: int) -> Found:
+    """Kill a central node at random moments while two sensors send to it, also while it starts, rotates and seals."""
+    rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
+    record = Record(folder, "--rotate-size", str(_ROTATE_MB))
+    diary = folder / "sender.ndjson"
+    job = Job(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=40.0, seed=seed)
+    with job.replace(ring_bytes=_RING_BYTES, patience_s=60.0).start() as sender:
+        sender.wait_for("begun")
+        for _ in range(count):
+            with record.start() as node:
+                if rng.random() < 0.8:  # others are killed while they start
+                    node.wait_for("listening")
+                time.sleep(rng.uniform(0.0, 0.5))
+                node.kill()
+        ended = record.finish([sender])
+    return {"kills": count} | ended | judged(folder, record.archive, [diary])
+
+
+def nodes(folder: Path, *, seed: int, count: int) -> Found:
+    """Kill sensor nodes at random moments, of which one keeps a spool on disk; that one is to lose nothing at all."""
+    rng = random.Random(seed)  # noqa: S311  as above
+    record = Record(folder, "--rotate-size", str(_ROTATE_MB))
+    diaries = {name: folder / f"{name}.ndjson" for name in ("spool", "memory")}
+    jobs = {
+        name: Job(address=record.address, diary=str(diary), sensors=(name,), rate_hz=100.0, seed=seed, patience_s=60.0)
+        for name, diary in diaries.items()
+    }
+    jobs["spool"] = jobs["spool"].replace(spool=str(folder / "spool"))
+    (folder / "spool").mkdir()
+    with record.start() as node:
+        node.wait_for("listening")
+        for _ in range((count + 1) // 2):
+            with ExitStack() as stack:
+                senders = [stack.enter_context(job.start()) for job in jobs.values()]
+                for sender in senders:
+                    sender.wait_for("begun")
+                for sender in rng.sample(senders, 2):
+                    time.sleep(rng.uniform(0.0, 0.3))
+                    sender.kill()
+        node.stop()
+    with jobs["spool"].replace(count=1).start() as sender:
+        sender.wait_for("done")
+        ended = record.finish([sender])
+    found = judged(folder, record.archive, list(diaries.values()), kept=[diaries["spool"]])
+    return {"kills": 2 * ((count + 1) // 2)} | ended | found | {"in_spool": len(list((folder / "spool").iterdir()))}
+
+
+def sealings(folder: Path, *, seed: int, count: int) -> Found:
+    """Kill what seals recordings while the central node goes on, and now and then the central node with it."""
+    rng = random.Random(seed)  # noqa: S311  as above
+    record = Record(folder, "--rotate-size", "2")
+    diary = folder / "sender.ndjson"
+    job = Job(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
+    killed = with_central = 0
+    with ExitStack() as stack:
+        sender = stack.enter_context(job.replace(patience_s=60.0).start())
+        node = stack.enter_context(record.start())
+        seen: set[int] = set()
+        while killed < count:
+            sealers = [pid for pid, line in survivors(record.mark).items() if "_sealing_process" in line]
+            fresh = [pid for pid in sealers if pid not in seen]
+            if not fresh:
+                if not node.running:
+                    raise DataError(f"the central node has ended; {node.last_words()}")
+                time.sleep(0.01)
+                continue
+            seen.update(fresh)
+            time.sleep(rng.uniform(0.0, 0.6))
+            killed += _killed(fresh[0])
+            if rng.random() < 0.2:
+                node.kill()
+                with_central += 1
+                node = stack.enter_context(record.start())
+        node.stop()
+        ended = record.finish([sender])
+    return {"kills": killed, "with central": with_central} | ended | judged(folder, record.archive, [diary])
+
+
+def _killed(pid: int) -> bool:
+    """Kill a process, and return whether it was still there."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True

@@ -1,0 +1,196 @@
+"""Disks that are full or fail, central nodes that are away, and messages that get lost on the way."""
+
+import json
+import resource
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench.network_faults_kills import Record, judged
+from ertis_bench.network_meddler import ACKS, Meddler
+from ertis_bench.network_oracle import read_diaries
+from ertis_bench.network_processes import Process, ask, until
+from ertis_bench.network_sender import Job
+from ertis_numba.errors import DataError
+
+__all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
+
+_RING_BYTES: Final = 64_000_000
+_ROOM_BYTES: Final = 24_000_000  # more than a full ring, for what else a process may take and keep
+_START_S: Final = 2.0  # at most, until a node listens and sensors have found it
+_QUIET_S: Final = 1.5  # after which an ack that has been sent has come
+Found = dict[str, Any]
+
+
+def state_of(address: str, *keys: str) -> dict[str, Any]:
+    """Return the status of a central node, as ``ertis status --json`` prints it.
+
+    Raises
+    ------
+    DataError
+        It does not answer.
+    """
+    done = ask("status", address, "--json", "--once", *keys)
+    if done.returncode:
+        raise DataError(f"ertis status ended with {done.returncode}: {done.stderr.strip()}")
+    status: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return status
+
+
+def disk_full(folder: Path, disk: Path, *, seed: int) -> Found:
+    """Fill a small disk while a sensor sends, free it again, and see that nothing was acked in between nor lost."""
+    ballast = disk / "ballast"
+    archive = disk / "recordings"
+    archive.mkdir()
+
+    def free() -> None:
+        ballast.unlink()
+
+    ballast.write_bytes(bytes(9_000_000))
+    return _faulty(folder, Record(folder, archive=archive), free, seed=seed, count=25)
+
+
+def disk_fails(folder: Path, *, seed: int) -> Found:
+    """Let each write beyond a place in a file fail, as by EIO, allow it again, and see the same."""
+    record = Record(folder)
+    return _faulty(folder, record, None, seed=seed, count=60)
+
+
+def _faulty(folder: Path, record: Record, free: Callable[[], None] | None, *, seed: int, count: int) -> Found:
+    """Send until the disk fails, mend it, and send the rest.
+
+    Parameters
+    ----------
+    free : callable, optional
+        Mends the disk. By default the kernel refuses the process to write beyond some 100 kB of a file, and what
+        mends that is to let it again.
+    """
+    diary = folder / "sender.ndjson"
+    job = Job(address=record.address, diary=str(diary), rate_hz=20.0, count=count, seed=seed, patience_s=60.0)
+    with ExitStack() as stack:
+        node = stack.enter_context(record.start())
+        node.wait_for("listening")
+        sender = stack.enter_context(job.start())
+        sender.wait_for("begun")
+        if free is None:
+            until(lambda: bool(read_diaries([diary]).acked()))
+            _limit(node, 100_000)
+        fault = node.wait_for("fault")
+        time.sleep(_QUIET_S)
+        acked = len(read_diaries([diary]).acked())
+        time.sleep(_QUIET_S)
+        acked_in_fault = len(read_diaries([diary]).acked()) - acked
+        state = state_of(record.address)["state"]
+        if free is None:
+            _limit(node, resource.RLIM_INFINITY)
+        else:
+            free()
+        node.wait_for("resumed")
+        sender.wait_for("sent")
+        node.stop()
+        ended = record.finish([])
+    return {
+        "state": state,
+        "said": " ".join(str(fault.get("text", fault.get("reason", ""))).split()).replace(str(record.archive), "DISK"),
+        "acked before": acked,
+        "acked in fault": acked_in_fault,
+        **ended,
+        **judged(folder, record.archive, [diary]),
+    }
+
+
+def _limit(process: Process, most_bytes: int) -> None:
+    """Let writes beyond a place in any file fail: with EFBIG, which SQLite takes for a fault of the disk."""
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most_bytes, resource.RLIM_INFINITY))
+
+
+def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
+    """Stop a central node for a while, with what a ring in memory can hold in the meantime, and then with more.
+
+    Parameters
+    ----------
+    how : {"killed", "stopped"}
+        Whether its process is ended, or stands still and keeps its connections.
+    """
+    record = Record(folder)
+    diary = folder / "sender.ndjson"
+    rate_hz = 0.7 * _RING_BYTES / (131_072 * (away_s + _START_S))
+    job = Job(address=record.address, diary=str(diary), seed=seed, ring_bytes=_RING_BYTES, patience_s=60.0)
+    found: Found = {"away_s": away_s}
+    with ExitStack() as stack:
+        node = stack.enter_context(record.start())
+        node.wait_for("listening")
+        for name, factor in (("", 1.0), (" too long", 2.5)):
+            sender = stack.enter_context(job.replace(rate_hz=factor * rate_hz).start())
+            sender.wait_for("begun")
+            until(lambda: bool(read_diaries([diary]).acked()))
+            before = sender.memory_bytes
+            if how == "killed":
+                node.kill()
+            else:
+                node.signal(signal.SIGSTOP)
+            time.sleep(away_s)
+            found[f"memory grew{name}, MB"] = round((sender.memory_bytes - before) / 1e6, 1)
+            if how == "killed":
+                node = stack.enter_context(record.start())
+                node.wait_for("listening")
+            else:
+                node.signal(signal.SIGCONT)
+            back_s = time.monotonic()
+            acked = len(read_diaries([diary]).acked())
+            until(lambda acked=acked: len(read_diaries([diary]).acked()) > acked)  # type: ignore[misc]
+            found[f"back after{name}, s"] = round(time.monotonic() - back_s, 2)
+            sender.signal(signal.SIGTERM)
+            sender.wait_for("sent", timeout_s=120.0)
+            sender.wait()
+            if not name:
+                node.stop()
+                found |= {name: n for name, n in judged(folder, record.archive, [diary]).items() if name != "left_over"}
+                node = stack.enter_context(record.start())
+                node.wait_for("listening")
+        node.stop()
+        ended = record.finish([])
+    overrun = judged(folder, record.archive, [diary])
+    return (
+        found
+        | ended
+        | {"left_over": overrun["left_over"], "most memory, MB": (_RING_BYTES + _ROOM_BYTES) / 1e6}
+        | {f"{name} too long": overrun[name] for name in ("lost", "missing", "wrong", "twice", "unexpected", "silent")}
+    )
+
+
+def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
+    """Lose, repeat and delay acks, drop connections, and pull the cable without a word to either end."""
+    record = Record(folder)
+    diary = folder / "sender.ndjson"
+    with ExitStack() as stack:
+        node = stack.enter_context(record.start())
+        node.wait_for("listening")
+        cable = stack.enter_context(Meddler(record.address, seed=seed, odds=ACKS))
+        job = Job(address=cable.address, diary=str(diary), rate_hz=40.0, seed=seed, ring_bytes=10 * _RING_BYTES)
+        sender = stack.enter_context(job.replace(sensors=("left", "right"), patience_s=60.0).start())
+        sender.wait_for("begun")
+        end_s = time.monotonic() + duration_s
+        drops = cuts = 0
+        while time.monotonic() < end_s:
+            time.sleep(duration_s / 8)
+            cable.drop()
+            drops += 1
+            time.sleep(duration_s / 8)
+            cable.cut()
+            cuts += 1
+            time.sleep(min(5.0, duration_s / 4))
+            cable.mend()
+        sender.signal(signal.SIGTERM)
+        flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
+        node.stop()
+        ended = record.finish([])
+        did = dict(cable.did)
+    return (
+        {"drops": drops, "cuts": cuts, "flushed": flushed, "meddled": did}
+        | ended
+        | judged(folder, record.archive, [diary])
+    )

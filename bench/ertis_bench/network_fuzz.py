@@ -1,0 +1,168 @@
+"""Messages that no node sends: valid ones that are bent, headers of nothing, and lists of frames that make no sense."""
+
+import random
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import msgspec
+
+from ertis_numba.settings import Recording, Settings
+
+__all__ = ["VALID", "inputs"]
+
+_MAGIC: Final = b"eRTN\x01"
+_SENSOR: Final = {"sensor": "fuzz", "epoch": 1}
+_BYTES: Final = 4 * 4096
+_SETTINGS: Final = Settings(recording=Recording(n_samples=_BYTES // 4)).to_toml().encode()
+_PRODUCTS: Final = ("energyscape", "points", "raw", "group", "status")
+_STAMPS: Final = {"sequence": 0, "sync_count": 0, "timestamp_ns": 0, "uncertainty_ns": 0, "monotonic_ns": 0}
+_AIR: Final = {"temperature_c": 20.0, "humidity_percent": 50.0, "pressure_pa": 101_325.0}
+_FIELDS: Final[dict[str, dict[str, object]]] = {
+    "hello": _SENSOR | {"next_sequence": 0, "settings_crc32": zlib.crc32(_SETTINGS)},
+    "data": _SENSOR | _STAMPS | _AIR | {"crc32": 1},
+    "gap": _SENSOR | {"first": 0, "last": 3, "reason": "fuzz"},
+    "ping": {},
+    "bye": {},
+    "ack": _SENSOR | {"settled": 5, "status": "stored"},
+    "welcome": _SENSOR | {"state": "storage", "acks": "stored", "window": 16, "settled": 3},
+    "subscribe": {"products": ["energyscape", "status"], "consumed": 0, "credit": 2},
+    "askstatus": {},
+    "refused": {"code": "hello", "reason": "fuzz"},
+}
+
+
+def _header(kind: str, fields: dict[str, object]) -> bytes:
+    return _MAGIC + msgspec.msgpack.encode({"kind": kind} | fields)
+
+
+VALID: Final = {kind: _header(kind, fields) for kind, fields in _FIELDS.items()}
+"""A header of each kind that a node could send, none of which brings a measurement."""
+
+_ODD_VALUES: Final[tuple[object, ...]] = (
+    None, True, -1, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf"), "", "x" * 300, "../../etc", "\0",
+    "a\nb", b"", b"\xff" * 100, [], [[[[[]]]]], {}, {"a": {}}, ["status"] * 100, "\N{SNOWMAN}",
+)  # fmt: skip
+_ODD_HEADERS: Final = (
+    b"",
+    b"\0",
+    _MAGIC[:4],
+    _MAGIC,
+    _MAGIC + b"\xc1",
+    _MAGIC + b"\x80",
+    b"eRTN\x02" + VALID["ping"][5:],
+    b"eRTN\x00" + VALID["ping"][5:],
+    _MAGIC + b"\xdf\xff\xff\xff\xff",
+    _MAGIC + b"\xdd\xff\xff\xff\xff",
+    _MAGIC + b"\xc6\xff\xff\xff\xff",
+    _MAGIC + b"\xdb\xff\xff\xff\xff",
+    _MAGIC + b"\x91" * 3000,
+    _MAGIC + b"\x81\xa4kind" * 500,
+    _MAGIC + bytes(5000),
+)
+
+
+def inputs(rng: random.Random, count: int, size: int) -> Iterator[list[list[bytes]]]:
+    """Yield messages, each a list of frames, in batches of some size."""
+    made = 0
+    while made < count:
+        batch = [_input(rng) for _ in range(min(size, count - made))]
+        made += len(batch)
+        yield batch
+
+
+def _input(rng: random.Random) -> list[bytes]:
+    draw = rng.random()
+    if draw < 0.3:
+        return _plausible(rng)
+    header = rng.choice(_WAYS)(rng)
+    draw = rng.random()
+    if draw < 0.05:
+        return [header, _SETTINGS]
+    if draw < 0.6:
+        return [header, rng.randbytes(rng.choice((0, 1, 7, 64, 700)))]
+    if draw < 0.8:
+        return [header]
+    if draw < 0.9:
+        return [header, *(rng.randbytes(rng.randrange(20)) for _ in range(rng.randrange(1, 40)))]
+    return [b"", header] if draw < 0.95 else [rng.randbytes(5), header, header]
+
+
+def _plausible(rng: random.Random) -> list[bytes]:
+    """Return a message that is well-formed, of a run that a node may know, and makes no sense."""
+    number = rng.choice((0, 1, 2, 7, rng.randrange(1000), 2**31, 2**62, 2**63 - 1))
+    other = rng.choice((0, number, number + 1, 2**63 - 1)) % 2**63
+    fields = {"sensor": rng.choice(("fuzz", "fuzz2")), "epoch": rng.choice((1, 1, 1, 2, 2**63 - 1))}
+    match rng.randrange(6):
+        case 0:
+            return [_header("hello", _FIELDS["hello"] | fields | {"next_sequence": number}), _SETTINGS]
+        case 1:
+            return [_header("gap", _FIELDS["gap"] | fields | {"first": number, "last": other})]
+        case 2:
+            return [_header("bye", {})]
+        case 3:
+            wanted = {"products": rng.sample(_PRODUCTS, rng.randint(1, 5)), "consumed": number, "credit": 64}
+            return [_header("subscribe", wanted)]
+        case 4:
+            payload = rng.randbytes(rng.choice((_BYTES, _BYTES, 0, _BYTES - 4)))
+            air = {"temperature_c": rng.choice((20.0, float("nan"), 1e300, -300.0))}
+            data = _FIELDS["data"] | fields | air | {"sequence": number, "sync_count": -other}
+            return [_header("data", data | {"crc32": zlib.crc32(payload) ^ 1}), payload]
+        case _:
+            return [VALID["hello"], _SETTINGS]
+
+
+def _bent(rng: random.Random) -> bytes:
+    """Return a header of which some bytes are other ones, too many or too few."""
+    data = bytearray(rng.choice(list(VALID.values())))
+    for _ in range(rng.randint(1, 4)):
+        place = rng.randrange(len(data) + 1)
+        match rng.randrange(4):
+            case 0 if place < len(data):
+                data[place] ^= 1 << rng.randrange(8)
+            case 1 if place < len(data):
+                data[place] = rng.choice((0x00, 0x7F, 0x80, 0xC0, 0xC1, 0xD9, 0xDF, 0xFF))
+            case 2:
+                data[place:place] = rng.randbytes(rng.randint(1, 9))
+            case _:
+                del data[place : place + rng.randint(1, 9)]
+    return bytes(data)
+
+
+def _odd_field(rng: random.Random) -> bytes:
+    """Return a header with a value that its field cannot have, a field too many or one too few."""
+    kind = rng.choice(list(_FIELDS))
+    fields = dict(_FIELDS[kind])
+    name = rng.choice([*fields, "more"])
+    if rng.random() < 0.2:
+        fields.pop(name, None)
+    else:
+        fields[name] = rng.choice(_ODD_VALUES)
+    return _header(rng.choice((kind, kind, kind, "what", kind.upper(), "")), fields)
+
+
+def _spliced(rng: random.Random) -> bytes:
+    one, other = rng.choices(list(VALID.values()), k=2)
+    return one[: rng.randrange(len(one))] + other[rng.randrange(len(other)) :]
+
+
+def _random(rng: random.Random) -> bytes:
+    beginning = _MAGIC if rng.random() < 0.7 else b""
+    return beginning + rng.randbytes(rng.choice((1, 3, 20, 200, 4090, 4096)))
+
+
+def _odd(rng: random.Random) -> bytes:
+    header = rng.choice(_ODD_HEADERS)
+    return header if rng.random() < 0.8 else header + struct.pack("<Q", rng.getrandbits(64))
+
+
+_WAYS: Final[tuple[Callable[[random.Random], bytes], ...]] = (
+    _bent,
+    _bent,
+    _odd_field,
+    _odd_field,
+    _spliced,
+    _random,
+    _odd,
+)

@@ -1,0 +1,169 @@
+"""A cable between nodes that loses, repeats and delays whole messages, or goes dead, and tells nobody."""
+
+import contextlib
+import random
+import socket
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Self
+
+from ertis_bench.network_zmtp import GREETING, Frame, Frames, host_and_port
+
+__all__ = ["ACKS", "Meddler", "Odds"]
+
+_READ_BYTES: Final = 262_144
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Odds:
+    """What becomes of a kind of message: the share that is lost, repeated, and delayed, by up to ``most_s``."""
+
+    lose: float = 0.0
+    repeat: float = 0.0
+    delay: float = 0.0
+    most_s: float = 0.3
+
+
+ACKS: Final = {"ack": Odds(lose=0.25, repeat=0.25, delay=0.25), "welcome": Odds(lose=0.1, repeat=0.1)}
+"""Acks are lost, repeated and overtake each other."""
+
+
+class Meddler:
+    """Passes on what goes to and from an address, or not; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    target : str
+        ``tcp://HOST:PORT`` of a node without keys, whose messages can be read.
+    seed : int
+    odds : mapping of str to Odds
+        By the kind of a message.
+
+    Attributes
+    ----------
+    address : str
+        For those who are to reach the target.
+    did : Counter of str
+        What was done, such as ``ack lose``.
+    """
+
+    def __init__(self, target: str, *, seed: int = 0, odds: Mapping[str, Odds] | None = None) -> None:
+        self._target, self._odds = target, dict(odds or {})
+        self._random = random.Random(seed)  # noqa: S311  a seed is to give the same faults again
+        self.did: Counter[str] = Counter()
+        self._sockets: list[socket.socket] = []
+        self._plugged = threading.Event()
+        self._plugged.set()
+        self._closed = False
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def retarget(self, target: str) -> None:
+        """Connect to another address from now on."""
+        self._target = target
+
+    def cut(self) -> None:
+        """Pass nothing on, and tell nobody, as a cable that is pulled out does."""
+        self._plugged.clear()
+
+    def mend(self) -> None:
+        """Pass on what has waited, and what comes."""
+        self._plugged.set()
+
+    def drop(self) -> None:
+        """Close all connections."""
+        for each in self._sockets:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._server.accept()
+            except OSError:  # it is closed
+                return
+            if not self._plugged.is_set():
+                near.close()
+                continue
+            try:
+                far = socket.create_connection(host_and_port(self._target), timeout=5.0)
+                far.settimeout(None)
+            except OSError:
+                near.close()
+                continue
+            self._sockets = [each for each in self._sockets if each.fileno() >= 0] + [near, far]
+            for ends in ((near, far), (far, near)):
+                for end in ends:
+                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                threading.Thread(target=self._relay, args=ends, daemon=True).start()
+
+    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
+        """Pass on one direction of a connection until it ends."""
+        frames, greeted, body, turn = Frames(), 0, list[Frame](), threading.Lock()
+        with contextlib.suppress(OSError):
+            while data := source.recv(_READ_BYTES):
+                self._plugged.wait()
+                head, data = data[: len(GREETING) - greeted], data[len(GREETING) - greeted :]
+                greeted += len(head)
+                _send(sink, head, turn)
+                for frame in frames.feed(data):
+                    body.append(frame)
+                    if frame.is_command:
+                        _send(sink, body.pop().encode(), turn)
+                    elif not frame.more:
+                        self._pass(sink, body, turn)
+                        body = []
+        for each in (source, sink):
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+
+    def _pass(self, sink: socket.socket, body: list[Frame], turn: threading.Lock) -> None:
+        data = b"".join(frame.encode() for frame in body)
+        kind = _kind(body[0].body)
+        odds = self._odds.get(kind)
+        if odds is None:
+            _send(sink, data, turn)
+            return
+        for what, share in (("lose", odds.lose), ("delay", odds.delay), ("repeat", odds.repeat)):
+            if self._random.random() >= share:
+                continue
+            self.did[f"{kind} {what}"] += 1
+            if what == "lose":
+                return
+            if what == "delay":
+                _later(self._random.uniform(0.0, odds.most_s), sink, data, turn)
+                return
+            _send(sink, data, turn)
+        _send(sink, data, turn)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._plugged.set()
+        self._server.close()
+        self.drop()
+
+
+def _kind(header: bytes) -> str:
+    """Return which message a header is of, empty where it is none."""
+    _, found, rest = header.partition(b"\xa4kind")
+    return rest[1 : 1 + (rest[0] & 0x1F)].decode() if found and rest else ""
+
+
+def _later(delay_s: float, sink: socket.socket, data: bytes, turn: threading.Lock) -> None:
+    timer = threading.Timer(delay_s, _send, args=(sink, data, turn))
+    timer.daemon = True
+    timer.start()
+
+
+def _send(sink: socket.socket, data: bytes, turn: threading.Lock) -> None:
+    """Send in one piece; what cannot be sent any more is lost."""
+    if not data:
+        return
+    with turn, contextlib.suppress(OSError):
+        sink.sendall(data)

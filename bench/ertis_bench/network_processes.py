@@ -1,0 +1,222 @@
+"""Processes that speak: they are started, listened to, killed, and looked for when they ought to be gone."""
+
+import contextlib
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from ertis_numba.errors import DataError
+
+__all__ = ["ERTIS", "Process", "ask", "central", "free_address", "survivors", "until"]
+
+ERTIS: Final = (sys.executable, "-m", "ertis_cli")
+_WAIT_S: Final = 60.0  # for anything that ought to happen by itself
+_MARK: Final = "ERTIS_BENCH_MARK"
+_PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
+_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
+Event = dict[str, Any]
+
+
+class Process:
+    """A process that tells what happens by lines of JSON on stdout; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    command : sequence of str
+    said : Path
+        Where what it says on stderr is appended.
+    mark : str
+        By which `survivors` finds it, and what it has started.
+
+    Attributes
+    ----------
+    events : list of dict
+        What it has told so far.
+    """
+
+    def __init__(self, command: Sequence[str], *, said: Path, mark: str = "") -> None:
+        paths = os.pathsep.join(filter(None, sys.path))
+        environment = os.environ | {"PYTHONPATH": paths, _MARK: mark or secrets.token_hex(4)}
+        self.events: list[Event] = []
+        self._said = said
+        self._news = threading.Condition()
+        with said.open("ab") as stderr:
+            self._process = subprocess.Popen(  # noqa: S603  this very package
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                text=True,
+                env=environment,
+                start_new_session=True,
+            )
+        self.pid = self._process.pid
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    def _listen(self) -> None:
+        for line in self._process.stdout or ():
+            try:
+                event = json.loads(line)
+            except ValueError:  # a process that is killed may have told half of it
+                continue
+            with self._news:
+                self.events.append(event)
+                self._news.notify_all()
+        with self._news:
+            self._news.notify_all()
+
+    def wait_for(self, name: str, *, timeout_s: float = _WAIT_S, since: int = 0) -> Event:
+        """Return the first event of a name, of those after the first ``since``.
+
+        Raises
+        ------
+        DataError
+            It did not come.
+        """
+        end_s = time.monotonic() + timeout_s
+        with self._news:
+            while True:
+                found = next((each for each in self.events[since:] if each.get("event") == name), None)
+                if found is not None:
+                    return found
+                ended = not self._listener.is_alive()
+                if ended or not self._news.wait(min(0.5, max(0.0, end_s - time.monotonic()))):
+                    if not ended and time.monotonic() < end_s:
+                        continue
+                    raise DataError(f"no event {name!r} came of {self._said.stem}; {self.last_words()}")
+
+    def last_words(self) -> str:
+        """Return how it is, and the last line that it has said."""
+        if not self._listener.is_alive():  # it has closed its stdout, and so will have ended in a moment
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(1.0)
+        code = self._process.poll()
+        said = self._said.read_text(errors="replace").strip().splitlines()
+        return f"it {'runs' if code is None else f'ended with {code}'}, saying {said[-1] if said else 'nothing'!r}"
+
+    def kill(self) -> None:
+        """Kill it, as by kill -9: whatever it has started is not touched."""
+        self._process.kill()
+        self.wait()
+
+    def signal(self, number: int) -> None:
+        """Send it a signal, unless it has ended."""
+        self._process.send_signal(number)
+
+    def stop(self, *, timeout_s: float = _WAIT_S) -> int:
+        """Ask it to end, and return its exit code."""
+        self.signal(signal.SIGTERM)
+        return self.wait(timeout_s=timeout_s)
+
+    def wait(self, *, timeout_s: float = _WAIT_S) -> int:
+        """Wait until it has ended by itself, and return its exit code.
+
+        Raises
+        ------
+        DataError
+            It does not end.
+        """
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired as error:
+            raise DataError(f"{self._said.stem} does not end within {timeout_s:g} s") from error
+        self._listener.join(timeout_s)
+        return code
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    @property
+    def memory_bytes(self) -> int:
+        """What it holds in memory; 0 where that cannot be told."""
+        try:
+            pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
+        except (OSError, IndexError):
+            return 0
+        return int(pages) * _PAGE_BYTES
+
+    @staticmethod
+    def cpu_s_of(pid: int) -> float:
+        """Return the processor time that a process has taken, without its children; 0 where that cannot be told."""
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+        self._listener.join(_WAIT_S)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+
+def central(command: str, folder: Path, *options: str, listen: str = "tcp://127.0.0.1:*", mark: str = "") -> Process:
+    """Start ``ertis record`` or ``ertis serve``, which says on ``central.txt`` in a folder what is wrong.
+
+    Parameters
+    ----------
+    command : {"record", "serve"}
+    folder : Path
+        Of the harness.
+    *options : str
+    listen : str
+    mark : str
+    """
+    line = [*ERTIS, command, "--listen", listen, *options, "--json", "--quiet"]
+    return Process(line, said=folder / "central.txt", mark=mark)
+
+
+def free_address() -> str:
+    """Return an address of this machine that nobody listens at, for nodes that are started again and again."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def ask(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    """Run an ``ertis`` command to its end."""
+    command = [*ERTIS, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600.0)  # noqa: S603
+
+
+def survivors(mark: str) -> dict[int, str]:
+    """Return the processes that have a mark, or were started by such, with what they run; Linux only."""
+    found = {}
+    wanted = f"{_MARK}={mark}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if wanted in (folder / "environ").read_bytes().split(b"\0"):
+                found[int(folder.name)] = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+        except OSError:  # it has ended meanwhile
+            continue
+    return {pid: line for pid, line in found.items() if line}  # without a command line: it has ended
+
+
+def until(holds: Callable[[], bool], *, timeout_s: float = _WAIT_S, every_s: float = 0.02) -> bool:
+    """Wait until something holds, and return whether it does."""
+    end_s = time.monotonic() + timeout_s
+    while not holds():
+        if time.monotonic() > end_s:
+            return False
+        time.sleep(every_s)
+    return True

@@ -1,0 +1,167 @@
+"""An application that looks at every image, and keeps a diary: ``python -m ertis_bench.network_receiver JOB``."""
+
+import json
+import os
+import signal
+import sys
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.network_diary import Key
+from ertis_bench.network_processes import Process
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.messages import Product
+from ertis_numba.network.subscriber import Subscriber
+
+__all__ = ["STEP", "Look", "Received", "read_received"]
+
+STEP: Final = 61
+"""Every so manieth value of an image is compared with the right one, in all of its rows and columns in turn."""
+
+_TOLERANCE: Final = 0.1  # of the largest value: each process chooses its own plan; other measurements are far beyond
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What a receiver is to do.
+
+    Attributes
+    ----------
+    address, diary : str
+    products : tuple of str
+    keys : (path of a secret, public key of the central node), optional
+    expected : str, optional
+        File of what images of some measurements should be, in turn, by `network_faults_processing.expected_of`.
+    waits_s : float
+        How long it does something else after each product.
+    credit : int
+    """
+
+    address: str
+    diary: str
+    products: tuple[Product, ...] = ("energyscape",)
+    keys: tuple[str, str] | None = None
+    expected: str | None = None
+    waits_s: float = 0.0
+    credit: int = 2
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
+        return replace(self, **changes)
+
+    def start(self, *, mark: str = "") -> Process:
+        """Start it; what it says on stderr stands beside its diary."""
+        command = [sys.executable, "-m", "ertis_bench.network_receiver", json.dumps(asdict(self))]
+        return Process(command, said=Path(self.diary).with_suffix(".txt"), mark=mark)
+
+
+@dataclass(slots=True)
+class Received:
+    """What a receiver has written.
+
+    Attributes
+    ----------
+    times_ms : dict of Key to float
+        From the arrival of each measurement at the sensor node to its image in the receiver's hands.
+    twice, disordered, wrong : int
+        Images that came again; whose number does not rise; that are not what they should be.
+    numbers : list of int
+        Of all products.
+    dropped : int
+        As the publisher told with the last one.
+    """
+
+    times_ms: dict[Key, float] = field(default_factory=dict)
+    twice: int = 0
+    disordered: int = 0
+    wrong: int = 0
+    numbers: list[int] = field(default_factory=list)
+    dropped: int = 0
+
+    @property
+    def untold(self) -> int:
+        """Numbers that were left out and not told to be dropped, or the other way round."""
+        return abs(max(self.numbers, default=-1) + 1 - len(self.numbers) - self.dropped)
+
+
+def read_received(path: Path) -> Received:
+    """Return what a receiver has written."""
+    found = Received()
+    for line in path.read_bytes().splitlines(keepends=True) if path.exists() else ():
+        if not line.endswith(b"\n"):
+            continue
+        sensor, epoch, sequence, number, dropped, time_ns, wrong = json.loads(line)
+        key = Key(sensor, epoch, sequence)
+        found.twice += key in found.times_ms
+        found.disordered += bool(found.numbers) and number <= found.numbers[-1]
+        found.wrong += wrong
+        found.times_ms[key] = time_ns / 1e6
+        found.numbers.append(number)
+        found.dropped = dropped
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    values: NDArray[np.float32]
+    shape: tuple[int, ...]
+
+    @classmethod
+    def load(cls, path: str) -> Self:
+        with np.load(path) as loaded:
+            return cls(loaded["values"], tuple(loaded["shape"].tolist()))
+
+    def spoilt(self, image: Energyscape) -> bool:
+        """Whether an image is not that of its measurement."""
+        if image.energy.shape != self.shape:
+            return True
+        number = image.stamp.sequence % len(self.values)
+        wanted = self.values[number]
+        came = image.energy.reshape(-1)[number % STEP :: STEP][: len(wanted)]
+        return bool(np.abs(came - wanted).max() > _TOLERANCE * np.abs(wanted).max())
+
+
+def main(look: Look) -> None:
+    """Receive until SIGTERM comes, or for ever."""
+    keys = None if look.keys is None else ClientKeys(pair=KeyPair.load(Path(look.keys[0])), server=look.keys[1])
+    expected = None if look.expected is None else _Expected.load(look.expected)
+    diary = os.open(look.diary, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
+    subscriber = Subscriber(
+        look.address,
+        products=look.products,
+        keys=keys,
+        credit=look.credit,
+        on_note=lambda text: _tell(event="note", text=text),
+    )
+    signal.signal(signal.SIGTERM, lambda *_: subscriber.close())
+    _tell(event="subscribed", pid=os.getpid())
+    with subscriber:
+        for item in subscriber:
+            now_ns = time.monotonic_ns()
+            if subscriber.latest is None or not isinstance(item, Energyscape | Measurement):
+                continue
+            header: Any = subscriber.latest.header
+            stamp = item.stamp
+            wrong = expected is not None and isinstance(item, Energyscape) and expected.spoilt(item)
+            line = [
+                stamp.sensor, stamp.epoch, stamp.sequence, header.number, header.dropped,
+                now_ns - header.monotonic_ns, wrong,
+            ]  # fmt: skip
+            os.write(diary, f"{json.dumps(line)}\n".encode())
+            if look.waits_s:
+                time.sleep(look.waits_s)
+    _tell(event="received", **asdict(subscriber.counts))
+
+
+def _tell(**event: object) -> None:
+    os.write(1, f"{json.dumps(event)}\n".encode())
+
+
+if __name__ == "__main__":
+    main(Look(**json.loads(sys.argv[1])))

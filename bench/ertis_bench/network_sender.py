@@ -1,0 +1,237 @@
+"""A sensor node that measures nothing, but keeps a diary: ``python -m ertis_bench.network_sender JOB``.
+
+It hands measurements to a `SensorNode` as a capture does, and writes in its diary what it hands over, what was taken,
+and what it is told to be settled.
+"""
+
+import json
+import os
+import secrets
+import signal
+import sys
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.network_diary import Diary, Key, Row
+from ertis_bench.network_processes import Process
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.journal import Entry
+from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.settings import Processing, Recording, Settings
+
+__all__ = ["SETTINGS", "SMALL", "Job", "words_of"]
+
+SETTINGS: Final = Settings()
+SMALL: Final = Settings(
+    recording=Recording(n_samples=32_768), processing=Processing(directions="2d:9", range_m=(0.3, 1.0))
+)
+"""Measurements of 131 kB, from which an image can be made in no time."""
+
+_SYNC_OF_FIRST: Final = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """What a sender is to do.
+
+    Attributes
+    ----------
+    address, diary : str
+    sensors : tuple of str
+    rate_hz : float
+        Of each sensor; all of them measure at the same time.
+    count : int, optional
+        Measurements of each sensor; until it is ended by default.
+    seed : int
+        Of the words.
+    small : bool
+        Measurements of `SMALL` rather than of `SETTINGS`.
+    spool : str, optional
+    ring_bytes, spool_bytes : int, optional
+    keys : (path of a secret, public key of the central node), optional
+    patience_s : float
+        How long it waits at its end until all is settled.
+    words : str, optional
+        File of the words of some measurements, which are sent in turn; noise that is never the same by default.
+    first_pulse, begins_ns : int, optional
+        SYNC count and timestamp of the first measurement.
+    lost_pulse, double_pulse : int, optional
+        A pulse that the sensors do not see, so that they measure nothing and count one too few from then on; one that
+        they count twice, so that a number is left out.
+    clock_step : (number, seconds), optional
+        From which pulse on the clock is wrong, and by how much.
+    start_s : float, optional
+        When to begin, by `time.monotonic`.
+    """
+
+    address: str
+    diary: str
+    sensors: tuple[str, ...] = ("front",)
+    rate_hz: float = 50.0
+    count: int | None = None
+    seed: int = 1
+    small: bool = True
+    spool: str | None = None
+    ring_bytes: int | None = None
+    spool_bytes: int | None = None
+    keys: tuple[str, str] | None = None
+    patience_s: float = 30.0
+    words: str | None = None
+    first_pulse: int = _SYNC_OF_FIRST
+    begins_ns: int | None = None
+    lost_pulse: int | None = None
+    double_pulse: int | None = None
+    clock_step: tuple[int, float] | None = None
+    start_s: float | None = None
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
+        return replace(self, **changes)
+
+    def sequence_of(self, pulse: int) -> int:
+        """Return the number of the measurement of a pulse."""
+        missed = self.lost_pulse is not None and pulse > self.lost_pulse
+        return pulse - missed + (self.double_pulse is not None and pulse >= self.double_pulse)
+
+    def command(self) -> list[str]:
+        """Return what runs it."""
+        return [sys.executable, "-m", "ertis_bench.network_sender", json.dumps(asdict(self))]
+
+    def start(self, *, mark: str = "") -> Process:
+        """Start it; what it says on stderr stands beside its diary."""
+        return Process(self.command(), said=Path(self.diary).with_suffix(".txt"), mark=mark)
+
+
+def words_of(base: NDArray[np.uint32], epoch: int, sequence: int) -> NDArray[np.uint32]:
+    """Return words that no other measurement has."""
+    words = base.copy()
+    words[:4] = sequence & 0xFFFFFFFF, sequence >> 32, epoch & 0xFFFFFFFF, epoch >> 32
+    return words
+
+
+@dataclass(slots=True)
+class _Sender:
+    job: Job
+    settings: Settings
+    diary: Diary
+    epoch: int = field(default_factory=lambda: secrets.randbits(62))
+    stopped: bool = False
+    seen_dropped: set[Key] = field(default_factory=set)
+    told: Counter[str] = field(default_factory=Counter)
+
+    def settled(self, message: Any) -> None:
+        """Note what the node tells to be settled."""
+        now_ns = time.monotonic_ns()
+        self.diary.settled(message.sensor, message.epoch, message.settled, message.status, now_ns)
+        for sequence, reason in message.dropped:
+            self.diary.dropped(message.sensor, message.epoch, sequence, reason)
+            self.told[reason] += 1
+
+    def note(self, *texts: str) -> None:
+        """Tell what the node tells."""
+        _tell(event="note", text=": ".join(texts))
+
+    def run(self, node: SensorNode) -> int:
+        """Send, and return how many pulses that took."""
+        job = self.job
+        for sensor in job.sensors:
+            node.add_sensor(sensor, self.settings, firmware="bench")
+        _tell(event="begun", epoch=self.epoch, pid=os.getpid())
+        rng = np.random.default_rng(job.seed)
+        n_samples = self.settings.recording.n_samples
+        given = np.load(job.words) if job.words else None
+        bases = {sensor: rng.integers(0, 2**32, n_samples, dtype=np.uint32) for sensor in job.sensors}
+        start_s = time.monotonic() if job.start_s is None else job.start_s
+        start_ns = time.time_ns() if job.begins_ns is None else job.begins_ns
+        pulse = 0
+        while not self.stopped and pulse != job.count:
+            wait_s = start_s + pulse / job.rate_hz - time.monotonic()
+            if wait_s > 0:
+                time.sleep(min(wait_s, 0.05))
+                continue
+            if pulse == job.lost_pulse:
+                pulse += 1
+                continue
+            stamp = self._stamp(pulse, start_ns)
+            sequence = stamp.sequence
+            entries = [
+                self._entry(
+                    replace(stamp, sensor=sensor),
+                    words_of(bases[sensor], self.epoch, sequence) if given is None else given[sequence % len(given)],
+                )
+                for sensor in job.sensors
+            ]
+            for entry in node.append(entries):
+                self.diary.kept(_key(entry))
+            pulse += 1
+        return pulse
+
+    def _stamp(self, pulse: int, start_ns: int) -> Stamp:
+        job = self.job
+        sequence = job.sequence_of(pulse)
+        step_ns = 0
+        if job.clock_step is not None and pulse >= job.clock_step[0]:
+            step_ns = round(1e9 * job.clock_step[1])
+        return Stamp(
+            sequence=sequence,
+            sync_count=job.first_pulse + sequence,
+            epoch=self.epoch,
+            timestamp_ns=start_ns + round(1e9 * pulse / job.rate_hz) + step_ns,
+            timestamp_uncertainty_ns=100_000,
+        )
+
+    def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> Entry:
+        """Return a measurement, once it stands in the diary."""
+        measurement = Measurement(words, self.settings, stamp)
+        row, now_ns = Row.of(measurement), time.monotonic_ns()
+        entry = Entry(measurement, monotonic_ns=now_ns)
+        self.diary.offered(_key(entry), row, now_ns)
+        return entry
+
+
+def _key(entry: Entry) -> Key:
+    stamp = entry.measurement.stamp
+    return Key(stamp.sensor, stamp.epoch, stamp.sequence)
+
+
+def _tell(**event: object) -> None:
+    os.write(1, f"{json.dumps(event)}\n".encode())
+
+
+def _stop(sender: _Sender, _number: int, _frame: FrameType | None) -> None:
+    sender.stopped = True
+
+
+def main(job: Job) -> None:
+    """Send until the count is reached or SIGTERM comes, then wait until all is settled."""
+    options: dict[str, Any] = {
+        name: value for name in ("ring_bytes", "spool_bytes") if (value := getattr(job, name)) is not None
+    }
+    keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
+    sender = _Sender(job, SMALL if job.small else SETTINGS, Diary(Path(job.diary)))
+    signal.signal(signal.SIGTERM, partial(_stop, sender))
+    with SensorNode(
+        job.address,
+        keys=keys,
+        spool=None if job.spool is None else Path(job.spool),
+        on_settled=sender.settled,
+        on_note=sender.note,
+        **options,
+    ) as node:
+        sent = sender.run(node)
+        _tell(event="done", sent=sent)
+        flushed = node.flush(job.patience_s)
+        _tell(event="sent", sent=sent, flushed=flushed, dropped=dict(sender.told))
+
+
+if __name__ == "__main__":
+    main(Job(**json.loads(sys.argv[1])))

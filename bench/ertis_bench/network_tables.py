@@ -1,0 +1,179 @@
+"""The reports of `network_faults` and `network` as Markdown."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+
+__all__ = ["ROWS", "network", "network_faults"]
+
+_STORED: Final = "{stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong, {silent} unexplained"
+_NOT_HERE: Final = "not tried: only root may"
+
+_CONDITIONS: Final = (
+    "{duration_s:g} s each, CURVE on, loopback; sensor nodes, central node and application share the cores. "
+    "Measurements of 655 kB come of processes that are sensor nodes but for the sensor: words of noise, all sensors at "
+    "the same time. Every word that was stored was read again and compared; every image was compared with one that was "
+    "computed apart, at one place in 61. Times are from the whole measurement being at the sensor node to its ack, or "
+    "to its image being in the application's hands. Not included: the sensor itself, its USB, other hosts, and the "
+    "first seconds, in which pipelines are made."
+)
+ROWS: Final[dict[str, tuple[str, str, str]]] = {
+    "centrals": (
+        "kill -9 of the central node, mid-stream",
+        "0 acked lost, 0 twice",
+        "{kills:,} kills: {acked:,} acked, " + _STORED + ", {left_over} files left over",
+    ),
+    "nodes": (
+        "kill -9 of sensor nodes, mid-stream",
+        "0 acked lost, 0 twice; with a spool, 0 kept lost",
+        "{kills:,} kills: {promised:,} promised, " + _STORED,
+    ),
+    "captures": (
+        "kill -9 of `ertis capture --to --spool` and of the central node",
+        "0 kept lost, 0 twice",
+        "{kills:,} kills: {kept:,} kept, {stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong",
+    ),
+    "sealings": (
+        "kill -9 while sealing, {with central:,} times of the central node with it",
+        "0 broken files",
+        "{kills:,} kills: {broken} broken, " + _STORED,
+    ),
+    "workers": (
+        "kill -9 of a worker",
+        "0 lost beyond policy, ingest untouched",
+        (
+            "{kills:,} kills: {received:,} = {published:,} published + {dropped all} dropped; images: {untold} "
+            "unexplained, {wrong} wrong, {twice} twice; {lost} lost, acked within {slowest ack, ms:.0f} ms"
+        ),
+    ),
+    "disk_full": (
+        "disk full (20 MB), and freed again",
+        "no ack, state FAULT, resumes; 0 lost",
+        "{acked in fault} acked meanwhile, state {state}, “{said}”; then " + _STORED,
+    ),
+    "disk_fails": (
+        "disk that fails, and is mended",
+        "the same",
+        "{acked in fault} acked meanwhile, state {state}; then " + _STORED,
+    ),
+    "away": (
+        "central node away for {away_s:g} s",
+        "0 lost, 0 twice, memory flat",
+        _STORED + "; back in {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times as much as it "
+        "holds: {missing too long:,} told to be missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
+    ),
+    "stopped": (
+        "central node stands still for {away_s:g} s",
+        "the same",
+        _STORED + "; back in {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times as much as it "
+        "holds: {missing too long:,} told to be missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
+    ),
+    "meddled": (
+        "acks lost, repeated and reordered; {drops} connections dropped, {cuts} cables pulled out",
+        "0 lost, 0 twice",
+        "{faults:,} faults: " + _STORED,
+    ),
+    "hosts": (
+        "two hosts; 1 % of packets lost, 1 % twice, 2 % late; cable pulled out {cuts} times",
+        "0 lost, 0 twice",
+        _STORED + "; {packets:,} packets, back in {slowest back, s:.1f} s at most",
+    ),
+    "hostile": (
+        "{connections:,} hostile connections: garbage, huge frames, slow handshakes",
+        "real sensors miss nothing; memory + < 50 MB",
+        _STORED + "; slowest ack {slowest ack, ms:.0f} ms; memory + {memory grew, MB:.0f} MB",
+    ),
+    "keys": (
+        "no key, unknown key, wrong server key, wrong role, another's serial, key removed while connected",
+        "refused and counted, the last within 1 s",
+        "{tried} tried, let in: {let in all}; refused: {refused all}; last ack {removed, s:.2f} s after the removal; "
+        + _STORED,
+    ),
+    "fuzzed": (
+        "{inputs:,} malformed messages",
+        "refused, no crash",
+        "{answers:,} answers, {restarts} restarts, memory + {memory grew, MB:.0f} MB; of the real sensor " + _STORED,
+    ),
+    "overload": (
+        "overload 2×, {capacity per s:.0f} images/s being possible",
+        "received = published + dropped; latency bounded",
+        (
+            "{received:,} = {published:,} + {dropped all}; p50 {p50, ms:.0f} ms, p99 {p99, ms:.0f} ms, slowest "
+            "{slowest, ms:.0f} ms"
+        ),
+    ),
+    "subscribers": (
+        "a slow application and one that stands still",
+        "p99 of others + < 10 %",
+        "p99 {p99 alone, ms:.1f} ms alone, {p99 beside, ms:.1f} ms beside ({grew, %:+.1f} %); {untold} unexplained",
+    ),
+    "groups": (
+        "lost and double SYNC, clock step of an hour",
+        "that group flagged, others aligned by SYNC count",
+        (
+            "{complete:,} of {pulses:,} groups complete, {mixed} mixed; {pulse flags} flagged for a pulse; "
+            "{clock flags after} of {complete after} for the clock after its step, {clock flags before} before"
+        ),
+    ),
+}
+
+
+def network_faults(report: dict[str, Any]) -> str:
+    """Return what was tried and what became of it, with the seed that tries it again."""
+    rows = [_row(texts, report[name]) for name, texts in ROWS.items() if name in report]
+    options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
+    made = " ".join(["ertis bench network-faults", *options, f"--seed {report['seed']}"])
+    return f"{table(('fault', 'wanted', 'found'), rows, numbers=False)}\n\nBy `{made}`. {sentence(report['machine'])}"
+
+
+def _row(texts: tuple[str, str, str], found: Mapping[str, Any] | None) -> tuple[str, str, str]:
+    tried, wanted, became = texts
+    if found is None:
+        return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
+    values = dict(found)
+    values["faults"] = sum(found.get("meddled", {}).values())
+    for name in ("dropped", "refused", "let in"):
+        values[f"{name} all"] = _all(found.get(name))
+    return tried.format(**values), wanted, became.format(**values)
+
+
+def _all(found: Any) -> str:
+    """Return counts by reason, or names, as a list in words."""
+    if isinstance(found, Mapping):
+        return ", ".join(f"{count:,} {reason}" for reason, count in sorted(found.items())) or "0"
+    return ", ".join(found or ()) or "nobody"
+
+
+def network(report: dict[str, Any]) -> str:
+    """Return what a central node does on this machine, beside what it ought to."""
+    rows = [(row["what"], row["goal"], row["found"]) for row in map(_figure, report["rows"])]
+    return "\n\n".join(
+        [
+            table(("", "goal", "measured"), rows, numbers=False),
+            f"Measured on {sentence(report['machine'])}",
+            _CONDITIONS.format(**report),
+        ]
+    )
+
+
+def _figure(row: dict[str, Any]) -> dict[str, str]:
+    cpu = "; ".join(f"{name} {share:.0f} %" for name, share in row["cpu_percent"].items())
+    if row["part"] == "storage":
+        what = f"storage, {row['sensors']} sensors × {row['rate_hz']:g} Hz ({row['megabytes_per_s']:.0f} MB/s)"
+        goal = "0 lost; ack p99 < 100 ms"
+        found = (
+            f"{row['stored']:,} of {row['offered']:,} stored, {row['lost']} lost, {row['missing']} told to be missing, "
+            f"{row['wrong']} wrong, {row['twice']} twice; ack p50 {row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, "
+            f"slowest {row['slowest_ms']:.0f} ms; {row['rate_reached_hz']:.1f} Hz reached"
+        )
+    else:
+        what = f"{row['part']}, {row['directions']} directions, {row['sensors']} × {row['rate_hz']:g} Hz"
+        goal = row["goal"]
+        found = (
+            f"{row['received']:,} = {row['published']:,} published + {_all(row['dropped'])} dropped; "
+            f"{row['images']:,} images here, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
+            f"{row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms"
+        )
+    return {"what": what, "goal": goal, "found": f"{found}. Of a core: {cpu}"}

@@ -1,0 +1,106 @@
+"""What is told while a central node runs."""
+
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+    from typing import Self
+
+    from ertis_numba.network.status import Status
+
+__all__ = ["CentralWatch"]
+
+_REFRESH_S = 0.5
+_EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
+
+
+class CentralWatch:
+    """Events as lines of JSON on stdout and of a log on stderr; on a terminal also a line that is drawn again and again.
+
+    Parameters
+    ----------
+    quiet, as_json : bool
+
+    Attributes
+    ----------
+    recordings : list of str
+        That were made.
+    """
+
+    def __init__(self, *, quiet: bool, as_json: bool) -> None:
+        from ertis_numba.network.log import logger, show
+
+        show(level="CRITICAL" if quiet else "INFO")
+        self._log = logger("central_node")
+        self._quiet, self._as_json = quiet, as_json
+        self._line = sys.stderr.isatty() and not quiet
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.recordings: list[str] = []
+
+    def event(self, event: dict[str, Any]) -> None:
+        """Tell of an event of the central node."""
+        if event["event"] == "sealed" and event["recording"] is not None:
+            self.recordings.append(event["recording"])
+        if self._as_json:
+            options.print_json(event)
+        if self._quiet:
+            return
+        if self._line:
+            click.echo("\r\x1b[K", err=True, nl=False)
+        fields = {name: value for name, value in event.items() if name != "event" and value != ""}
+        (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
+
+    def stored(self, sensor: str, epoch: int, sequence: int, crc32: int) -> None:
+        """Tell of a measurement that is durable."""
+        options.print_json({"event": "stored", "sensor": sensor, "epoch": epoch, "sequence": sequence, "crc32": crc32})
+
+    def shows(self, status: "Callable[[], Status]") -> "Self":
+        """Draw a line of what is going on, on a terminal, until the ``with`` block ends."""
+        if self._line:
+            self._thread = threading.Thread(target=self._draw, args=(status,), daemon=True)
+        return self
+
+    def __enter__(self) -> "Self":
+        if self._thread is not None:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: "type[BaseException] | None", error: "BaseException | None", trace: "TracebackType | None"
+    ) -> None:
+        if self._thread is not None:
+            self._ended.set()
+            self._thread.join()
+            click.echo("\r\x1b[K", err=True, nl=False)
+
+    def _draw(self, status: "Callable[[], Status]") -> None:
+        while not self._ended.wait(_REFRESH_S):
+            click.echo(f"\r\x1b[K{_progress(status())}", err=True, nl=False)
+
+
+def _progress(status: "Status") -> str:
+    """Return what is going on, in a line."""
+    sensors = status.sensors.values()
+    parts = [
+        f"{sum(each.connected for each in sensors)} sensors",
+        " ".join(f"{each.rate_hz:.1f}" for each in sensors if each.connected)[:40] + " Hz",
+    ]
+    if status.archive is not None:
+        parts.append(f"{sum(each.stored for each in sensors)} stored")
+        parts.append(f"ack p99 {status.archive.ack.p99_ms:.0f} ms")
+        parts.append(f"{status.archive.room_bytes / 1e9:.1f} GB left")
+    if status.processing is not None:
+        parts.append(f"{sum(each.published for each in sensors)} images")
+        parts.append(f"{sum(sum(each.dropped.values()) for each in sensors)} dropped")
+    if status.state == "fault":
+        parts.append(f"FAULT: {status.fault}")
+    return f"{time.strftime('%H:%M:%S')}   {'   '.join(parts)}"[:160]

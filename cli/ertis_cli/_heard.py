@@ -1,0 +1,162 @@
+"""What is told of what a central node publishes."""
+
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Energyscape, PointCloud
+    from ertis_numba.network.products import Arrival
+    from ertis_numba.network.subscriber import SubscriberCounts
+    from ertis_numba.stages.points import PointExtractor
+
+__all__ = ["Heard"]
+
+_HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
+_ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
+
+
+class Heard:
+    """Prints what came: a line for each product, or for each event in JSON."""
+
+    def __init__(self, *, as_json: bool, quiet: bool) -> None:
+        self._as_json, self._quiet = as_json, quiet
+        self._said = self._noted = False
+        self._extractors: dict[tuple[str, int], PointExtractor] = {}
+
+    def head(self) -> None:
+        """Print what the columns are."""
+        if not self._as_json:
+            click.echo(_HEAD)
+
+    def subscribed(self, address: str, sensors: tuple[str, ...], products: tuple[str, ...]) -> None:
+        """Tell, once, that a publisher answers."""
+        if self._as_json and not self._said:
+            options.print_json(
+                {
+                    "event": "subscribed",
+                    "address": address,
+                    "sensors": list(sensors) or None,
+                    "products": list(products),
+                }
+            )
+        self._said = True
+
+    def note(self, text: str) -> None:
+        """Tell what happened to the connection, but for its beginning."""
+        was_quiet, self._noted = not self._noted and text == "connected", True
+        if was_quiet:
+            return
+        if self._as_json:
+            options.print_json({"event": "note", "text": text})
+        options.say(text, quiet=self._quiet)
+
+    def product(self, arrival: "Arrival", counts: "SubscriberCounts") -> None:
+        """Tell of a product."""
+        about, text = self._about(arrival)
+        header = arrival.header
+        age_s, made_in_s = arrival.age_s, arrival.made_in_s
+        if self._as_json:
+            stamp = {
+                name: getattr(header, name)
+                for name in ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "monotonic_ns")
+                if hasattr(header, name)
+            }
+            times = {"age_ms": age_s, "made_in_ms": made_in_s}
+            rounded = {name: None if value is None else round(1e3 * value, 3) for name, value in times.items()}
+            options.print_json(
+                {"event": about.pop("product"), "number": header.number, "dropped": counts.dropped}
+                | stamp
+                | rounded
+                | {"arrived_ns": arrival.arrived_ns}
+                | about
+            )
+            return
+        click.echo(
+            _ROW.format(
+                sensor=getattr(header, "sensor", "-"),
+                sequence=getattr(header, "sequence", header.number),
+                age=_told(age_s),
+                made_in=_told(made_in_s),
+                dropped=counts.dropped,
+                text=text,
+            )
+        )
+
+    def end(self, counts: "SubscriberCounts", target: Path | None, took_s: float) -> None:
+        """Tell what has come of it."""
+        if self._as_json:
+            options.print_json(
+                {
+                    "event": "listened",
+                    "received": counts.received,
+                    "dropped": counts.dropped,
+                    "missed": counts.missed,
+                    "reconnects": counts.reconnects,
+                    "output": None if target is None else str(target),
+                    "seconds": round(took_s, 3),
+                }
+            )
+        where = "" if target is None else f"{target}: "
+        again = f", {options.counted(counts.reconnects, 'reconnect')}" if counts.reconnects else ""
+        options.say(f"{where}{counts.received} received, {counts.dropped} dropped{again}", quiet=self._quiet)
+
+    def _about(self, arrival: "Arrival") -> tuple[dict[str, Any], str]:
+        """Return what a product is and says: for JSON, and as text."""
+        from ertis_numba.frames import Energyscape, Measurement, PointCloud
+        from ertis_numba.network.messages import Group
+
+        item = arrival.item
+        if isinstance(item, Energyscape):
+            return self._of_points("energyscape", self._extracted(item))
+        if isinstance(item, PointCloud):
+            return self._of_points("points", item)
+        if isinstance(item, Measurement):
+            crc32 = zlib.crc32(item.words.data)
+            return {"product": "raw", "crc32": crc32}, f"{item.words.nbytes} bytes, CRC-32 {crc32:08x}"
+        if isinstance(item, Group):
+            odd = "".join(f", {flag}" for flag in item.flags)
+            about = {"group": item.group, "sensors": item.sensors, "missing": item.missing, "flags": item.flags}
+            return {"product": "group", **about, "spread_ns": item.spread_ns}, f"{' '.join(item.sensors)}{odd}"
+        received = sum(each.received for each in item.sensors.values())
+        return (
+            {"product": "status", "state": item.state, "received": received},
+            f"{item.state}, {len(item.sensors)} sensors, {received} received",
+        )
+
+    def _extracted(self, image: "Energyscape") -> "PointCloud":
+        from ertis_numba.geometry import Grid
+        from ertis_numba.stages.points import PointExtractor
+
+        key = (image.stamp.sensor, id(image.azimuth_rad))  # all images of a description share their axes
+        if key not in self._extractors:
+            self._extractors = {kept: made for kept, made in self._extractors.items() if kept[0] != key[0]}
+            self._extractors[key] = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad))
+        return self._extractors[key](image)
+
+    @staticmethod
+    def _of_points(product: str, cloud: "PointCloud") -> tuple[dict[str, Any], str]:
+        """Return how many points there are, and the nearest."""
+        import numpy as np
+
+        about: dict[str, Any] = {"product": product, "n_points": len(cloud), "nearest": None}
+        if not len(cloud):
+            return about, "nothing near"
+        x, y, z = cloud.position_m[np.argmin(np.linalg.norm(cloud.position_m, axis=1))].tolist()
+        range_m = float(np.linalg.norm((x, y, z)))
+        azimuth_deg = float(np.degrees(np.arctan2(y, x)))
+        elevation_deg = float(np.degrees(np.arcsin(z / range_m)))
+        about["nearest"] = {
+            "azimuth_deg": round(azimuth_deg, 2),
+            "elevation_deg": round(elevation_deg, 2),
+            "range_m": round(range_m, 4),
+        }
+        return about, f"{range_m:.3f} m at {azimuth_deg:+.1f}°, {elevation_deg:+.1f}°"
+
+
+def _told(time_s: float | None) -> str:
+    return "-" if time_s is None else f"{1e3 * time_s:.1f} ms"

@@ -1,0 +1,74 @@
+"""Options of the commands that speak over the network."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from ertis_numba.network.keys import ClientKeys, ServerKeys
+
+__all__ = ["allow", "client_keys", "key", "server_key", "server_keys"]
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+key: Decorator = click.option(
+    "--key", metavar="FILE|NAME", help="Keys of this node, a .secret.toml from 'ertis keys new', or their name."
+)
+server_key: Decorator = click.option(
+    "--server-key",
+    metavar="FILE|NAME|KEY",
+    help="Public key of the central node; no other is spoken to.",
+)
+allow: Decorator = click.option(
+    "--allow",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="List of the keys that are let in; that of 'ertis keys allow' by default.",
+)
+
+
+def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
+    """Return what a central node needs, or None if no keys were given.
+
+    Raises
+    ------
+    SettingsError
+        They cannot be used.
+    """
+    from ertis_numba.network.keys import ALLOW_LIST, KeyPair, ServerKeys, default_folder
+
+    if key is None:
+        if allow is not None:
+            raise click.UsageError("--allow says who is let in and nobody has to show a key; give --key, too")
+        return None
+    return ServerKeys(KeyPair.load(_file(key, "secret")), allow or default_folder() / ALLOW_LIST)
+
+
+def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
+    """Return what a sensor or application node needs, or None if no keys were given.
+
+    Raises
+    ------
+    SettingsError
+        They cannot be used.
+    """
+    from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
+
+    if key is None and server_key is None:
+        return None
+    if key is None or server_key is None:
+        given, other = ("--server-key", "--key") if key is None else ("--key", "--server-key")
+        raise click.UsageError(f"{given} is given without {other}; give both, or none on this machine alone")
+    return ClientKeys(KeyPair.load(_file(key, "secret")), public_key(_file(server_key, "public"))[0])
+
+
+def _file(given: str, what: str) -> str:
+    """Return the file of a key that was given by its name."""
+    from ertis_numba.network.keys import default_folder
+
+    named = default_folder() / f"{given}.{what}.toml"
+    if Path(given).name == given and not Path(given).is_file() and named.is_file():
+        return str(named)
+    return given

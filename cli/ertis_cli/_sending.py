@@ -1,0 +1,118 @@
+"""What a capture does that sends measurements to a central node, and what is told of it."""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+from ertis_cli._watch import Watch
+
+if TYPE_CHECKING:
+    from ertis_numba.capture import Session
+    from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.network.keys import ClientKeys
+    from ertis_numba.network.sensor_node import SensorNode, Settled
+
+__all__ = ["Sending"]
+
+_COUNTS = ("refused", "overwritten", "damaged", "unsettled")
+
+
+class _Watch(Watch):
+    """Tells what the central node has, too."""
+
+    word = "kept"
+    node: "SensorNode | None" = None
+
+    def settled(self, settled: "Settled") -> None:
+        """Tell of what the central node has."""
+        if self._as_json:
+            event = {"event": "settled", "sensor": settled.sensor, "epoch": settled.epoch, "settled": settled.settled}
+            self._print(event | {"status": settled.status, "dropped": [list(each) for each in settled.dropped]})
+
+    def linked(self, text: str) -> None:
+        """Tell what happened between this node and the central node."""
+        if self._as_json:
+            self._print({"event": "note", "text": text})
+        self._say(text)
+
+    def _more(self) -> Iterator[str]:
+        if self.node is not None:
+            yield f"{self.node.unsettled} to be settled"
+            yield f"central node: {self.node.central}"
+
+
+class Sending:
+    """A capture whose measurements go to a central node.
+
+    Attributes
+    ----------
+    address : str
+    watch : Watch
+    report : dict
+        What became of them, for programs, once `run` has returned.
+    """
+
+    def __init__(self, address: str, spool: Path | None, *, quiet: bool, as_json: bool) -> None:
+        self.address, self._spool, self._quiet = address, spool, quiet
+        self.watch = _Watch(quiet=quiet, as_json=as_json)
+        self.report: dict[str, Any] = {}
+
+    def node(self, keys: "ClientKeys | None") -> "SensorNode":
+        """Return the sensor node, which is to be opened before `run` and closed after it."""
+        from ertis_numba.network.sensor_node import SensorNode
+
+        self._node = self.watch.node = SensorNode(
+            self.address, keys=keys, spool=self._spool, on_settled=self.watch.settled, on_note=self.watch.linked
+        )
+        return self._node
+
+    def run(self, session: "Session", checks: "dict[str, BitCheck]", *, patience_s: float) -> Exception | None:
+        """Capture, wait until the central node has everything, and return what went wrong."""
+        from ertis_numba.errors import NetworkError
+
+        where = (
+            f"measurements that the central node does not have yet are safe in {self._spool}; the next capture with "
+            "--spool sends them"
+            if self._spool
+            else "measurements that the central node does not have yet are lost"
+        )
+        failure = self.watch.run(session, self._node, checks, where=where)
+        try:
+            self._node.flush(patience_s)
+        except (KeyboardInterrupt, SystemExit):
+            click.echo(where, err=True)
+            raise
+        lost = self._account()
+        if lost and failure is not None:
+            click.echo(f"ertis: error: {lost}", err=True)
+        return failure or (NetworkError(lost) if lost else None)
+
+    def _account(self) -> str:
+        """Tell what became of all measurements, and return an error if some are lost."""
+        counts = self._node.counts.values()
+        total = {
+            name: sum(getattr(each, name) for each in counts) for name in (*_COUNTS, "accepted", "stored", "taken")
+        }
+        dropped: Counter[str] = sum((each.dropped for each in counts), Counter())
+        self.report = {
+            "kept": total["accepted"],
+            "central": {"stored": total["stored"], "accepted": total["taken"], "dropped": dict(dropped)},
+            **{name: total[name] for name in _COUNTS},
+            "reconnects": self._node.reconnects,
+        }
+        for reason, count in dropped.items():
+            self._say(f"{options.counted(count, 'measurement')} dropped by the central node, {reason}")
+        waiting = options.counted(total["unsettled"], "measurement")
+        if self._spool and total["unsettled"]:
+            self._say(f"{waiting} wait in {self._spool}; the next capture with --spool sends what is there")
+        lost = sum(total[name] for name in _COUNTS) - (total["unsettled"] if self._spool else 0)
+        remedy = "give the spool a larger disk" if self._spool else "give --spool DIR, which keeps them on the disk"
+        did_not = f"{options.counted(lost, 'measurement')} did not reach the central node at {self.address}; {remedy}"
+        return did_not if lost else ""
+
+    def _say(self, text: str) -> None:
+        options.say(text, quiet=self._quiet)

@@ -1,0 +1,137 @@
+"""``ertis keys``: who is who, and who may do what."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.network.keys import AllowList, Permission
+
+__all__ = ["keys"]
+
+_FILE = click.Path(path_type=Path)
+_list_file = click.option(
+    "--list", "listed", type=_FILE, metavar="FILE", help="The list; allow.toml beside the keys by default."
+)
+
+
+@click.group()
+def keys() -> None:
+    """Make keys, and say who may do what.
+
+    Each machine makes keys of its own by 'ertis keys new'. Its public file goes to the central node, where 'ertis keys
+    allow' lists it, and the public file of the central node goes to each machine (--server-key).
+
+    \b
+    central$  ertis keys new central
+    sensor$   ertis keys new robot
+    central$  ertis keys allow robot.public.toml --role sensor --serial front
+    central$  ertis record --listen tcp://0.0.0.0:5601 -o DIR --key central
+    sensor$   ertis capture --port front --to tcp://central:5601 --key robot --server-key central.public.toml
+    """
+
+
+@keys.command()
+@click.argument("name")
+@click.option("--dir", "folder", type=_FILE, metavar="DIR", help="Folder for them; that of this user by default.")
+@options.as_json
+def new(*, name: str, folder: Path | None, as_json: bool) -> None:
+    """Make keys: NAME.secret.toml, which stays where it is, and NAME.public.toml for others."""
+    from ertis_numba.network.keys import KeyPair, default_folder
+
+    pair = KeyPair.new(name)
+    secret, public = pair.save(folder or default_folder())
+    if as_json:
+        options.print_json(
+            {"name": name, "public": pair.public, "secret_file": str(secret), "public_file": str(public)}
+        )
+        return
+    click.echo(f"{secret}: keep it, and nobody else may read it")
+    click.echo(f"{public}: for the other side, {pair.public}")
+
+
+@keys.command()
+@click.argument("key", metavar="PUBLIC_FILE|KEY")
+@click.option(
+    "--role",
+    required=True,
+    type=click.Choice(["sensor", "application", "admin"]),
+    help="A sensor sends, an application receives, an admin may do both.",
+)
+@click.option("--serial", "serials", multiple=True, metavar="S", help="Of a sensor that it may send for; repeatable.")
+@click.option("--name", metavar="NAME", help="In the list; that of the file by default.")
+@_list_file
+@options.as_json
+def allow(
+    *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
+) -> None:
+    """Let a key in, from the next second on; what it was allowed before is replaced."""
+    from ertis_numba.network.keys import ROLES, Permission, public_key
+
+    public, named = public_key(key)
+    if not (name or named):
+        raise click.UsageError("a key that is not given by its file has no name; give --name")
+    (chosen,) = (known for known in ROLES if known == role)
+    permission = Permission(name=name or named, public=public, role=chosen, serials=serials)
+    path = _path(listed)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    allowed = _load(path).allow(permission)
+    allowed.save(path)
+    _print(path, [permission], as_json=as_json)
+
+
+@keys.command()
+@click.argument("who", metavar="NAME|KEY")
+@_list_file
+@options.as_json
+def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
+    """Let a key in no more, from the next second on, connected or not."""
+    path = _path(listed)
+    before = _load(path)
+    after = before.remove(who)
+    after.save(path)
+    removed = [permission for permission in before.keys if permission not in after.keys]
+    if as_json:
+        options.print_json({"list": str(path), "removed": [_report(permission) for permission in removed]})
+        return
+    click.echo(f"{path}: without {', '.join(permission.name for permission in removed)}")
+
+
+@keys.command("list")
+@_list_file
+@options.as_json
+def list_(*, listed: Path | None, as_json: bool) -> None:
+    """Show who is let in, and as what."""
+    path = _path(listed)
+    _print(path, list(_load(path).keys), as_json=as_json)
+
+
+def _path(listed: Path | None) -> Path:
+    from ertis_numba.network.keys import ALLOW_LIST, default_folder
+
+    return listed or default_folder() / ALLOW_LIST
+
+
+def _load(path: Path) -> "AllowList":
+    """Return a list, which is empty before it is made."""
+    from ertis_numba.network.keys import AllowList
+
+    return AllowList.load(path) if path.exists() else AllowList()
+
+
+def _report(permission: "Permission") -> dict[str, Any]:
+    return {name: getattr(permission, name) for name in ("name", "public", "role", "serials")}
+
+
+def _print(path: Path, permissions: "list[Permission]", *, as_json: bool) -> None:
+    if as_json:
+        options.print_json({"list": str(path), "keys": [_report(permission) for permission in permissions]})
+        return
+    if not permissions:
+        click.echo(f"{path}: nobody is let in; list keys by 'ertis keys allow'", err=True)
+    widest = max((len(permission.name) for permission in permissions), default=0)
+    for each in permissions:
+        click.echo(f"{each.name:{widest}}  {each.role:11}  {each.public}  {' '.join(each.serials)}".rstrip())

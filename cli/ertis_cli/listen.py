@@ -1,0 +1,115 @@
+"""``ertis listen``: what a central node publishes, shown or saved."""
+
+import importlib
+import math
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import _network, options
+from ertis_cli._heard import Heard
+from ertis_cli._saving import PRODUCTS as FILED
+from ertis_cli._saving import saving
+from ertis_cli._watch import stopped_by_signals
+
+if TYPE_CHECKING:
+    from ertis_cli._saving import Write
+    from ertis_numba.network.products import Arrival
+
+__all__ = ["listen"]
+
+_PRODUCTS = ("energyscape", "points", "raw", "group", "status")
+_LOOK_S = 0.1
+
+
+@click.command()
+@click.argument("address", metavar="ADDRESS")
+@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Of these only; of all by default.")
+@click.option(
+    "--product",
+    "products",
+    multiple=True,
+    type=click.Choice(_PRODUCTS),
+    help="What to receive; energyscape by default.",
+)
+@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="End after so many.")
+@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option(
+    "--save", "target", type=click.Path(path_type=Path), metavar="FILE.h5", help="Write energyscapes, or a recording."
+)
+@_network.key
+@_network.server_key
+@options.force
+@options.quiet
+@options.as_json
+def listen(
+    *,
+    address: str,
+    sensors: tuple[str, ...],
+    products: tuple[Any, ...],
+    n: int | None,
+    duration: float | None,
+    target: Path | None,
+    key: str | None,
+    server_key: str | None,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Show or save what a central node publishes at ADDRESS.
+
+    There is a line for each product, with its nearest reflector, how long ago the sound was emitted and how long the
+    central node had it. What this is too slow for is dropped there and counted. With --save, the energyscapes, or
+    with --product raw the measurements, become a file that appears complete at the end. A central node that goes
+    away is waited for. With --json there is a line for each event, the first when it is connected.
+    """
+    products = tuple(dict.fromkeys(products)) or ("energyscape",)
+    if target is not None and (len(products) > 1 or products[0] not in FILED):
+        raise click.UsageError(f"--save makes a file of one product; give --product {' or '.join(FILED)} alone")
+    from ertis_numba.network.subscriber import Subscriber
+
+    if "energyscape" in products:  # takes half a second, in which the first images would be dropped
+        importlib.import_module("ertis_numba.stages.points")
+    keys = _network.client_keys(key, server_key)
+    notes: deque[str] = deque()
+    heard = Heard(as_json=as_json, quiet=quiet)
+    begun_s, failure = time.monotonic(), None
+    end_s = math.inf if duration is None else begun_s + duration
+    with (
+        stopped_by_signals() as signals,
+        saving(target, products[0], overwrite=force) as save,
+        Subscriber(address, sensors=sensors or None, products=products, keys=keys, on_note=notes.append) as subscriber,
+    ):
+        signals.obey(subscriber.close)
+        heard.head()
+        while subscriber.counts.received != n and not signals.came and time.monotonic() < end_s and failure is None:
+            item = subscriber.receive(_LOOK_S)
+            if subscriber.connected:
+                heard.subscribed(address, sensors, products)
+            while notes:
+                heard.note(notes.popleft())
+            if item is not None and subscriber.latest is not None:
+                failure = _saved(save, subscriber.latest)
+                heard.product(subscriber.latest, subscriber.counts)
+    heard.end(subscriber.counts, target, time.monotonic() - begun_s)
+    if failure is not None:
+        raise failure
+    if signals.came:
+        sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
+    if n is not None and subscriber.counts.received < n:
+        raise click.ClickException(f"{subscriber.counts.received} of {n} came in {duration:g} s; give it more time")
+
+
+def _saved(save: "Write", arrival: "Arrival") -> Exception | None:
+    """Save a product; return why it does not fit to those before, which are kept."""
+    from ertis_numba.errors import ArgumentError
+
+    try:
+        save(arrival)
+    except ArgumentError as error:
+        return error
+    return None

@@ -1,0 +1,162 @@
+"""``ertis serve``: the central node that makes images of what sensors send."""
+
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from ertis_cli import _network, options
+
+if TYPE_CHECKING:
+    from ertis_numba.network.status import Status
+
+__all__ = ["serve"]
+
+_FOLDER = click.Path(path_type=Path)
+
+
+@click.command()
+@click.option("--listen", metavar="ADDRESS", help="Where sensor nodes come; tcp://127.0.0.1:5601 by default.")
+@click.option("--publish", metavar="ADDRESS", help="Where applications come; tcp://127.0.0.1:5602 by default.")
+@click.option("--record", "folder", type=_FOLDER, metavar="DIR", help="Store measurements there as well.")
+@click.option("--workers", type=click.IntRange(1, 256), metavar="N", help="Processes; as many as cores by default.")
+@options.threads
+@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own by default.")
+@click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
+@click.option("--method", type=click.Choice(["fast", "paper"]), help="The sensor's own choice by default.")
+@click.option(
+    "--beamformer",
+    type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
+    help="How microphones are combined; the sensor's own choice by default.",
+)
+@click.option(
+    "--max-error",
+    "max_error_db",
+    type=options.ERROR_BUDGET,
+    metavar="DB|PRESET",
+    help="Error that images may have, as in -40, or draft, standard, fine, exact; the sensor's own by default.",
+)
+@options.device
+@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32", show_default=True)
+@click.option(
+    "--deadline", type=float, default=2.0, show_default=True, metavar="S", help="A worker that takes longer is killed."
+)
+@click.option("--quarantine", type=_FOLDER, metavar="DIR", help="Keep measurements there that two workers failed at.")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a dask.distributed cluster.")
+@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@_network.key
+@_network.allow
+@click.option("--metrics", metavar="HOST:PORT", help="Serve metrics for Prometheus there.")
+@click.option("--every", is_flag=True, help="With --json and --record: a line for each measurement, too.")
+@options.quiet
+@options.as_json
+def serve(
+    *,
+    listen: str | None,
+    publish: str | None,
+    folder: Path | None,
+    workers: int | None,
+    threads: int | None,
+    directions: str | None,
+    range_m: tuple[float, float] | None,
+    method: str | None,
+    beamformer: str | None,
+    max_error_db: float | None,
+    device: str,
+    dtype: Literal["float32", "float16"],
+    deadline: float,
+    quarantine: Path | None,
+    scheduler: str | None,
+    duration: float | None,
+    key: str | None,
+    allow: Path | None,
+    metrics: str | None,
+    every: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Be the central node that makes images of what sensors send.
+
+    Sensors send to it by 'ertis capture --to ADDRESS'; 'ertis listen ADDRESS' shows what it publishes. Where images
+    take longer than measurements to come, the oldest are dropped and counted. With --record, what is acknowledged is
+    durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
+    """
+    from ertis_cli._central_watch import CentralWatch
+    from ertis_cli._watch import stopped_by_signals
+    from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH
+    from ertis_numba.network.central_node import Archive, CentralNode
+    from ertis_numba.network.processing import Options, Processing
+
+    changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
+    keys = _network.server_keys(key, allow)
+    processing = Processing(
+        Options(
+            publish=publish or DEFAULT_PUBLISH,
+            keys=keys,
+            processing={name: value for name, value in changes.items() if value is not None},
+            max_error_db=max_error_db,
+            device=device,
+            workers=workers,
+            threads=threads,
+            deadline_s=deadline,
+            dtype=dtype,
+            quarantine=quarantine,
+            cluster=scheduler,
+        )
+    )
+    watch = CentralWatch(quiet=quiet, as_json=as_json)
+
+    def on_event(event: dict[str, Any]) -> None:
+        watch.event(event | ({"publish": processing.address} if event["event"] == "listening" else {}))
+
+    node = CentralNode(
+        listen or DEFAULT_LISTEN,
+        keys=keys,
+        archive=None if folder is None else Archive(folder),
+        processing=processing,
+        on_event=on_event,
+        on_stored=watch.stored if as_json and every else None,
+    )
+    stop = threading.Event()
+    with stopped_by_signals() as signals, node, ExitStack() as stack:
+        if metrics is not None:
+            from ertis_numba.network.metrics import Metrics
+
+            stack.enter_context(Metrics(metrics, lambda: node.latest))
+        signals.obey(stop.set)
+        with watch.shows(lambda: node.latest):
+            node.run(stop, duration)
+        stack.close()
+    _report(node.status(), watch.recordings, quiet=quiet, as_json=as_json)
+
+
+def _report(status: "Status", recordings: list[str], *, quiet: bool, as_json: bool) -> None:
+    """Tell what has come of it."""
+    import msgspec
+
+    sensors, archive = status.sensors, status.archive
+    if as_json:
+        report = msgspec.to_builtins(
+            {
+                "recordings": recordings,
+                "unsealed": 0 if archive is None else archive.sealing,
+                "refused": status.refused,
+                "seconds": status.uptime_s,
+                "ack": None if archive is None else archive.ack,
+                "processing": status.processing,
+                "sensors": sensors,
+            }
+        )
+        options.print_json({"event": "served"} | report)
+    for name, each in sensors.items():
+        dropped = "".join(f", {count} dropped ({reason})" for reason, count in each.dropped.items())
+        missing = "".join(f", {count} missing ({reason})" for reason, count in each.missing.items())
+        stored = "" if archive is None else f", {each.stored} stored"
+        told = f"{each.received} received, {each.published} published{dropped}{missing}{stored}"
+        options.say(f"{name}: {told}", quiet=quiet)
+    if archive is not None and archive.sealing:
+        left = options.counted(archive.sealing, "journal")
+        click.echo(f"{left} not sealed; seal by 'ertis recover {archive.folder}'", err=True)
+        click.get_current_context().exit(1)

@@ -1,0 +1,167 @@
+"""``ertis status``: how a central node is."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import _network, options
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+    from ertis_numba.network.status import Percentiles, Status
+
+__all__ = ["status"]
+
+_REFRESH_S = 1.0
+
+
+@click.command()
+@click.argument("address", metavar="ADDRESS")
+@_network.key
+@_network.server_key
+@click.option("--once", is_flag=True, help="Show it once, on a terminal too.")
+@click.option("--watch", is_flag=True, help="Show it again and again, not only on a terminal; with --json as lines.")
+@click.option("--patience", type=float, default=3.0, show_default=True, metavar="S", help="Wait so long for an answer.")
+@options.as_json
+def status(
+    *,
+    address: str,
+    key: str | None,
+    server_key: str | None,
+    once: bool,
+    watch: bool,
+    patience: float,
+    as_json: bool,
+) -> None:
+    """Show how the central node at ADDRESS is, live on a terminal.
+
+    ADDRESS is that where sensors send to it, or that where it publishes. With keys, those of an application or an
+    admin are needed.
+    """
+    from ertis_numba import checks
+    from ertis_numba.network.asking import Asking
+
+    if once and watch:
+        raise click.UsageError("--once and --watch exclude each other; give one of them")
+    checks.positive("--patience", patience)
+    with Asking(address, keys=_network.client_keys(key, server_key)) as node:
+        if as_json or once or not (watch or sys.stdout.isatty()):
+            _print(node.ask(patience), as_json=as_json)
+            while watch:
+                time.sleep(_REFRESH_S)
+                _print(node.ask(patience), as_json=as_json)
+            return
+        with _live() as show:
+            while True:
+                show(_drawn(node.ask(patience)))
+                time.sleep(_REFRESH_S)
+
+
+def _print(now: "Status", *, as_json: bool) -> None:
+    from rich.console import Console
+
+    if as_json:
+        import msgspec
+
+        options.print_json(msgspec.to_builtins(now))
+        return
+    # A pipe is as wide as a table needs.
+    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(_drawn(now))
+
+
+@contextmanager
+def _live() -> "Iterator[Any]":
+    from rich.live import Live
+
+    with Live(auto_refresh=False, screen=False) as live:
+        yield lambda drawn: live.update(drawn, refresh=True)
+
+
+def _drawn(now: "Status") -> "Group":
+    """Return the tables."""
+    from rich.console import Group
+    from rich.text import Text
+
+    keys = "with keys" if now.keys else "without keys"
+    head = (
+        f"{now.address} on {now.host}, {now.state}, up {_seconds(now.uptime_s)}, "
+        f"{options.counted(now.peers, 'sensor node')}, {keys}, {now.memory_bytes / 1e6:.0f} MB"
+    )
+    lines = [Text(head)]
+    if now.fault:
+        lines.append(Text(f"fault: {now.fault}", style="bold red"))
+    if now.refused:
+        lines.append(Text(f"refused: {_by_reason(now.refused)}"))
+    return Group(*lines, _sensors(now), *(Text(line) for line in _below(now)))
+
+
+def _sensors(now: "Status") -> Any:
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    table = Table(box=SIMPLE, pad_edge=False)
+    table.add_column("sensor")
+    processing, archive = now.processing is not None, now.archive is not None
+    headings = ["Hz", "received", *(["stored"] if archive else []), *(["published"] if processing else []), "queue"]
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    table.add_column("missing")
+    if processing:
+        table.add_column("dropped")
+        table.add_column("image ms p50/p99", justify="right")
+    for name, each in now.sensors.items():
+        row = [f"{each.rate_hz:.1f}", str(each.received)]
+        row += [str(each.stored)] if archive else []
+        row += [str(each.published)] if processing else []
+        row += [str(each.queue), _by_reason(each.missing)]
+        row += [_by_reason(each.dropped), _times(each.image_latency)] if processing else []
+        table.add_row(name if each.connected else f"{name} (away)", *row)
+    return table
+
+
+def _below(now: "Status") -> Iterator[str]:
+    """Yield lines about storage and processing."""
+    archive, processing = now.archive, now.processing
+    if archive is not None:
+        failed = f", {archive.sealing_failed} not sealed" if archive.sealing_failed else ""
+        yield (
+            f"archive {archive.folder}: {archive.recording or 'nothing'} is written, journal "
+            f"{archive.journal_bytes / 1e6:.0f} MB, {archive.sealed} sealed, {archive.sealing} to seal{failed}"
+        )
+        yield (
+            f"disk: {archive.free_bytes / 1e9:.1f} GB free, room for {archive.room_bytes / 1e9:.1f} GB; "
+            f"commit {_times(archive.commit)} ms, ack {_times(archive.ack)} ms (p50/p99)"
+        )
+    if processing is not None:
+        busy = sum(worker.state == "busy" for worker in processing.workers)
+        yield (
+            f"workers: {len(processing.workers)}, {busy} busy, {_times(processing.process_time)} ms (p50/p99), "
+            f"{processing.respawned} respawned, {processing.retried} retried, {processing.quarantined} quarantined"
+        )
+        if processing.choice:
+            yield f"cores: {processing.choice}"
+        if processing.groups:
+            yield f"groups: {_by_reason(processing.groups)}"
+        yield f"published at {processing.address or 'no address'} to {len(processing.subscribers)}"
+        for each in processing.subscribers:
+            sensors = "all sensors" if each.sensors is None else " ".join(each.sensors)
+            yield f"  {each.name}: {' '.join(each.products)} of {sensors}, {each.sent} sent, {each.dropped} dropped"
+
+
+def _by_reason(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items()) or "0"
+
+
+def _times(times: "Percentiles") -> str:
+    return f"{times.p50_ms:.1f}/{times.p99_ms:.1f}"
+
+
+def _seconds(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"

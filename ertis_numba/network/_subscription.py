@@ -1,0 +1,319 @@
+"""The connection of an application to a publisher: what is asked for, what comes, and when to begin anew."""
+
+import socket as system
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import zmq
+
+from ertis_numba.errors import ErtisError, FormatVersionError, RefusedError
+from ertis_numba.network import sockets
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.messages import (
+    Bye,
+    Description,
+    Group,
+    Image,
+    Message,
+    Ping,
+    Points,
+    Pong,
+    Product,
+    Raw,
+    Refused,
+    Report,
+    Subscribe,
+    decode,
+    encode,
+)
+from ertis_numba.network.products import Arrival, Header, ProductReader
+
+__all__ = ["SubscriberCounts", "Subscription"]
+
+_EXPECTED: Final = (Description, Image, Points, Raw, Group, Report, Pong, Refused)
+_BEAT_S: Final = 1.0
+_DEAD_S: Final = 3.0
+_UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, of which word may come before anybody listens
+_AGAIN_S: Final = 0.5
+_MOST_AGAIN_S: Final = 5.0
+_REFUSALS: Final = 3  # before the first answer, after which it is no use to go on
+_AT_ONCE: Final = 64
+
+
+@dataclass(slots=True)
+class SubscriberCounts:
+    """What has come to an application.
+
+    Attributes
+    ----------
+    received : int
+        Products that the application has taken.
+    dropped : int
+        Those that were dropped for it because it was slow, as the publisher counts them.
+    missed : int
+        Numbers that never came; equal to ``dropped`` but for those that still wait.
+    reconnects : int
+    damaged : int
+        Messages that were not what they should be; each ends a connection.
+    """
+
+    received: int = 0
+    dropped: int = 0
+    missed: int = 0
+    reconnects: int = 0
+    damaged: int = 0
+
+
+@dataclass(slots=True)
+class _Connection:
+    """What counts from when a connection was made."""
+
+    number: int
+    begun_s: float
+    first_asked_s: float | None = None
+    asked_s: float | None = None
+    heard_s: float | None = None
+    taken: int = 0
+    received: int = 0
+    next_number: int = 0
+    reader: ProductReader = field(default_factory=ProductReader)
+
+
+class Subscription:
+    """Asks for products and reads them, in one thread; `taken` alone is called by another.
+
+    Parameters
+    ----------
+    address : str
+    sensors : tuple of str or None
+    products : tuple of str
+    keys : ClientKeys or None
+    on_note : callable
+    credit : int
+    counts : SubscriberCounts
+    deliver : callable
+        Gets each `Arrival`.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        sensors: tuple[str, ...] | None,
+        products: tuple[Product, ...],
+        keys: ClientKeys | None,
+        on_note: Callable[[str], None],
+        credit: int,
+        counts: SubscriberCounts,
+        deliver: Callable[[Arrival], None],
+    ) -> None:
+        self._address, self._keys, self._credit = address, keys, credit
+        self._sensors, self._products = sensors, products
+        self._note, self._counts, self._deliver = on_note, counts, deliver
+        self._context: zmq.Context[zmq.Socket[bytes]]
+        self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: sockets.Monitor | None = None
+        self._connection = _Connection(0, 0.0)
+        self._taken: deque[int] = deque()
+        self._ask = True
+        self._wait_until_s = 0.0
+        self._refusals: list[str] = []
+        self._was_connected = False
+        self._told = ""
+        self._dropped_before = self._missed_before = 0
+
+    @property
+    def connected(self) -> bool:
+        """Whether the publisher has answered on this connection."""
+        return self._connection.heard_s is not None
+
+    def taken(self, arrival: Arrival) -> None:
+        """Note that the application has a product, so that another may come."""
+        self._taken.append(arrival.connection)
+
+    @contextmanager
+    def within(self, context: "zmq.Context[zmq.Socket[bytes]]") -> Iterator[None]:
+        """Use a context until the block ends."""
+        self._context = context
+        try:
+            yield
+            self._send(Bye())
+        finally:
+            self._close()
+
+    def turn(self, woken: system.socket, now_s: float) -> None:
+        """Do what there is to do, or wait until there is; not for longer than a tenth of a second.
+
+        Raises
+        ------
+        RefusedError
+            The publisher does not let this in, and never has.
+        """
+        if self._socket is None:
+            if now_s < self._wait_until_s:
+                _wait(woken, min(0.1, self._wait_until_s - now_s))
+                return
+            self._open(now_s)
+        self._subscribe(now_s)
+        ready = self._poll(woken)
+        if self._monitor is not None and self._monitor.socket in ready:
+            for text in self._monitor.read()[-1:]:
+                self._refuse(text, time.monotonic())
+                return
+        if self._socket in ready:
+            self._read_all()
+        connection, now_s = self._connection, time.monotonic()
+        since_s = connection.heard_s if connection.heard_s is not None else connection.first_asked_s
+        if since_s is not None and now_s - since_s > _DEAD_S:
+            self._again(f"the publisher has been silent for {_DEAD_S:g} s; connecting again", now_s)
+        elif since_s is None and self._socket is not None and now_s - connection.begun_s > _UNMADE_S:
+            self._again("", now_s)
+
+    def _poll(self, woken: system.socket) -> list[object]:
+        poller = zmq.Poller()
+        poller.register(woken, zmq.POLLIN)
+        for socket in (self._socket, self._monitor.socket if self._monitor else None):
+            if socket is not None:
+                poller.register(socket, zmq.POLLIN)
+        return [socket for socket, _ in poller.poll(100)]
+
+    def _open(self, now_s: float) -> None:
+        self._socket = sockets.client(self._context, self._address, keys=self._keys)
+        self._monitor = sockets.Monitor(self._socket)
+        self._connection = _Connection(self._connection.number + 1, now_s)
+        self._ask = True
+
+    def _close(self, now_s: float = 0.0) -> None:
+        if self._monitor is not None:
+            self._monitor.close()
+        if self._socket is not None:
+            self._socket.close(linger=0)
+        self._socket = self._monitor = None
+        self._connection = _Connection(self._connection.number, now_s)
+
+    def _again(self, text: str, now_s: float, *, wait_s: float = 0.0) -> None:
+        """Begin a connection anew, whose numbers count from 0."""
+        if self.connected:
+            self._counts.reconnects += 1
+        self._tell(text)
+        self._count_anew()
+        self._close(now_s)
+        self._wait_until_s = now_s + wait_s
+
+    def _count_anew(self) -> None:
+        """Go on from what was dropped and missed so far."""
+        self._dropped_before, self._missed_before = self._counts.dropped, self._counts.missed
+
+    def _restarted(self) -> None:
+        """Begin anew on a connection that ZeroMQ has made again, to another publisher at the same address.
+
+        What was consumed goes on: a publisher counts from what it hears first.
+        """
+        connection = self._connection
+        connection.reader, connection.received, connection.next_number = ProductReader(), 0, 0
+        self._counts.reconnects += 1
+        self._count_anew()
+
+    def _refuse(self, text: str, now_s: float) -> None:
+        self._refusals.append(text)
+        if not self._was_connected and len(self._refusals) >= _REFUSALS:
+            raise RefusedError(f"{self._address}: {text}")
+        self._again(text, now_s, wait_s=min(_MOST_AGAIN_S, _AGAIN_S * len(self._refusals)))
+
+    def _tell(self, text: str) -> None:
+        """Call back, once for the same text until the publisher answers again."""
+        if text and text != self._told:
+            self._told = text
+            self._note(text)
+
+    def _subscribe(self, now_s: float) -> None:
+        """Say what is wanted, each second and when something was taken."""
+        connection = self._connection
+        while self._taken:
+            if self._taken.popleft() == connection.number:
+                connection.taken += 1
+                self._ask = True
+        beat = connection.asked_s is None or now_s - connection.asked_s >= _BEAT_S
+        if not (beat or self._ask):
+            return
+        wanted = Subscribe(
+            sensors=self._sensors, products=self._products, consumed=connection.taken, credit=self._credit
+        )
+        if self._send(wanted):
+            self._ask = False
+            if beat:
+                connection.asked_s = now_s
+                connection.first_asked_s = connection.first_asked_s or now_s
+                self._send(Ping())
+
+    def _send(self, message: Message) -> bool:
+        """Send a message if there is a connection with room for it."""
+        if self._socket is None:
+            return False
+        with suppress(zmq.Again):
+            self._socket.send(encode(message), zmq.NOBLOCK)
+            return True
+        return False
+
+    def _read_all(self) -> None:
+        for _ in range(_AT_ONCE):
+            if self._socket is None:
+                return
+            try:
+                frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            try:
+                self._read([frame.buffer for frame in frames])
+            except FormatVersionError as error:
+                self._refuse(str(error), time.monotonic())
+            except RefusedError:
+                raise
+            except ErtisError as error:
+                self._counts.damaged += 1
+                self._again(str(error), time.monotonic())
+
+    def _read(self, frames: list[memoryview]) -> None:
+        message = decode(frames[0], _EXPECTED)
+        connection = self._connection
+        if isinstance(message, Refused):
+            self._refuse(message.reason, time.monotonic())
+            return
+        if not self.connected:
+            self._was_connected, self._refusals = True, []
+            self._tell("connected")
+            self._told = ""
+        connection.heard_s = time.monotonic()
+        if isinstance(message, Description):
+            if message.number in connection.reader:
+                self._restarted()
+            connection.reader.describe(message, frames[1:])
+        elif not isinstance(message, Pong):
+            self._take(message, frames[1:])
+
+    def _take(self, header: Header, payload: list[memoryview]) -> None:
+        """Deliver a product and count what did not come before it."""
+        connection = self._connection
+        if header.number < connection.next_number:  # they rise
+            self._restarted()
+        item = connection.reader.read(header, payload)
+        arrived_ns, arrived_utc_ns = time.monotonic_ns(), time.time_ns()
+        connection.received += 1
+        connection.next_number = header.number + 1
+        self._counts.missed = self._missed_before + connection.next_number - connection.received
+        self._counts.dropped = max(self._counts.dropped, self._dropped_before + header.dropped)
+        arrival = Arrival(item, header, arrived_ns, arrived_utc_ns, connection.number)
+        if isinstance(header, Image | Points | Raw):
+            about = connection.reader.description(header.description)
+            arrival = replace(arrival, translation_m=about.translation_m, rotation_xyzw=about.rotation_xyzw)
+        self._deliver(arrival)
+
+
+def _wait(woken: system.socket, timeout_s: float) -> None:
+    poller = zmq.Poller()
+    poller.register(woken, zmq.POLLIN)
+    poller.poll(max(1, round(1000 * timeout_s)))

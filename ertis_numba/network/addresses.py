@@ -1,0 +1,75 @@
+"""Addresses of nodes, and which of them may be used without keys."""
+
+import ipaddress
+import re
+from typing import Final
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["DEFAULT_LISTEN", "DEFAULT_PUBLISH", "endpoint", "host_of", "is_loopback", "require_keys"]
+
+DEFAULT_LISTEN: Final = "tcp://127.0.0.1:5601"
+"""Where sensor nodes find a central node."""
+DEFAULT_PUBLISH: Final = "tcp://127.0.0.1:5602"
+"""Where applications find it."""
+
+_ADDRESS: Final = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*):(\*|[0-9]{1,5})", re.ASCII)
+
+
+def endpoint(text: str) -> str:
+    """Return an address as ZeroMQ takes it.
+
+    Parameters
+    ----------
+    text : str
+        ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for any that is free, and host ``*`` for all
+        of its own.
+
+    Raises
+    ------
+    ArgumentError
+        It is no such address.
+    """
+    found = _ADDRESS.fullmatch(text)
+    if found is None or (found[2] != "*" and int(found[2]) > 65535):
+        raise ArgumentError(f"address {text!r} cannot be used; give tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
+    if found[1].startswith("["):
+        try:
+            ipaddress.IPv6Address(found[1].strip("[]"))
+        except ValueError as error:
+            raise ArgumentError(
+                f"address {text!r} cannot be used ({error}); give one such as tcp://[::1]:5601"
+            ) from error
+    return f"tcp://{found[1]}:{'*' if found[2] == '*' else int(found[2])}"
+
+
+def host_of(endpoint: str) -> str:
+    """Return the host of what `endpoint` has returned, without brackets."""
+    return endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether an address cannot be reached from another machine, which is sure of literal ones only."""
+    host = host_of(endpoint)
+    if host == "localhost":
+        return True
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return address == ipaddress.IPv6Address("::1") or (address.version == 4 and address.is_loopback)
+
+
+def require_keys(endpoint: str, *, keys: object | None) -> None:
+    """Refuse an address that others can reach if there are no keys.
+
+    Raises
+    ------
+    ArgumentError
+        It is not of this machine alone, and ``keys`` is None.
+    """
+    if keys is None and not is_loopback(endpoint):
+        raise ArgumentError(
+            f"address {endpoint} can be reached from other machines, and there are no keys; make some by "
+            "'ertis keys new' and give --key, or use tcp://127.0.0.1:PORT"
+        )

@@ -1,0 +1,274 @@
+"""Stores measurements: a thread that waits for the disk, so that nobody else does."""
+
+import collections
+import os
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from msgspec.structs import replace
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.journal import SUFFIX, Sealed
+from ertis_numba.network.central_node._items import Event, Failed, Fault, Item, Resumed, Run, SealedOne
+from ertis_numba.network.central_node._ledger import Ledger, Lock
+from ertis_numba.network.central_node._sealing import Sealing
+from ertis_numba.network.central_node._shelf import Shelf
+from ertis_numba.network.status import ArchiveStatus, Latencies
+
+__all__ = ["Archive"]
+
+_GROUP: Final = 64
+_GROUP_BYTES: Final = 40_000_000
+_LOOK_S: Final = 0.5
+_AGAIN_S: Final = 1.0
+_STUCK_S: Final = 5.0
+
+
+class Archive:
+    """Puts measurements into journals, and lets those become recordings.
+
+    Parameters
+    ----------
+    folder : str or Path
+        It is made where it is missing; no other archive can use it meanwhile.
+    name : str
+        Of recordings, before the time.
+    rotate_bytes : float
+        Words after which a recording is full.
+    rotate_s : float
+        Time after which it is.
+    seal : bool
+        Make recordings; where False, journals are left to ``ertis recover``.
+
+    Raises
+    ------
+    ArgumentError
+        A name that cannot be that of a file, or numbers that are none.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        name: str = "recording",
+        *,
+        rotate_bytes: float = 2e9,
+        rotate_s: float = 600.0,
+        seal: bool = True,
+    ) -> None:
+        self.folder = Path(folder)
+        self._name = checks.sensor_name(name)
+        self._rotate_bytes = checks.between("size of a recording", rotate_bytes, 1e6, 1e15)
+        self._rotate_s = checks.between("time of a recording", rotate_s, 1.0, 1e9)
+        self._seal = seal
+        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        self._events: collections.deque[Event] = collections.deque()
+        self._stop = threading.Event()
+        self._lock: Lock | None = None
+        self._shelf: Shelf | None = None
+        self._sealing: Sealing | None = None
+        self._thread: threading.Thread | None = None
+        self._wake: tuple[int, int] | None = None
+        self._commits = Latencies()
+        self._snapshot = ArchiveStatus(folder=str(folder))
+        self._busy_since_s: float | None = None
+        self._next_look_s = 0.0
+        self.fault = ""
+
+    def open(self) -> int:
+        """Take the folder, take up what a crash has left, and return what to poll: `read` when it can be read.
+
+        Raises
+        ------
+        InUseError
+            Another process has the folder, or a journal of it that this one has to know.
+        DataError
+            It cannot be written, or what is in it not be read.
+        """
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
+        self._lock = Lock(self.folder)
+        try:
+            self._shelf = Shelf(self.folder, self._name, Ledger(self.folder), self._tell)
+        except BaseException:
+            self._lock.release()
+            raise
+        self._wake = os.pipe()
+        for end in self._wake:
+            os.set_blocking(end, False)
+        if self._seal:
+            self._sealing = Sealing(self._sealed, self._not_sealed)
+        self._look()
+        self._thread = threading.Thread(target=self._run, args=(self._shelf,), name="archive", daemon=True)
+        self._thread.start()
+        return self._wake[0]
+
+    def settled(self, run: Run) -> int:
+        """Return the number up to which all of a run is stored or known to be missing; -1 if there is none."""
+        return -1 if self._shelf is None else self._shelf.settled.get(run, -1)
+
+    def offer(self, item: Item) -> None:
+        """Have something stored; returns at once."""
+        self._queue.put(item)
+
+    def read(self) -> list[Event]:
+        """Return what has happened since; returns at once."""
+        if self._wake is not None:
+            try:
+                while os.read(self._wake[0], 4096):
+                    pass
+            except BlockingIOError:
+                pass
+        found = []
+        while self._events:
+            found.append(self._events.popleft())
+        return found
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the disk has not answered for some seconds."""
+        since_s = self._busy_since_s
+        return since_s is not None and time.monotonic() - since_s > _STUCK_S
+
+    def status(self) -> ArchiveStatus:
+        """Return how it is; returns at once, with numbers that are half a second old."""
+        sealing = self._sealing
+        if sealing is None:
+            return replace(self._snapshot)
+        return replace(self._snapshot, sealed=sealing.sealed, sealing=sealing.left, sealing_failed=sealing.failed)
+
+    def finish(self, timeout_s: float) -> bool:
+        """Store what was offered, end the thread, and return whether that was done in time."""
+        if self._thread is None:
+            return True
+        self._queue.put(None)
+        self._thread.join(0 if self.fault else timeout_s)
+        self._stop.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def close(self) -> None:
+        """Finish, make recordings of all that is stored, and let others have the folder."""
+        if self._sealing is not None:
+            self._sealing.hurry()
+        finished = self.finish(30.0)
+        if self._sealing is not None and finished:
+            self._sealing.close()
+        if self._wake is not None and finished:
+            wake, self._wake = self._wake, None
+            for end in wake:
+                os.close(end)
+        if self._lock is not None and finished:
+            self._lock.release()
+
+    def _tell(self, event: Event) -> None:
+        self._events.append(event)
+        if self._wake is not None:
+            try:
+                os.write(self._wake[1], b".")
+            except OSError:  # full: the reader will be woken anyway; closed: nobody reads
+                return
+
+    def _sealed(self, sealed: Sealed) -> None:
+        self._tell(SealedOne(sealed))
+
+    def _not_sealed(self, text: str) -> None:
+        self._tell(Failed(text))
+
+    def _run(self, shelf: Shelf) -> None:
+        while True:
+            items, ends = self._next()
+            if items and not self._store(shelf, items):
+                break
+            self._tend(shelf, ends=ends)
+            if ends:
+                break
+            self._look()
+        self._attempt(shelf.close)
+
+    def _next(self) -> tuple[list[Item], bool]:
+        """Return what to store together, and whether that was the last."""
+        items: list[Item] = []
+        n_bytes = 0
+        try:
+            item = self._queue.get(timeout=_LOOK_S)
+            while item is not None:
+                items.append(item)
+                n_bytes += item.n_bytes
+                if len(items) >= _GROUP or n_bytes >= _GROUP_BYTES:
+                    return items, False
+                item = self._queue.get_nowait()
+        except queue.Empty:
+            return items, False
+        return items, True
+
+    def _store(self, shelf: Shelf, items: list[Item]) -> bool:
+        """Store items, as often as it takes; False where it was ended before."""
+        while not self._attempt(lambda: shelf.store(items)):
+            if self._stop.wait(_AGAIN_S):
+                return False
+            self._look()
+        return True
+
+    def _tend(self, shelf: Shelf, *, ends: bool) -> None:
+        """Let journals that are full become recordings."""
+        volume = shelf.volume
+        full = volume is not None and (
+            volume.n_bytes >= self._rotate_bytes or time.monotonic() - volume.begun_s >= self._rotate_s
+        )
+        if full or ends or shelf.to_hand_on:
+            self._attempt(lambda: self._hand_on(shelf, rotate=full or ends, ends=ends))
+
+    def _hand_on(self, shelf: Shelf, *, rotate: bool, ends: bool) -> None:
+        if rotate:
+            shelf.rotate()
+            if not ends:  # what comes next begins a journal, for which the ledger is written anyway
+                return
+        for path in shelf.hand_on():
+            if self._sealing is not None:
+                self._sealing.give(path)
+
+    def _attempt(self, act: Callable[[], None]) -> bool:
+        """Do something with the disk; whatever comes of it, this thread goes on."""
+        begun_s = self._busy_since_s = time.monotonic()
+        try:
+            act()
+        except Exception as error:  # noqa: BLE001  a disk can fail in any way
+            text = " ".join(str(error).split()) or type(error).__name__
+            if text != self.fault:
+                self.fault = text
+                self._tell(Fault(text))
+            return False
+        finally:
+            self._busy_since_s = None
+        self._commits.add(1e3 * (time.monotonic() - begun_s))
+        if self.fault:
+            self.fault = ""
+            self._tell(Resumed())
+        return True
+
+    def _look(self) -> None:
+        """Note how much room there is, where that was not just done."""
+        now_s = time.monotonic()
+        if now_s < self._next_look_s or self._shelf is None:
+            return
+        self._next_look_s = now_s + _LOOK_S
+        made = ArchiveStatus(folder=str(self.folder), commit=self._commits.percentiles())
+        try:
+            made.free_bytes = shutil.disk_usage(self.folder).free
+            made.room_bytes = made.free_bytes // 2
+            volume = self._shelf.volume
+            if volume is not None:
+                made.recording = volume.path.name.removesuffix(SUFFIX)
+                made.journal_bytes = volume.path.stat().st_size
+                made.room_bytes = volume.journal.room()
+        except (OSError, DataError, ArgumentError):  # storing tells what is wrong
+            pass
+        self._snapshot = made

@@ -1,0 +1,106 @@
+"""What goes from the loop to the archive, and what comes back."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+from ertis_numba.journal import Entry, Gap, Sealed, Sensor
+
+__all__ = ["Event", "Failed", "Fault", "Forgotten", "Item", "Resumed", "Run", "SealedOne", "Stored", "Twin"]
+
+
+class Run(NamedTuple):
+    """A sensor's run, whose numbers settle in order."""
+
+    sensor: str
+    epoch: int
+
+
+@dataclass(slots=True, eq=False)
+class Item:
+    """Something to be stored.
+
+    Attributes
+    ----------
+    run : Run
+    first, last : int
+        Numbers that are settled once it is stored.
+    what : Entry or Gap
+    source : Sensor
+        As the journal is to know it.
+    arrived_s : float
+        By `time.monotonic`.
+    owner : bytes
+        Peer that sent it.
+    again : bool
+        The number was settled before: stored only if it is another measurement than that.
+    done : bool
+        It was told what has become of it.
+    """
+
+    run: Run
+    first: int
+    last: int
+    what: Entry | Gap
+    source: Sensor
+    arrived_s: float
+    owner: bytes
+    again: bool = False
+    done: bool = False
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory that it takes, about."""
+        return self.what.measurement.words.nbytes if isinstance(self.what, Entry) else 64
+
+
+@dataclass(slots=True)
+class Stored:
+    """Items that are durable."""
+
+    items: list[Item]
+    took_ms: float
+
+
+@dataclass(slots=True)
+class Forgotten:
+    """An item that was not stored; its sender has to send it again."""
+
+    item: Item
+    reason: str = ""
+
+
+@dataclass(slots=True)
+class Twin:
+    """An item whose number was settled before; whether it was another measurement, which is kept, too."""
+
+    item: Item
+    differs: bool
+
+
+@dataclass(slots=True)
+class Fault:
+    """Nothing can be stored at present."""
+
+    text: str
+
+
+@dataclass(slots=True)
+class Resumed:
+    """Storing works again."""
+
+
+@dataclass(slots=True)
+class SealedOne:
+    """A journal has become a recording."""
+
+    sealed: Sealed
+
+
+@dataclass(slots=True)
+class Failed:
+    """A journal has not become a recording yet."""
+
+    text: str
+
+
+Event: TypeAlias = Stored | Forgotten | Twin | Fault | Resumed | SealedOne | Failed

@@ -1,0 +1,98 @@
+"""Journals that are full become recordings, beside what goes on."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.errors import InUseError
+from ertis_numba.journal import Sealed, seal_apart
+
+__all__ = ["Sealing"]
+
+_AGAIN_S: Final = 5.0
+"""Until a journal that could not be sealed is tried again; twice as long after each time, …"""
+
+_LATEST_S: Final = 300.0
+"""… but not longer than this."""
+
+
+class Sealing:
+    """A thread that seals one journal after the other, each in a process of its own.
+
+    Parameters
+    ----------
+    on_sealed : callable
+        Called in the thread.
+    on_failed : callable
+        Called in the thread with a line about why.
+
+    Attributes
+    ----------
+    sealed, failed : int
+        So far.
+    """
+
+    def __init__(self, on_sealed: Callable[[Sealed], None], on_failed: Callable[[str], None]) -> None:
+        self._on_sealed, self._on_failed = on_sealed, on_failed
+        self._given: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
+        self._waiting: list[tuple[float, float, Path]] = []  # when it is due, how long it waited, which
+        self._n_given = self._n_done = 0
+        self._ends = False
+        self.sealed = self.failed = 0
+        self._thread = threading.Thread(target=self._run, name="sealing", daemon=True)
+        self._thread.start()
+
+    @property
+    def left(self) -> int:
+        """Journals that are not recordings yet."""
+        return self._n_given - self._n_done
+
+    def give(self, path: Path) -> None:
+        """Seal a journal, when those before are done."""
+        self._n_given += 1
+        self._given.put(path)
+
+    def hurry(self) -> None:
+        """Let nobody have processors and disk first, from the next journal on."""
+        self._ends = True
+
+    def close(self) -> None:
+        """Seal what is left, each tried once more, and return when that is done."""
+        self.hurry()
+        self._given.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            due = min(self._waiting, default=None)
+            try:
+                path = self._given.get(timeout=None if due is None else max(0.0, due[0] - time.monotonic()))
+            except queue.Empty:
+                if due is not None:
+                    self._waiting.remove(due)
+                    self._seal(due[2], due[1])
+                continue
+            if path is None:
+                break
+            self._seal(path, 0.0)
+        for _, waited_s, path in sorted(self._waiting):
+            self._seal(path, waited_s)
+
+    def _seal(self, path: Path, waited_s: float) -> None:
+        try:
+            sealed = seal_apart(path, gently=not self._ends)
+        except Exception as error:  # noqa: BLE001  whatever it is, the journal is still there and ingest goes on
+            if isinstance(error, InUseError) and not self._ends:
+                waits_s = _AGAIN_S  # who seals it now will be done soon
+            else:
+                self.failed += 1
+                waits_s = min(max(_AGAIN_S, 2 * waited_s), _LATEST_S)
+            self._waiting.append((time.monotonic() + waits_s, waits_s, path))
+            self._on_failed(f"{path.name} is not sealed yet: {' '.join(str(error).split())}")
+            return
+        self._n_done += 1
+        self.sealed += 1
+        self._on_sealed(sealed)

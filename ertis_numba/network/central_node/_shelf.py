@@ -1,0 +1,302 @@
+"""The journals of a folder, and how far each run is settled in them."""
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.network.central_node._items import Event, Forgotten, Item, Run, Stored, Twin
+from ertis_numba.network.central_node._ledger import Ledger, look
+from ertis_numba.network.central_node._volumes import Volume, journal_name, runs_of
+
+__all__ = ["Shelf"]
+
+_TRIES: Final = 5  # to open a journal again that has failed
+_TWINS_KEPT: Final = 4096
+
+
+class Shelf:
+    """What is stored, and what is still to be: knows of each number whether it is.
+
+    Nothing in it is done twice, and nothing out of order: an item is stored only if it follows what is settled.
+
+    Parameters
+    ----------
+    folder : Path
+        It is locked.
+    name : str
+        Of recordings.
+    ledger : Ledger
+        Of the folder.
+    tell : callable
+        Called with what has happened.
+
+    Attributes
+    ----------
+    settled : dict of Run to int
+        The number up to which all of a run is stored or known to be missing.
+    volume : Volume or None
+        That is being written.
+    to_hand_on : list of Path
+        Journals that are to be sealed.
+
+    Raises
+    ------
+    InUseError
+        Somebody has a journal whose content has to be known.
+    DataError
+        What is in the folder cannot be read.
+    """
+
+    def __init__(self, folder: Path, name: str, ledger: Ledger, tell: Callable[[Event], None]) -> None:
+        self._folder, self._name, self._ledger, self._tell = folder, name, ledger, tell
+        self.settled: dict[Run, int] = dict(ledger.settled)
+        self.volume: Volume | None = None
+        self._twins: Volume | None = None
+        self._known_twins: dict[tuple[Run, int, int], None] = {}
+        self._unsealed: set[str] = set(ledger.unsealed)
+        self._doubtful: Path | None = None
+        self._failures = 0
+        self._is_saved = False  # whether the ledger has what journals hold that are to be handed on
+        self.to_hand_on: list[Path] = []
+        self._take_up()
+
+    def _take_up(self) -> None:
+        """Learn what journals hold that a crash has left; they are to be sealed."""
+        if self._ledger.is_new:
+            self._settle(look(sorted(self._folder.glob("*.h5"))))
+            names = sorted(path.name for path in self._folder.glob(f"*.h5{SUFFIX}"))
+        else:
+            names = self._ledger.open
+        for name in names:
+            self._learn(self._folder / name)
+        for name in dict.fromkeys([*self._ledger.unsealed, *names]):
+            if (self._folder / name).exists():
+                self._retire(self._folder / name)
+
+    def _learn(self, path: Path) -> None:
+        """Learn what a journal holds, or the recording that somebody has made of it meanwhile."""
+        recording = path.with_name(path.name.removesuffix(SUFFIX))
+        if path.exists():
+            with Journal.open(path) as journal:
+                self._settle(runs_of(journal))
+        elif recording.exists():
+            self._settle(look([recording]))
+
+    def _settle(self, runs: dict[Run, int]) -> None:
+        for run, last in runs.items():
+            self.settled[run] = max(last, self.settled.get(run, -1))
+
+    def store(self, items: list[Item]) -> None:
+        """Make items durable and tell of them; after an error, call it again with the same ones.
+
+        Raises
+        ------
+        Exception
+            The disk fails. What was told of is durable, and the rest of the items is not lost.
+        """
+        try:
+            self._mend(sum(item.n_bytes for item in items))
+            self._store(items)
+        except Exception:
+            self._doubt()
+            raise
+        self._failures = 0
+
+    def _store(self, items: list[Item]) -> None:
+        batch: list[Item] = []
+        ahead: dict[Run, int] = {}  # settled, once the batch is
+
+        def flush() -> None:
+            self._append(batch)
+            batch.clear()
+            ahead.clear()
+
+        for item in items:
+            if item.done:
+                continue
+            if item.again:
+                flush()
+                self._store_twin(item)
+                continue
+            last = ahead.get(item.run, self.settled.get(item.run, -1))
+            if item.last <= last:  # a commit that seemed to fail had not
+                self._tell_stored([item], 0.0)
+            elif item.first != last + 1:
+                item.done = True
+                self._tell(Forgotten(item))
+            else:
+                volume = self._fitting(item, flush)
+                if isinstance(item.what, Entry):
+                    batch.append(item)
+                    ahead[item.run] = item.last
+                else:
+                    flush()
+                    self._note(volume, item)
+        flush()
+
+    def _fitting(self, item: Item, flush: Callable[[], None]) -> Volume:
+        """Return the journal that an item is to go into."""
+        if self.volume is not None and not self.volume.fits(item):
+            flush()
+            self.rotate()
+        if self.volume is None:
+            name = journal_name(self._folder, self._name, taken=self._unsealed)
+            self._save(open_=[name])  # before there is such a file: what a crash leaves of it is found
+            self.volume = Volume.create(self._folder / name)
+        return self.volume
+
+    def _append(self, batch: list[Item]) -> None:
+        if not batch or self.volume is None:
+            return
+        begun_s = time.monotonic()
+        try:
+            self.volume.append(batch)
+        except ArgumentError as error:
+            if len(batch) == 1:
+                batch[0].done = True
+                self._tell(Forgotten(batch[0], " ".join(str(error).split())))
+            else:  # the others must not suffer for one that nothing can hold
+                for item in batch:
+                    self._append([item])
+            return
+        self._tell_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
+
+    def _note(self, volume: Volume, item: Item) -> None:
+        begun_s = time.monotonic()
+        try:
+            volume.note(item)
+        except ArgumentError as error:
+            item.done = True
+            self._tell(Forgotten(item, " ".join(str(error).split())))
+            return
+        self._tell_stored([item], 1e3 * (time.monotonic() - begun_s))
+
+    def _tell_stored(self, items: list[Item], took_ms: float) -> None:
+        for item in items:
+            self.settled[item.run] = max(item.last, self.settled.get(item.run, -1))
+            item.done = True
+        self._tell(Stored(items, took_ms))
+
+    def _store_twin(self, item: Item) -> None:
+        """Keep a measurement whose number is settled, if the journal holds another one under it."""
+        if not isinstance(item.what, Entry):
+            return
+        key = (item.run, item.first, item.what.crc32 or 0)
+        held = None if self.volume is None or key in self._known_twins else self.volume.crc32_of(item.what)
+        differs = held is not None and held != item.what.crc32
+        if differs:
+            if self._twins is not None and not self._twins.fits(item):
+                self._retire_volume(self._twins)
+                self._twins = None
+            if self._twins is None:
+                name = journal_name(self._folder, self._name, end="_conflicts", taken=self._unsealed)
+                self._save(open_=self._open, also=[name])
+                self._twins = Volume.create(self._folder / name)
+            self._twins.append([item])
+            self._known_twins[key] = None
+            for old in list(islice(self._known_twins, max(0, len(self._known_twins) - _TWINS_KEPT))):
+                del self._known_twins[old]
+        item.done = True
+        self._tell(Twin(item, differs=differs))
+
+    @property
+    def _open(self) -> list[str]:
+        """Names of journals that hold more than the ledger says."""
+        paths = (None if self.volume is None else self.volume.path, self._doubtful)
+        return [path.name for path in paths if path is not None]
+
+    def _save(self, *, open_: list[str], also: Iterable[str] = ()) -> None:
+        self._unsealed = {name for name in self._unsealed if (self._folder / name).exists()}
+        self._ledger.save(self.settled, open_=open_, unsealed=sorted({*self._unsealed, *also}))
+        self._unsealed.update(also)
+        self._is_saved = True
+
+    def rotate(self) -> None:
+        """Begin new recordings with what comes next."""
+        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        for volume in volumes:
+            if volume is not None:
+                self._retire_volume(volume)
+
+    def _retire_volume(self, volume: Volume) -> None:
+        self._retire(volume.path)
+        with suppress(DataError):  # what was committed is there, whatever happens now
+            volume.close()
+
+    def _retire(self, path: Path) -> None:
+        self._unsealed.add(path.name)
+        self.to_hand_on.append(path)
+        self._is_saved = False
+
+    def hand_on(self) -> list[Path]:
+        """Return journals that can be sealed: the ledger has durably what they hold.
+
+        Raises
+        ------
+        DataError, OSError
+            It cannot be written; call this again.
+        """
+        if not self._is_saved:
+            self._save(open_=self._open)
+        found, self.to_hand_on = self.to_hand_on, []
+        return found
+
+    def _doubt(self) -> None:
+        """Close what has failed: only when it is opened again, it shows what it holds."""
+        self._failures += 1
+        if self.volume is not None:
+            self._doubtful = self.volume.path
+            with suppress(Exception):
+                self.volume.close()
+            self.volume = None
+        if self._twins is not None:
+            self._retire_volume(self._twins)
+            self._twins = None
+
+    def _mend(self, n_bytes: int) -> None:
+        """Open a journal again that has failed, and learn what it holds."""
+        path = self._doubtful
+        if path is None:
+            return
+        if not path.exists():  # somebody took it away, or has sealed it
+            self._learn(path)
+            self._doubtful = None
+            return
+        try:
+            journal = Journal.open(path)
+            try:
+                self._settle(runs_of(journal))
+                volume = Volume(journal)
+                useless = self._failures > 1 and len(volume) > 0 and journal.room() > n_bytes
+            except BaseException:
+                journal.close()
+                raise
+        except InUseError:
+            raise
+        except (DataError, OSError):
+            if self._failures < _TRIES:
+                raise
+            self._set_aside(path)
+            self._doubtful = None
+            return
+        self._doubtful = None
+        if useless:  # there is room, and still it fails
+            self._retire_volume(volume)
+        else:
+            self.volume = volume
+
+    def _set_aside(self, path: Path) -> None:
+        """Give a journal that cannot be read another name: nothing that it may hold in secret is sealed twice."""
+        for end in ("-wal", ""):
+            part = path.with_name(path.name + end)
+            if part.exists():
+                part.rename(path.with_name(f"{path.name}.damaged{end}"))
+
+    def close(self) -> None:
+        """Close all journals."""
+        self.rotate()

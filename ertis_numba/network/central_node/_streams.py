@@ -1,0 +1,192 @@
+"""Runs that are greeted: which number comes next, and what is counted of each sensor."""
+
+import time
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Final
+
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.geometry import layout_names
+from ertis_numba.journal import Sensor
+from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.messages import Data, Hello
+from ertis_numba.network.status import SensorStatus
+from ertis_numba.settings import Air, Settings
+
+__all__ = ["SETTINGS_BYTES", "Peer", "Stream", "Track", "source_of"]
+
+SETTINGS_BYTES: Final = 262_144
+"""Of the settings of a sensor, as TOML."""
+
+_RECENT_S: Final = 3.0
+_NUMBERS_KEPT: Final = 512  # whose CRC-32 is remembered, of each run
+
+
+def source_of(hello: Hello, text: bytes, *, most_bytes: int) -> Sensor:
+    """Return the sensor that a node greets for.
+
+    Parameters
+    ----------
+    hello : Hello
+    text : bytes
+        Its settings as TOML.
+    most_bytes : int
+        Longest measurement that is taken.
+
+    Raises
+    ------
+    ArgumentError
+        They cannot be used.
+    """
+    return _source(
+        hello.sensor, text, hello.firmware, tuple(hello.translation_m), tuple(hello.rotation_xyzw), most_bytes
+    )
+
+
+@lru_cache(maxsize=64)
+def _source(
+    name: str,
+    text: bytes,
+    firmware: str,
+    translation_m: tuple[float, ...],
+    rotation_xyzw: tuple[float, ...],
+    most_bytes: int,
+) -> Sensor:
+    if not firmware.isprintable():
+        raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; give printable characters")
+    try:
+        settings = Settings.from_toml(text.decode(), f"settings of sensor {name}")
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"settings of sensor {name} are no text ({error}); give TOML in UTF-8") from error
+    if not settings.array.layout.isprintable() or not settings.processing.directions.isprintable():
+        raise SettingsError(f"settings of sensor {name} hold names that cannot be printed; give printable characters")
+    if settings.array.positions_m is None and settings.array.layout not in layout_names():
+        raise SettingsError(  # what others name must not be opened as a file here
+            f"array.layout of sensor {name} is {settings.array.layout!r}, a file; send its positions instead"
+        )
+    source = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
+    if source.n_bytes > most_bytes:
+        raise SettingsError(
+            f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {most_bytes}; record fewer "
+            "samples, or let it take more"
+        )
+    return source
+
+
+@dataclass(slots=True)
+class Track:
+    """What became of one sensor's measurements."""
+
+    epoch: int = 0
+    settled: int = -1
+    received: int = 0
+    received_bytes: int = 0
+    stored: int = 0
+    repeated: int = 0
+    conflicts: int = 0
+    waiting: int = 0
+    missing: Counter[str] = field(default_factory=Counter)
+    peers: set[bytes] = field(default_factory=set)
+    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=128))
+
+    def took(self, n_bytes: int, arrived_s: float) -> None:
+        """Count a measurement that has not come before."""
+        self.received += 1
+        self.received_bytes += n_bytes
+        self.times_s.append(arrived_s)
+
+    def status(self) -> SensorStatus:
+        """Return what is counted."""
+        now_s = time.monotonic()
+        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
+        span_s = recent_s[-1] - recent_s[0] if len(recent_s) > 1 else 0.0
+        return SensorStatus(
+            connected=bool(self.peers),
+            epoch=self.epoch,
+            settled=self.settled,
+            rate_hz=round((len(recent_s) - 1) / span_s, 3) if span_s else 0.0,
+            received=self.received,
+            received_bytes=self.received_bytes,
+            stored=self.stored,
+            missing=dict(self.missing),
+            repeated=self.repeated,
+            conflicts=self.conflicts,
+            queue=self.waiting,
+        )
+
+
+@dataclass(slots=True, eq=False)
+class Stream:
+    """A run that is greeted.
+
+    Attributes
+    ----------
+    run : Run
+    source : Sensor
+    track : Track
+    settled, taken : int
+        The number up to which all is settled, and will be once what waits is stored.
+    begins : int
+        The oldest number that the node has.
+    owner : bytes
+        The peer that has greeted last.
+    hole : bool
+        Something came beyond what is to come next: the node has to hear what that is.
+    """
+
+    run: Run
+    source: Sensor
+    track: Track
+    settled: int
+    taken: int
+    begins: int
+    owner: bytes
+    hole: bool = False
+    recent: OrderedDict[int, int] = field(default_factory=OrderedDict)
+    _air: tuple[tuple[float, float, float], Settings] | None = None
+
+    def remember(self, sequence: int, crc32: int) -> None:
+        """Keep the CRC-32 of a measurement for a while."""
+        self.recent[sequence] = crc32
+        if len(self.recent) > _NUMBERS_KEPT:
+            self.recent.popitem(last=False)
+
+    def settings(self, data: Data) -> Settings:
+        """Return the settings of a measurement.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such air.
+        """
+        air = (data.temperature_c, data.humidity_percent, data.pressure_pa)
+        if self._air is None or self._air[0] != air:
+            temperature_c, humidity_percent, pressure_pa = air
+            made = Air(temperature_c=temperature_c, humidity_percent=humidity_percent, pressure_pa=pressure_pa)
+            settings = self.source.settings
+            self._air = air, settings if settings.air == made else settings.replace(air=made)
+        return self._air[1]
+
+    def use(self, source: Sensor) -> None:
+        """Take other settings from now on."""
+        if source is not self.source:
+            self.source, self._air = source, None
+
+
+@dataclass(slots=True, eq=False)
+class Peer:
+    """A connection that has greeted for some sensors.
+
+    Attributes
+    ----------
+    streams : dict of Run to Stream
+    heard_s : float
+        When it sent something, by `time.monotonic`.
+    waiting_bytes : int
+        Of it, that wait for the disk.
+    """
+
+    streams: dict[Run, Stream] = field(default_factory=dict)
+    heard_s: float = 0.0
+    waiting_bytes: int = 0

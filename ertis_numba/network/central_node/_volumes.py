@@ -1,0 +1,135 @@
+"""Journals of an archive: their names, and which measurements still fit into one."""
+
+import time
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import SUFFIX, Entry, Journal, Sensor
+from ertis_numba.network.central_node._items import Item, Run
+
+__all__ = ["Volume", "journal_name", "runs_of"]
+
+_SOURCE = "central node"
+
+
+def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
+    """Return a name for a journal that neither it nor its recording has in a folder."""
+    stem = f"{name}_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    number, made = 1, f"{stem}{end}.h5{SUFFIX}"
+    while made in taken or (folder / made).exists() or (folder / made.removesuffix(SUFFIX)).exists():
+        number += 1
+        made = f"{stem}_{number}{end}.h5{SUFFIX}"
+    return made
+
+
+def runs_of(journal: Journal) -> dict[Run, int]:
+    """Return the highest number of each run that a journal holds, or says to be missing."""
+    last: dict[Run, int] = {}
+    for key in journal.index():
+        run = Run(key.sensor, key.epoch)
+        last[run] = max(key.sequence, last.get(run, -1))
+    for gap in journal.gaps:
+        run = Run(gap.sensor, gap.epoch)
+        last[run] = max(gap.last, last.get(run, -1))
+    return last
+
+
+class Volume:
+    """A journal that is being written.
+
+    Parameters
+    ----------
+    journal : Journal
+        It belongs to this from now on.
+
+    Attributes
+    ----------
+    n_bytes : int
+        Words that it holds.
+    begun_s : float
+        When it was opened, by `time.monotonic`.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self.journal = journal
+        self._known: dict[str, Sensor] = dict(journal.sensors)
+        self._counted = {Run(key.sensor, key.epoch): key.sequence for key in journal.index()}
+        self.n_bytes = sum(journal.sensors[key.sensor].n_bytes for key in journal.index())
+        self.begun_s = time.monotonic()
+
+    @classmethod
+    def create(cls, path: Path) -> Self:
+        """Make one whose recording will lie beside it."""
+        return cls(Journal.create(path, target=path.name.removesuffix(SUFFIX), source=_SOURCE))
+
+    @property
+    def path(self) -> Path:
+        """Of the journal."""
+        return self.journal.path
+
+    def __len__(self) -> int:
+        return len(self.journal)
+
+    def fits(self, item: Item) -> bool:
+        """Whether an item can go into this journal: its sensor is the same as before, and its number rises."""
+        known = self._known.get(item.source.name)
+        if known is not None and known is not item.source:
+            if not _same(known, item.source):
+                return False
+            self._known[known.name] = item.source
+        return item.first > self._counted.get(item.run, -1)
+
+    def append(self, items: list[Item]) -> None:
+        """Make measurements durable, all or none; see `Journal.append`."""
+        for item in items:
+            self._add(item.source)
+        self.journal.append([item.what for item in items if isinstance(item.what, Entry)])
+        for item in items:
+            self._counted[item.run] = item.last
+            self.n_bytes += item.n_bytes
+
+    def note(self, item: Item) -> None:
+        """Say durably what is missing."""
+        if isinstance(item.what, Entry):
+            raise ArgumentError("a measurement is given where a gap is noted; append it")
+        self._add(item.source)
+        gap = item.what
+        self.journal.note_gap(gap.sensor, gap.first, gap.last, gap.reason, epoch=gap.epoch)
+
+    def _add(self, source: Sensor) -> None:
+        if source.name not in self.journal.sensors:
+            self.journal.add_sensor(
+                source.name,
+                source.settings,
+                firmware=source.firmware,
+                translation_m=source.translation_m,
+                rotation_xyzw=source.rotation_xyzw,
+            )
+        self._known[source.name] = source
+
+    def crc32_of(self, entry: Entry) -> int | None:
+        """Return the CRC-32 of the measurement with the number of this one; None where it is not held."""
+        stamp = entry.measurement.stamp
+        if stamp.sensor not in self.journal.sensors:
+            return None
+        for key in self.journal.index(stamp.sensor):
+            if (key.epoch, key.sequence) == (stamp.epoch, stamp.sequence):
+                return self.journal.entry(key).crc32
+        return None
+
+    def close(self) -> None:
+        """Close the journal."""
+        self.journal.close()
+
+
+def _same(one: Sensor, other: Sensor) -> bool:
+    parts: tuple[Callable[[Sensor], object], ...] = (
+        lambda sensor: sensor.settings,
+        lambda sensor: sensor.firmware,
+        lambda sensor: sensor.translation_m,
+        lambda sensor: sensor.rotation_xyzw,
+    )
+    return all(part(one) == part(other) for part in parts)

@@ -1,0 +1,106 @@
+"""Log lines that both people and programs read: one event each, with its fields."""
+
+import json
+import logging
+import re
+import sys
+from datetime import UTC, datetime
+from typing import IO, Any, Final
+
+__all__ = ["Log", "Logfmt", "NDJson", "logger", "show"]
+
+_ROOT: Final = "ertis.network"
+_FIELDS: Final = "ertis_fields"
+_BARE: Final = re.compile(r"[^\s\"=\\]+")
+
+
+class Log:
+    """Logs events of a part of a node.
+
+    ::
+
+        log = logger("central_node")
+        log.warning("conflict", sensor="front", epoch=7, sequence=41, text="held with another checksum; both are kept")
+
+    Parameters
+    ----------
+    name : str
+    """
+
+    def __init__(self, name: str) -> None:
+        self._logger = logging.getLogger(f"{_ROOT}.{name}")
+
+    def debug(self, event: str, **fields: Any) -> None:
+        """Log what only who looks for a mistake wants to know."""
+        self._log(logging.DEBUG, event, fields)
+
+    def info(self, event: str, **fields: Any) -> None:
+        """Log what happened as it should."""
+        self._log(logging.INFO, event, fields)
+
+    def warning(self, event: str, **fields: Any) -> None:
+        """Log what somebody should look at."""
+        self._log(logging.WARNING, event, fields)
+
+    def error(self, event: str, **fields: Any) -> None:
+        """Log what does not work."""
+        self._log(logging.ERROR, event, fields)
+
+    def _log(self, level: int, event: str, fields: dict[str, Any]) -> None:
+        self._logger.log(level, "%s", event, extra={_FIELDS: fields})
+
+
+def logger(name: str) -> Log:
+    """Return what logs events of a part of a node, such as ``"publisher"``."""
+    return Log(name)
+
+
+def show(*, as_json: bool = False, level: str = "INFO", stream: IO[str] | None = None) -> None:
+    """Write events as lines to ``stream``, stderr by default; what was shown before is not any more."""
+    handler = logging.StreamHandler(stream or sys.stderr)
+    handler.setFormatter(NDJson() if as_json else Logfmt())
+    root = logging.getLogger(_ROOT)
+    root.handlers[:] = [handler]
+    root.setLevel(level)
+    root.propagate = False
+
+
+class Logfmt(logging.Formatter):
+    """Formats an event as ``TIME level event key=value …``; a value with spaces in it is quoted."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        time, level, event, fields = _parts(record)
+        return " ".join((time, level, _word(event), *(f"{_key(key)}={_word(value)}" for key, value in fields.items())))
+
+
+class NDJson(logging.Formatter):
+    """Formats an event as one JSON object."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        time, level, event, fields = _parts(record)
+        return json.dumps({**fields, "time": time, "level": level, "event": event}, default=str)
+
+
+def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
+    fields = {name: value for name, value in getattr(record, _FIELDS, {}).items() if value is not None}
+    if record.exc_info and record.exc_info[1] is not None:
+        fields.setdefault("text", f"{type(record.exc_info[1]).__name__}: {record.exc_info[1]}")
+    time = datetime.fromtimestamp(record.created, UTC)
+    return (
+        f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond // 1000:03}Z",
+        record.levelname.lower(),
+        record.getMessage(),
+        fields,
+    )
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[\s\"=\\]", "_", name)
+
+
+def _word(value: object) -> str:
+    """Return a value so that it is one word, whatever a stranger has put into it."""
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if _BARE.fullmatch(text) and text.isprintable() else json.dumps(text)

@@ -1,0 +1,190 @@
+"""How a central node is, for Prometheus."""
+
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.network import addresses
+from ertis_numba.network.status import Percentiles, Status
+
+if TYPE_CHECKING:
+    import threading
+
+    from prometheus_client.core import Metric
+
+__all__ = ["Metrics"]
+
+_STATES: Final = ("storage", "processing", "fault", "closing")
+_QUANTILES: Final = (("0.5", "p50_ms"), ("0.9", "p90_ms"), ("0.99", "p99_ms"), ("1", "max_ms"))
+_OF_SENSOR: Final = {
+    "received": "Measurements received, each once",
+    "received_bytes": "Bytes of measurements received",
+    "stored": "Measurements that are durable",
+    "published": "Measurements that were published",
+    "repeated": "Measurements that came again",
+    "conflicts": "Measurements that came again and were not the same",
+}
+_NOW_OF_SENSOR: Final = {
+    "connected": "Whether its sensor node is there",
+    "rate_hz": "Measurements a second",
+    "in_flight": "Measurements being processed",
+    "queue": "Measurements that wait",
+    "settled": "Highest sequence number up to which all is known",
+}
+
+
+class Metrics:
+    """Serves the status of a central node as metrics, over HTTP and on this machine only.
+
+    ::
+
+        with Metrics("127.0.0.1:9101", node.status):
+            ...
+
+    Parameters
+    ----------
+    address : str
+        ``HOST:PORT``; port 0 for any that is free.
+    latest : callable
+        Returns the status. It is called from other threads.
+
+    Attributes
+    ----------
+    address : str
+        ``HOST:PORT``, with the port that it was, once it is started.
+
+    Raises
+    ------
+    ArgumentError
+        The address is not of this machine alone, or prometheus-client is not installed.
+    """
+
+    def __init__(self, address: str, latest: Callable[[], Status]) -> None:
+        try:
+            import prometheus_client  # noqa: F401, PLC0415  an extra
+        except ImportError as error:
+            raise ArgumentError(
+                "metrics need prometheus-client, which is not installed; run \"pip install 'ertis-numba[metrics]'\""
+            ) from error
+        endpoint = addresses.endpoint(f"tcp://{address}")
+        if not addresses.is_loopback(endpoint):
+            raise ArgumentError(f"metrics address {address!r} can be reached from other machines; give 127.0.0.1:PORT")
+        self.address = address
+        self._host, self._port = addresses.host_of(endpoint), endpoint.rpartition(":")[2].replace("*", "0")
+        self._latest = latest
+        self._server: Any = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Serve from now on.
+
+        Raises
+        ------
+        NetworkError
+            The address is in use.
+        """
+        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415  an extra
+
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(self)
+        try:
+            self._server, self._thread = start_http_server(int(self._port), addr=self._host, registry=registry)
+        except OSError as error:
+            raise NetworkError(
+                f"{self.address} cannot be served at ({error.strerror}); give another address"
+            ) from error
+        self.address = f"{self.address.rpartition(':')[0]}:{self._server.server_port}"
+
+    def close(self) -> None:
+        """Serve no more."""
+        if self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
+        if self._thread is not None:
+            self._thread.join()
+        self._server = self._thread = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def describe(self) -> "list[Metric]":
+        """Return nothing: what there is, is known when it is asked for."""
+        return []
+
+    def collect(self) -> "Iterator[Metric]":
+        """Yield the metrics, as Prometheus asks for them."""
+        from prometheus_client.core import (  # noqa: PLC0415  an extra
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            InfoMetricFamily,
+        )
+
+        def counter(name: str, text: str, rows: Mapping[Any, float], *labels: str) -> "Metric":
+            family = CounterMetricFamily(f"ertis_{name}", text, labels=labels)
+            for values, value in rows.items():
+                family.add_metric(values, value)
+            return family
+
+        def gauge(name: str, text: str, rows: Mapping[Any, float], *labels: str) -> "Metric":
+            family = GaugeMetricFamily(f"ertis_{name}", text, labels=labels)
+            for values, value in rows.items():
+                family.add_metric(values, value)
+            return family
+
+        status = self._latest()
+        node = InfoMetricFamily("ertis_node", "The central node")
+        node.add_metric((), {"version": status.version, "host": status.host, "address": status.address})
+        yield node
+        yield gauge("state", "What it does", {(state,): status.state == state for state in _STATES}, "state")
+        yield gauge("uptime_seconds", "Since it was started", {(): status.uptime_s})
+        yield gauge("memory_bytes", "Resident memory of the process that takes in", {(): status.memory_bytes})
+        yield gauge("peers", "Sensor nodes that are there", {(): status.peers})
+        yield counter("refused", "Who was not let in, and what was not taken", _by(status.refused), "reason")
+        sensors = status.sensors.items()
+        for field, text in _OF_SENSOR.items():
+            yield counter(field, text, {(name,): getattr(each, field) for name, each in sensors}, "sensor")
+        for field, text in _NOW_OF_SENSOR.items():
+            yield gauge(field, text, {(name,): getattr(each, field) for name, each in sensors}, "sensor")
+        for field, text in (("dropped", "Measurements thrown away"), ("missing", "Sequence numbers never seen")):
+            rows = {(name, why): n for name, each in sensors for why, n in getattr(each, field).items()}
+            yield counter(field, text, rows, "sensor", "reason")
+        latency = {(name, q): s for name, each in sensors for q, s in _quantiles(each.image_latency)}
+        yield gauge("image_latency_seconds", "From arrival to image, of the latest", latency, "sensor", "quantile")
+        yield from self._rest(status, counter, gauge)
+
+    @staticmethod
+    def _rest(status: Status, counter: "Callable[..., Metric]", gauge: "Callable[..., Metric]") -> "Iterator[Metric]":
+        """Yield those of storage and of processing, as far as there are any."""
+        archive, processing = status.archive, status.processing
+        if archive is not None:
+            for field in ("journal_bytes", "free_bytes", "room_bytes", "sealing"):
+                yield gauge(f"archive_{field}", f"Archive: {field}", {(): getattr(archive, field)})
+            for field in ("sealed", "sealing_failed"):
+                yield counter(f"archive_{field}", f"Recordings: {field}", {(): getattr(archive, field)})
+            for field in ("commit", "ack"):
+                rows = {(q,): s for q, s in _quantiles(getattr(archive, field))}
+                yield gauge(f"{field}_seconds", f"Time to {field}, of the latest", rows, "quantile")
+        if processing is not None:
+            yield gauge("workers", "Worker processes", {(): len(processing.workers)})
+            for field in ("respawned", "retried", "quarantined", "publisher_respawned"):
+                yield counter(field, f"Processing: {field}", {(): getattr(processing, field)})
+            rows = {(q,): s for q, s in _quantiles(processing.process_time)}
+            yield gauge("process_seconds", "Time of a measurement in a worker, of the latest", rows, "quantile")
+            yield gauge("subscribers", "Applications that are there", {(): len(processing.subscribers)})
+            yield counter("groups", "Groups of simultaneous measurements", _by(processing.groups), "kind")
+
+
+def _by(counts: dict[str, int]) -> dict[tuple[str, ...], float]:
+    return {(name,): count for name, count in counts.items()}
+
+
+def _quantiles(times: Percentiles) -> list[tuple[str, float]]:
+    """Return quantiles in seconds."""
+    return [(name, getattr(times, field) / 1e3) for name, field in _QUANTILES]

@@ -1,0 +1,218 @@
+"""The process that hands products to applications: ``python -m …processing._publisher DESCRIPTOR``."""
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import zmq
+
+from ertis_numba.errors import DataError, ErtisError, FormatVersionError
+from ertis_numba.network import sockets
+from ertis_numba.network.gate import Gate
+from ertis_numba.network.keys import KeyPair, ServerKeys
+from ertis_numba.network.messages import (
+    AskStatus,
+    Bye,
+    Image,
+    Message,
+    Ping,
+    Points,
+    Pong,
+    Raw,
+    Refused,
+    Report,
+    Subscribe,
+    decode,
+    encode,
+)
+from ertis_numba.network.processing import notes
+from ertis_numba.network.processing.child import pipe_of_child
+from ertis_numba.network.processing.notes import ToPublisher
+from ertis_numba.network.processing.slots import View
+from ertis_numba.network.processing.subscribers import Item, Subscribers
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing.pipe import Pipe
+
+_PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same bytes in one large frame
+_AT_ONCE: Final = 64
+_TICK_MS: Final = 200
+_TELL_S: Final = 1.0
+_HEARD_BYTES: Final = 4096  # of what applications send
+
+
+class _Publisher:
+    def __init__(self, pipe: "Pipe[ToPublisher]", begin: notes.Begin) -> None:
+        self._pipe = pipe
+        self._views: dict[int, View] = {}
+        self._status = b""
+        self._reports = 0
+        self._wanted: notes.Wanted | None = None
+        self._next_tick_s = self._next_tell_s = 0.0
+        keys = None
+        if begin.public:
+            keys = ServerKeys(KeyPair(begin.public, begin.secret, begin.name), Path(begin.allow))
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._gate = Gate(context, keys)
+        self._socket = sockets.server(context, begin.address, keys=keys, most_bytes=_HEARD_BYTES)
+        self._gate.watch(self._socket)
+        self._subscribers = Subscribers(self._socket)
+        address = sockets.bound(self._socket)
+        self._gate.self_test(address)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._pipe.fileno(), zmq.POLLIN)
+        if self._gate.socket is not None:
+            self._poller.register(self._gate.socket, zmq.POLLIN)
+        pipe.send(notes.Started(address=address))
+
+    def run(self) -> None:
+        while not self._pipe.closed:
+            self._poller.poll(_TICK_MS)
+            self._gate.serve()
+            for note in self._pipe.receive():
+                self._obey(note)
+            for _ in range(_AT_ONCE):
+                try:
+                    frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
+                except zmq.Again:
+                    break
+                self._hear(frames)
+            self._tick(time.monotonic())
+
+    def _tick(self, now_s: float) -> None:
+        if now_s >= self._next_tick_s:
+            self._next_tick_s = now_s + _TICK_MS / 1000
+            self._gate.tick()
+            self._subscribers.tick(self._may_receive)
+        wanted = notes.Wanted(points=self._subscribers.sensors_for("points"))
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._pipe.send(wanted)
+        if now_s >= self._next_tell_s:
+            self._next_tell_s = now_s + _TELL_S
+            self._subscribers.tell(Pong(state="processing"))
+            if not self._pipe.waiting:
+                refused = dict(self._gate.refused)
+                self._pipe.send(
+                    notes.Served(subscribers=self._subscribers.status(), refused=refused, reports=self._reports)
+                )
+
+    def _may_receive(self, frames: Sequence[zmq.Frame]) -> bool:
+        permission = self._gate.who(frames)
+        return permission is not None and permission.may_receive
+
+    def _obey(self, note: ToPublisher) -> None:
+        match note:
+            case notes.Memory():
+                descriptor = self._pipe.files.popleft()
+                self._views[note.slot] = View(descriptor, note.words_bytes, note.image_bytes)
+                os.close(descriptor)
+            case notes.Describe():
+                self._subscribers.describe(note.description.number, [encode(note.description), *note.payloads])
+            case notes.Publish():
+                self._publish(note)
+            case notes.Grouped():
+                self._subscribers.offer(Item("group", "", note.group, ()))
+            case notes.Report():
+                self._status, self._reports = note.status, self._reports + 1
+                self._subscribers.offer(Item("status", "", Report(), (note.status,)))
+
+    def _publish(self, note: notes.Publish) -> None:
+        """Copy what anybody wants out of a slot, and say that it is free."""
+        view, sensor = self._views[note.slot], note.data.sensor
+        common: dict[str, Any] = {
+            name: getattr(note.data, name)
+            for name in ("epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
+        } | {"sensor": sensor, "number": 0, "dropped": 0}
+        times: dict[str, Any] = {"received_ns": note.received_ns, "published_ns": 0}
+        items = []
+        if self._subscribers.wanted("energyscape", sensor):
+            rows, columns = note.shape
+            payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
+            image = Image(description=note.description, shape=note.shape, dtype=note.dtype, **common, **times)
+            items.append(Item("energyscape", sensor, image, payloads, note.description))
+        if note.n_points >= 0 and self._subscribers.wanted("points", sensor):
+            cloud = Points(description=note.description, n_points=note.n_points, **common, **times)
+            items.append(Item("points", sensor, cloud, (bytes(view.points(16 * note.n_points)),), note.description))
+        if self._subscribers.wanted("raw", sensor):
+            air = {name: getattr(note.data, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")}
+            raw = Raw(description=note.raw_description, crc32=note.data.crc32, **common, **air)
+            words = bytes(view.words(note.words_bytes))
+            items.append(Item("raw", sensor, raw, (words,), note.raw_description))
+        self._pipe.send(notes.Taken(job=note.job, published_ns=time.monotonic_ns()))
+        for item in items:
+            self._subscribers.offer(item)
+
+    def _hear(self, frames: list[zmq.Frame]) -> None:
+        """Do what an application asks for, or tell it why not; never raises for what it has sent."""
+        permission = self._gate.who(frames)
+        if permission is None:
+            if frames:
+                self._subscribers.forget(frames[0].bytes)
+            return
+        if not permission.may_receive:
+            reason = f"{permission.name} is listed as {permission.role}; let it be listed as application"
+            self._refuse(frames, Refused(code="role", reason=reason), "role")
+            return
+        if len(frames) != 2:
+            text = f"a message has {len(frames) - 1} frames; send one"
+            self._refuse(frames, Refused(code="message", reason=text), "message")
+            return
+        try:
+            message = decode(frames[1].bytes, (Subscribe, AskStatus, Ping, Bye))
+        except FormatVersionError as error:
+            self._refuse(frames, Refused(code="version", reason=str(error)[:512]), "version")
+        except DataError as error:
+            self._refuse(frames, Refused(code="message", reason=str(error)[:512]), "message")
+        else:
+            self._answer(frames, permission.name, message)
+
+    def _answer(self, frames: list[zmq.Frame], name: str, message: Message) -> None:
+        match message:
+            case Subscribe():
+                if not self._subscribers.hear(frames, name, message):
+                    reason = "too many applications are connected; end one"
+                    self._refuse(frames, Refused(code="size", reason=reason), "too many")
+            case AskStatus() if self._status:
+                self._reply(frames, [encode(Report()), self._status])
+            case Ping():
+                self._reply(frames, [encode(Pong(state="processing"))])
+            case Bye():
+                self._subscribers.forget(frames[0].bytes)
+
+    def _refuse(self, frames: list[zmq.Frame], refused: Refused, why: str) -> None:
+        self._gate.refused[why] += 1
+        self._reply(frames, [encode(refused)])
+
+    def _reply(self, frames: list[zmq.Frame], answer: list[bytes]) -> None:
+        try:
+            self._socket.send_multipart([frames[0].bytes, *answer], zmq.NOBLOCK)
+        except zmq.ZMQError:  # it is gone, or takes nothing
+            return
+
+
+def _pieces(data: memoryview) -> list[bytes]:
+    """Return a copy of an image in frames that are quick to encrypt."""
+    return [bytes(data[begin : begin + _PIECE_BYTES]) for begin in range(0, len(data), _PIECE_BYTES)]
+
+
+def _main() -> None:
+    pipe: Pipe[ToPublisher] = pipe_of_child(sys.argv, ToPublisher)
+    pipe.wait(None)
+    for note in pipe.receive():
+        if isinstance(note, notes.Begin):
+            try:
+                publisher = _Publisher(pipe, note)
+            except (ErtisError, OSError) as error:
+                pipe.send(notes.Started(address="", error=str(error)))
+                return
+            publisher.run()
+            return
+
+
+if __name__ == "__main__":
+    _main()

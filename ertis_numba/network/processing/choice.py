@@ -1,0 +1,92 @@
+"""Whether a measurement gets all cores, or several get a share of them at once."""
+
+import statistics
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["Choice", "Mode"]
+
+_BUSY: Final = 0.8  # share of the time above which the cores have to be shared better …
+_CALM: Final = 0.7  # … and below which one measurement at a time is served soonest
+_LOOK_S: Final = 3.0
+_KEPT: Final = 32
+_GAIN: Final = 1.05  # that a change has to bring, as times are never quite the same
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """How many measurements are processed at once, on how many threads each."""
+
+    at_once: int
+    threads: int
+
+
+class Choice:
+    """Chooses by measured times and the measured load.
+
+    One measurement on all cores is done soonest; several at once, with a share of the cores each, wait less for each
+    other and get more done.
+
+    Parameters
+    ----------
+    workers : int
+    threads : int
+        Of all of them.
+
+    Attributes
+    ----------
+    mode : Mode
+    why : str
+        In a line.
+    """
+
+    def __init__(self, workers: int, threads: int) -> None:
+        self.wide, self.many = Mode(1, threads), Mode(workers, max(1, threads // workers))
+        self.mode = self.wide
+        self._times_s: dict[Mode, deque[float]] = {mode: deque(maxlen=_KEPT) for mode in (self.wide, self.many)}
+        self._next_s = 0.0
+        self.why = f"{self._named(self.mode)}: no time is known yet"
+
+    def seed(self, wide_s: float, many_s: float) -> None:
+        """Take what was measured before the first job."""
+        for mode, time_s in ((self.wide, wide_s), (self.many, many_s)):
+            if time_s > 0:
+                self._times_s[mode].append(time_s)
+
+    def took(self, mode: Mode, time_s: float) -> None:
+        """Take how long a job has taken."""
+        self._times_s[mode].append(time_s)
+
+    def look(self, now_s: float, rate_hz: float) -> bool:
+        """Choose again, if it is time; return whether it is another mode now.
+
+        Parameters
+        ----------
+        now_s : float
+        rate_hz : float
+            Measurements per second of all sensors together.
+        """
+        if now_s < self._next_s or not all(self._times_s.values()):
+            return False
+        self._next_s = now_s + _LOOK_S
+        if self.wide == self.many:
+            self.why = f"{self._named(self.wide)}: there is nothing to choose"
+            return False
+        before = self.mode
+        wide_s, many_s = (statistics.median(self._times_s[mode]) for mode in (self.wide, self.many))
+        busy, capacity_hz = rate_hz * wide_s, {self.wide: 1 / wide_s, self.many: self.many.at_once / many_s}
+        other = self.many if before == self.wide else self.wide
+        if busy < (_BUSY if before == self.wide else _CALM):
+            self.mode = self.wide
+        elif capacity_hz[other] > _GAIN * capacity_hz[before]:
+            self.mode = other
+        self.why = (
+            f"{self._named(self.mode)}: {rate_hz:.0f} measurements/s keep all cores busy {busy:.0%} of the time one by "
+            f"one ({1e3 * wide_s:.1f} ms each), {self.many.at_once} at once take {1e3 * many_s:.1f} ms"
+        )
+        return self.mode != before
+
+    def _named(self, mode: Mode) -> str:
+        threads = "1 thread" if mode.threads == 1 else f"{mode.threads} threads"
+        return f"{mode.at_once} at once on {threads} each" if mode.at_once > 1 else f"one at a time on {threads}"

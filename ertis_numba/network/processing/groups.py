@@ -1,0 +1,142 @@
+"""Which measurements were emitted together, as the SYNC chain says."""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from ertis_numba.capture.sync_counts import SyncCounts
+from ertis_numba.network.messages import Data, Group
+
+__all__ = ["Groups"]
+
+_RUNS: Final = 32  # that can be compared at a time
+_OPEN: Final = 32
+_MOST: Final = 32  # that the header of a group can name
+_SHORTEST_S: Final = 0.02  # between pulses, while that is not known
+_LEAST_S, _INTERVALS = 1.0, 10.0  # that an incomplete group waits for: that long, or so many intervals
+_RECENT: Final = 256  # closed groups, that are not opened again
+_FUTURE_S: Final = 0.5
+_AWAY: Final = 3.0  # as many times that: a sensor that has sent nothing for so long is not waited for
+
+Flag = Literal["incomplete", "clock", "pulse"]
+
+
+@dataclass(slots=True)
+class _Run:
+    """A run: its measurements share a counter, and a clock."""
+
+    slot: str
+    ahead_ns: int  # of its clock that nobody sets, to the one of all
+    used_ns: int = 0
+
+
+@dataclass(slots=True)
+class _Group:
+    opened_ns: int
+    members: dict[str, Data] = field(default_factory=dict)
+    flags: set[Flag] = field(default_factory=set)
+
+
+class Groups:
+    """Puts together what has the same number of a pulse.
+
+    Within a run (epoch) sensors have the same SYNC count. Counts of several runs differ by an offset that is found
+    by time: by the timestamp of the first measurement, and from then on by the sensor node's clock that nobody sets,
+    so that a clock which is set by an hour puts no measurement into another group.
+
+    Attributes
+    ----------
+    closed : Counter of str
+        Groups by ``complete``, or their flags; ``late`` are measurements of groups that were closed already.
+    """
+
+    def __init__(self) -> None:
+        slots = [str(number) for number in range(_RUNS)]
+        self._pulses: SyncCounts[tuple[Data, int]] = SyncCounts(slots, shortest_s=_SHORTEST_S)
+        self._free = slots
+        self._runs: dict[int, _Run] = {}
+        self._seen_ns: dict[str, int] = {}
+        self._groups: dict[int, _Group] = {}
+        self._recent: deque[int] = deque(maxlen=_RECENT)
+        self._realigned = 0
+        self._ahead_ns: int | None = None  # of the clock of all, to the one of this node
+        self.closed: Counter[str] = Counter()
+
+    def know(self, sensor: str, now_ns: int) -> None:
+        """Wait for a sensor from now on."""
+        self._seen_ns[sensor] = now_ns
+
+    def add(self, data: Data, arrived_ns: int) -> list[Group]:
+        """Take a measurement, and return the groups that are closed now."""
+        run = self._run(data, arrived_ns)
+        run.used_ns = self._seen_ns[data.sensor] = arrived_ns
+        at_ns = data.monotonic_ns + run.ahead_ns
+        self._ahead_ns = at_ns - arrived_ns
+        self._place(self._pulses.add(run.slot, (data, arrived_ns), data.sync_count, at_ns))
+        return self._close(arrived_ns)
+
+    def tick(self, now_ns: int) -> list[Group]:
+        """Return the groups that are closed now, as time has passed."""
+        if self._ahead_ns is not None:
+            self._place(self._pulses.release(now_ns + self._ahead_ns))
+        return self._close(now_ns)
+
+    def _run(self, data: Data, arrived_ns: int) -> _Run:
+        if data.epoch in self._runs:
+            return self._runs[data.epoch]
+        if not self._free:
+            oldest = min(self._runs, key=lambda epoch: self._runs[epoch].used_ns)
+            slot = self._runs.pop(oldest).slot
+            self._place(self._pulses.forget(slot))
+            self._free.append(slot)
+        at_ns = data.timestamp_ns
+        if self._ahead_ns is not None and at_ns - arrived_ns - self._ahead_ns > _FUTURE_S * 1e9:
+            at_ns = arrived_ns + self._ahead_ns  # nothing comes before it was measured: that clock is wrong
+        made = self._runs[data.epoch] = _Run(self._free.pop(0), at_ns - data.monotonic_ns)
+        return made
+
+    def _place(self, found: list[tuple[tuple[Data, int], int]]) -> None:
+        realigned = self._pulses.realigned > self._realigned
+        self._realigned = self._pulses.realigned
+        for (data, arrived_ns), number in found:
+            if number in self._recent or (self._recent and number < min(self._recent)):
+                self.closed["late"] += 1
+                continue
+            group = self._groups.setdefault(number, _Group(arrived_ns))
+            if realigned or data.sensor in group.members:
+                group.flags.add("pulse")
+            group.members.setdefault(data.sensor, data)
+
+    def _close(self, now_ns: int) -> list[Group]:
+        """Close groups in order: one closes when it is complete, too old, or followed by too many."""
+        patience_ns = max(_LEAST_S * 1e9, _INTERVALS * self._pulses.interval_ns)
+        sensors = {name for name, seen_ns in self._seen_ns.items() if now_ns - seen_ns < _AWAY * patience_ns}
+        ready = [
+            number
+            for number, group in self._groups.items()
+            if sensors <= group.members.keys() or now_ns - group.opened_ns > patience_ns
+        ]
+        while len(self._groups) - len(ready) > _OPEN:
+            ready.append(min(self._groups.keys() - set(ready)))
+        return [self._made(number, self._groups.pop(number), sensors) for number in sorted(ready)]
+
+    def _made(self, number: int, group: _Group, sensors: set[str]) -> Group:
+        missing = sorted(sensors - group.members.keys())
+        members = sorted(group.members.values(), key=lambda data: data.sensor)
+        times_ns = [data.timestamp_ns for data in members]
+        spread_ns = max(times_ns) - min(times_ns)
+        if missing:
+            group.flags.add("incomplete")
+        if spread_ns > self._pulses.interval_ns / 2:
+            group.flags.add("clock")
+        self._recent.append(number)
+        self.closed.update(set[str](group.flags) or {"complete"})
+        return Group(
+            number=0,
+            dropped=0,
+            group=number,
+            members=tuple((data.sensor, data.epoch, data.sequence) for data in members[:_MOST]),
+            missing=tuple(missing[:_MOST]),
+            spread_ns=spread_ns,
+            flags=tuple(sorted(group.flags)),
+        )

@@ -1,0 +1,230 @@
+"""The publisher as the central node sees it: a process that is started, told, watched and started again."""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from ertis_numba.errors import NetworkError
+from ertis_numba.network.log import Log
+from ertis_numba.network.messages import Description, Group
+from ertis_numba.network.processing import notes
+from ertis_numba.network.processing.child import Child
+from ertis_numba.network.processing.notes import FromPublisher
+from ertis_numba.network.processing.options import Options
+from ertis_numba.network.processing.runner import Job
+from ertis_numba.network.processing.subscribers import DESCRIPTIONS
+from ertis_numba.network.status import Status, SubscriberStatus
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing.slots import Slot
+
+__all__ = ["Publisher"]
+
+_MODULE: Final = "ertis_numba.network.processing._publisher"
+# The GNU C library gives the memory of large blocks back to the system and asks for it again, which is a page fault for
+# each 4 KiB: 3600 for an image of 14 MB, and 5 of the 12 ms that the system took for it. Kept, there are 100.
+_KEEP_MEMORY: Final = {
+    "MALLOC_MMAP_THRESHOLD_": str(32 * 2**20),
+    "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
+    "MALLOC_ARENA_MAX": "1",
+}
+_STARTED_S: Final = 20.0
+_HUNG_S: Final = 10.0  # without a word, where it tells each second
+_BACK_OFF_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
+_CLOSED_S: Final = 2.0
+
+
+class Publisher:
+    """Hands products to applications, in a process of its own.
+
+    Parameters
+    ----------
+    options : Options
+    log : Log
+        Told what goes wrong.
+
+    Attributes
+    ----------
+    address : str
+        Where applications subscribe; it stays the same.
+    respawned : int
+    subscribers : tuple of SubscriberStatus
+    refused : dict of str to int
+        Messages and keys that were refused, by reason.
+    """
+
+    def __init__(self, options: Options, log: Log) -> None:
+        self._options, self._log = options, log
+        self.address = options.publish
+        self.respawned = 0
+        self.subscribers: tuple[SubscriberStatus, ...] = ()
+        self.refused: dict[str, int] = {}
+        self._refused_before: dict[str, int] = {}
+        self._child: Child[FromPublisher] | None = None
+        self._serves = False
+        self._next_s = 0.0
+        self._deaths = 0
+        self._heard_s = 0.0
+        self._points: tuple[str, ...] | None = ()
+        self._jobs: dict[int, Job] = {}
+        self._slots: dict[int, Slot] = {}
+        self._descriptions: dict[int, tuple[Description, tuple[bytes, ...]]] = {}
+        self._told: set[int] = set()
+        self._reports_sent = self._reports_taken = 0
+
+    def start(self) -> None:
+        """Start the process, and wait until it listens.
+
+        Raises
+        ------
+        NetworkError
+            It cannot listen there.
+        """
+        self._begin()
+        end_s = time.monotonic() + _STARTED_S
+        while self._child is not None and not self._serves:
+            if time.monotonic() > end_s or self._child.pipe.closed:
+                raise NetworkError(f"{self.address} is not listened at: its process ended or hangs; try again")
+            self._child.pipe.wait(0.2)
+            for note in self._child.pipe.receive():
+                if isinstance(note, notes.Started) and note.error:
+                    raise NetworkError(note.error)
+                self._take(note)
+
+    @property
+    def pid(self) -> int:
+        """Of the process; 0 while there is none."""
+        return 0 if self._child is None else self._child.pid
+
+    @property
+    def serves(self) -> bool:
+        """Whether it takes products now."""
+        return self._serves
+
+    def wants_points(self, sensor: str) -> bool:
+        """Whether anybody wants the points of a sensor."""
+        return self._points is None or sensor in self._points
+
+    def describe(self, description: Description, payloads: tuple[bytes, ...]) -> None:
+        """Say what products are about, before the first of them."""
+        self._descriptions[description.number] = description, payloads
+        while len(self._descriptions) > DESCRIPTIONS:
+            del self._descriptions[min(self._descriptions)]
+
+    def publish(self, job: Job, publish: notes.Publish) -> None:
+        """Hand over a job that is done; `Taken` tells of it, or its death does."""
+        child, slot = self._child, job.slot
+        if child is None or slot is None:
+            raise AssertionError("nothing can be published now; ask serves first")
+        if self._slots.get(slot.number) is not slot:
+            self._slots[slot.number] = slot
+            note = notes.Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
+            child.pipe.send(note, files=(slot.descriptor,))
+        for number in (publish.description, publish.raw_description):
+            if number not in self._told:
+                self._told.add(number)
+                description, payloads = self._descriptions[number]
+                child.pipe.send(notes.Describe(description=description, payloads=payloads))
+        self._jobs[job.number] = job
+        child.pipe.send(publish)
+
+    def group(self, group: Group) -> None:
+        """Tell of a group that is closed; it is not told while the process does not listen."""
+        if self._child is not None and self._serves and not self._child.pipe.waiting:
+            self._child.pipe.send(notes.Grouped(group=group))
+
+    def report(self, status: Status) -> None:
+        """Tell how the central node is, if what was told before has been taken."""
+        if self._child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
+            self._reports_sent += 1
+            self._child.pipe.send(notes.Report(status=msgspec.msgpack.encode(status)))
+
+    def fds(self) -> Iterable[int]:
+        """Return what is to be polled now."""
+        return () if self._child is None else (self._child.pipe.fileno(),)
+
+    def ready(self) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
+        """Return jobs that were published, with the time, and jobs that the process has died with."""
+        if self._child is None:
+            return (), ()
+        taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
+        lost = self._died() if self._child.pipe.closed else ()
+        return taken, lost
+
+    def tick(self, now_s: float) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
+        """Do as `ready`; start the process again, or end one that hangs, if it is time."""
+        if self._child is None:
+            if now_s >= self._next_s:
+                self._begin()
+            return (), ()
+        self._child.pipe.flush()
+        if now_s - self._heard_s > (_HUNG_S if self._serves else _STARTED_S):
+            self._log.warning("publisher_killed", pid=self._child.pid, text="it hangs")
+            self._child.kill()
+        if not self._child.ended:
+            return (), ()
+        taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
+        return taken, self._died()
+
+    def close(self) -> None:
+        """End it."""
+        if self._child is not None:
+            self._child.close(_CLOSED_S)
+            self._child = None
+        self._serves = False
+
+    def _begin(self) -> None:
+        keys = self._options.keys
+        self._child = Child(_MODULE, FromPublisher, environment=_KEEP_MEMORY)
+        self._heard_s = time.monotonic()
+        given: dict[str, Any] = {}
+        if keys is not None:
+            given = {
+                "name": keys.pair.name,
+                "public": keys.pair.public,
+                "secret": keys.pair.secret,
+                "allow": str(keys.allow),
+            }
+        self._child.pipe.send(notes.Begin(address=self.address, **given))
+
+    def _take(self, note: FromPublisher) -> tuple[Job, int] | None:
+        self._heard_s = time.monotonic()
+        match note:
+            case notes.Started(address=address, error=error):
+                if error:
+                    self._log.error("publisher_silent", text=error)
+                else:
+                    self.address, self._serves = address, True
+            case notes.Wanted(points=points):
+                self._points = points
+            case notes.Served():
+                self.subscribers, self._deaths = note.subscribers, 0
+                self._reports_taken = note.reports
+                names = {*self._refused_before, *note.refused}
+                self.refused = {name: self._refused_before.get(name, 0) + note.refused.get(name, 0) for name in names}
+            case notes.Taken(job=number, published_ns=published_ns):
+                job = self._jobs.pop(number, None)
+                return None if job is None else (job, published_ns)
+        return None
+
+    def _died(self) -> list[Job]:
+        """Clear up after the process, and return what it had taken with it."""
+        if self._child is None:
+            return []
+        self._child.kill()
+        self._child.close()
+        self._log.warning("publisher_died", pid=self._child.pid, text="another takes its place")
+        self._child, self._serves = None, False
+        self._next_s = time.monotonic() + _BACK_OFF_S[min(self._deaths, len(_BACK_OFF_S) - 1)]
+        self._deaths += 1
+        self.respawned += 1
+        self.subscribers, self._points = (), ()
+        self._refused_before = self.refused
+        self._reports_sent = self._reports_taken = 0
+        self._slots.clear()
+        self._told.clear()
+        lost = list(self._jobs.values())
+        self._jobs.clear()
+        return lost

@@ -1,0 +1,82 @@
+"""Where measurements are kept that workers have died of, so that somebody can find out why."""
+
+import queue
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.network.log import Log
+
+__all__ = ["Quarantine"]
+
+_WAITING: Final = 16
+
+
+class Quarantine:
+    """Writes measurements into a journal, from a thread: a slow disk delays nobody.
+
+    ``ertis recover`` makes a recording of it.
+
+    Parameters
+    ----------
+    folder : Path
+    log : Log
+        Told what goes wrong.
+    """
+
+    def __init__(self, folder: Path, log: Log) -> None:
+        self._folder, self._log = folder, log
+        self._waiting: queue.Queue[Entry | None] = queue.Queue(_WAITING)
+        self._thread = threading.Thread(target=self._run, name="quarantine", daemon=True)
+        self._thread.start()
+        self._journal: Journal | None = None
+
+    def put(self, entry: Entry) -> None:
+        """Keep a measurement, unless the disk is far behind."""
+        try:
+            self._waiting.put_nowait(entry)
+        except queue.Full:
+            self._lost(entry, "the disk is too slow")
+
+    def close(self) -> None:
+        """End it, when what waits is written."""
+        self._waiting.put(None)
+        self._thread.join()
+
+    def _lost(self, entry: Entry, why: str) -> None:
+        stamp = entry.measurement.stamp
+        self._log.error("not_kept", sensor=stamp.sensor, epoch=stamp.epoch, sequence=stamp.sequence, text=why)
+
+    def _run(self) -> None:
+        while (entry := self._waiting.get()) is not None:
+            try:
+                self._write(entry)
+            except (OSError, ValueError) as error:
+                self._lost(entry, str(error))
+        if self._journal is not None:
+            self._journal.close()
+
+    def _write(self, entry: Entry) -> None:
+        measurement: Measurement = entry.measurement
+        if self._journal is not None:
+            try:
+                self._append(self._journal, measurement, entry)
+            except ArgumentError:  # numbers that do not rise, or other settings: that needs another journal
+                self._journal.close()
+                self._journal = None
+            else:
+                return
+        target = self._folder / f"quarantine_{datetime.now(UTC):%Y%m%dT%H%M%S_%fZ}.h5"
+        self._journal = Journal.create(target.with_name(target.name + SUFFIX), target=target.name, source="quarantine")
+        self._append(self._journal, measurement, entry)
+        self._log.warning("quarantine", text=f"see what is kept by 'ertis recover {self._journal.path}'")
+
+    @staticmethod
+    def _append(journal: Journal, measurement: Measurement, entry: Entry) -> None:
+        if measurement.stamp.sensor not in journal.sensors:
+            journal.add_sensor(measurement.stamp.sensor, measurement.settings)
+        journal.append([entry])

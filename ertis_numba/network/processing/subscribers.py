@@ -1,0 +1,243 @@
+"""What each application gets: what it has asked for, as much as it takes, the latest first."""
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeAlias
+
+import msgspec
+import zmq
+
+from ertis_numba.network.messages import Group, Image, Message, Points, Product, Raw, Report, Subscribe, encode
+from ertis_numba.network.status import SubscriberStatus
+
+__all__ = ["DESCRIPTIONS", "Item", "Subscriber", "Subscribers"]
+
+DESCRIPTIONS: Final = 256
+"""That are kept: two of each sensor, and those of before a change of its settings."""
+
+_MOST: Final = 256
+_SILENT_S: Final = 3.0
+_UNDER_WAY_BYTES: Final = 64_000_000  # that an application may have been sent and not yet have taken
+_AFTER_S: Final = 60.0  # that one is remembered when it says nothing any more
+
+Header: TypeAlias = Image | Points | Raw | Group | Report
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Item:
+    """Something to be sent, to whoever wants it.
+
+    Attributes
+    ----------
+    product : str
+    sensor : str
+        Empty for what is of no sensor.
+    header : Message
+        But for its numbers.
+    payloads : sequence of bytes
+        Shared by all that get it.
+    description : int
+        That has to be sent before; -1 if there is none.
+    """
+
+    product: Product
+    sensor: str
+    header: Header
+    payloads: Sequence[bytes]
+    description: int = -1
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the payloads."""
+        return sum(map(len, self.payloads))
+
+
+@dataclass(slots=True, eq=False)
+class Subscriber:
+    """An application that is connected.
+
+    Attributes
+    ----------
+    frames : sequence of zmq.Frame
+        Its latest message: whose it is, is to be asked again and again.
+    wants : Subscribe
+    """
+
+    frames: Sequence[zmq.Frame]
+    name: str
+    wants: Subscribe
+    before: int = 0  # what it had consumed when it was first heard of
+    heard_s: float = 0.0
+    active: bool = True
+    number: int = 0  # of the next product
+    sent: int = 0
+    dropped: int = 0
+    described: set[int] = field(default_factory=set)
+    under_way: deque[int] = field(default_factory=deque)  # bytes of each product that it has not consumed yet
+    waiting: dict[tuple[str, str], tuple[int, Item]] = field(default_factory=dict)
+
+    def asks_for(self, product: str, sensor: str) -> bool:
+        """Whether it wants this."""
+        sensors = self.wants.sensors
+        return product in self.wants.products and (not sensor or sensors is None or sensor in sensors)
+
+    @property
+    def has_credit(self) -> bool:
+        """Whether something may be sent to it."""
+        return len(self.under_way) < self.wants.credit and sum(self.under_way) < _UNDER_WAY_BYTES
+
+    def consumed(self, wants: Subscribe) -> None:
+        """Take what it says to want and to have consumed."""
+        self.wants = wants
+        left = max(0, self.sent - max(0, wants.consumed - self.before))
+        while len(self.under_way) > left:
+            self.under_way.popleft()
+        for key in [key for key in self.waiting if not self.asks_for(*key)]:
+            del self.waiting[key]
+            self.dropped += 1
+
+    def offer(self, item: Item) -> None:
+        """Give it something that it gets as soon as it has credit, unless something newer comes first."""
+        if not self.asks_for(item.product, item.sensor):
+            return
+        key = (item.product, item.sensor)
+        self.dropped += key in self.waiting
+        self.waiting[key] = (self.number, item)
+        self.number += 1
+
+    def next(self) -> tuple[tuple[str, str], int, Item] | None:
+        """Return what is to be sent next, if anything."""
+        if not self.waiting or not self.has_credit:
+            return None
+        key = min(self.waiting, key=lambda each: self.waiting[each][0])
+        return key, *self.waiting[key]
+
+    def was_sent(self, key: tuple[str, str]) -> None:
+        """Note that something is under way to it."""
+        _, item = self.waiting.pop(key)
+        self.under_way.append(item.n_bytes)
+        self.sent += 1
+
+    def retire(self) -> None:
+        """Forget what it wants until it says so again; its numbers go on."""
+        self.active = False
+        self.dropped += len(self.waiting)
+        self.waiting.clear()
+
+
+class Subscribers:
+    """All applications, and the socket that they are connected to.
+
+    Parameters
+    ----------
+    socket : zmq.Socket
+        A ROUTER.
+    """
+
+    def __init__(self, socket: "zmq.Socket[bytes]") -> None:
+        self._socket = socket
+        self._all: dict[bytes, Subscriber] = {}
+        self._descriptions: dict[int, list[bytes]] = {}
+
+    def __iter__(self) -> Iterator[Subscriber]:
+        return (each for each in self._all.values() if each.active)
+
+    def hear(self, frames: Sequence[zmq.Frame], name: str, wants: Subscribe) -> bool:
+        """Take what an application wants; return whether it is a new one that there is room for, or a known one."""
+        routing_id, now_s = frames[0].bytes, time.monotonic()
+        known = self._all.get(routing_id)
+        if known is None:
+            if sum(1 for _ in self) >= _MOST:
+                return False
+            known = self._all[routing_id] = Subscriber(frames, name, wants, before=wants.consumed)
+        known.frames, known.heard_s, known.active = frames, now_s, True
+        known.consumed(wants)
+        self._send(routing_id, known)
+        return True
+
+    def forget(self, routing_id: bytes) -> None:
+        """Know of an application no more."""
+        self._all.pop(routing_id, None)
+
+    def describe(self, number: int, frames: list[bytes]) -> None:
+        """Keep what products are about, for those who get one of them."""
+        self._descriptions[number] = frames
+        while len(self._descriptions) > DESCRIPTIONS:
+            del self._descriptions[min(self._descriptions)]
+
+    def wanted(self, product: Product, sensor: str) -> bool:
+        """Whether anybody wants this."""
+        return any(each.asks_for(product, sensor) for each in self)
+
+    def sensors_for(self, product: Product) -> tuple[str, ...] | None:
+        """Return the sensors of which anybody wants a product; None are all."""
+        asked = [each.wants.sensors for each in self if product in each.wants.products]
+        if any(sensors is None for sensors in asked):
+            return None
+        return tuple(sorted(set(itertools.chain.from_iterable(sensors or () for sensors in asked))))
+
+    def offer(self, item: Item) -> None:
+        """Send something to whoever wants it and has credit; the others get it, or something newer, later."""
+        for routing_id, each in list(self._all.items()):
+            if each.active:
+                each.offer(item)
+                self._send(routing_id, each)
+
+    def tick(self, may_receive: Any) -> None:
+        """Retire those who are silent, and forget those who ``may_receive`` no more; send what could not be before."""
+        now_s = time.monotonic()
+        for routing_id, each in list(self._all.items()):
+            if now_s - each.heard_s > _AFTER_S or (each.active and not may_receive(each.frames)):
+                self.forget(routing_id)
+            elif each.active and now_s - each.heard_s > _SILENT_S:
+                each.retire()
+            elif each.active:
+                self._send(routing_id, each)
+
+    def tell(self, message: Message) -> None:
+        """Send a message that is no product to everybody."""
+        header = encode(message)
+        for routing_id in [routing_id for routing_id, each in self._all.items() if each.active]:
+            self._put(routing_id, [header])
+
+    def status(self) -> tuple[SubscriberStatus, ...]:
+        """Return how they are served."""
+        return tuple(
+            SubscriberStatus(
+                name=each.name,
+                products=each.wants.products,
+                sensors=each.wants.sensors,
+                sent=each.sent,
+                dropped=each.dropped,
+            )
+            for each in self
+        )
+
+    def _send(self, routing_id: bytes, each: Subscriber) -> None:
+        while (found := each.next()) is not None:
+            key, number, item = found
+            if item.description >= 0 and item.description not in each.described:
+                if not self._put(routing_id, self._descriptions[item.description]):
+                    return
+                each.described.add(item.description)
+            changes: dict[str, Any] = {"number": number, "dropped": each.dropped}
+            if isinstance(item.header, Image | Points):
+                changes["published_ns"] = time.monotonic_ns()
+            header = encode(msgspec.structs.replace(item.header, **changes))
+            if not self._put(routing_id, [header, *item.payloads]):
+                return
+            each.was_sent(key)
+
+    def _put(self, routing_id: bytes, frames: Iterable[bytes]) -> bool:
+        """Send a message to an application; return whether it could be, and forget one that is gone."""
+        try:
+            self._socket.send_multipart([routing_id, *frames], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError:  # there is no such peer any more
+            self.forget(routing_id)
+            return False
+        return True

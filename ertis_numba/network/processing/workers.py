@@ -1,0 +1,354 @@
+"""Local worker processes: started, fed, watched, killed and started again."""
+
+import os
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+
+from ertis_numba.network.log import Log
+from ertis_numba.network.processing.child import Child
+from ertis_numba.network.processing.choice import Choice, Mode
+from ertis_numba.network.processing.notes import (
+    Failed,
+    Forget,
+    FromWorker,
+    Made,
+    Memory,
+    Prepare,
+    Prepared,
+    Process,
+    Ready,
+    Unusable,
+)
+from ertis_numba.network.processing.options import Options
+from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, bytes_of
+from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.status import WorkerStatus
+
+__all__ = ["Workers"]
+
+_MODULE: Final = "ertis_numba.network.processing._worker"
+_SLOTS: Final = 2  # of each worker: one is processed while the publisher reads the other
+_LOADING_S: Final = 60.0
+_BACK_OFF_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # before a worker that dies again and again is started again
+_TRIES: Final = 2  # workers that may die over getting ready for a kind
+_CLOSED_S: Final = 2.0
+
+
+@dataclass(slots=True, eq=False)
+class _Worker:
+    number: int
+    child: Child[FromWorker] | None = None
+    ready: bool = False
+    slots: list[Slot] = field(default_factory=list)
+    free: list[Slot] = field(default_factory=list)
+    kinds: set[int] = field(default_factory=set)
+    preparing: Kind | None = None
+    job: Job | None = None
+    slot: Slot | None = None  # that the job is in
+    mode: Mode | None = None  # in which it runs
+    deadline_s: float = float("inf")
+    deaths: int = 0
+    start_s: float = 0.0
+    done: int = 0
+
+    @property
+    def state(self) -> Literal["starting", "idle", "busy"]:
+        if not self.ready or self.preparing is not None:
+            return "starting"
+        return "idle" if self.job is None else "busy"
+
+
+class Workers:
+    """A `Runner` whose jobs run in processes of this machine.
+
+    Each worker has a pipe and two slots of its own, so that one that dies at any moment takes nothing with it but the
+    job it had. A worker is killed when it is not done in time.
+
+    Parameters
+    ----------
+    options : Options
+    log : Log
+        Told what goes wrong.
+
+    Attributes
+    ----------
+    choice : str
+    respawned : int
+    """
+
+    def __init__(self, options: Options, log: Log) -> None:
+        self._options, self._log = options, log
+        self._threads = options.threads or _n_cores()
+        count = options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads)
+        self._chosen = Choice(count, self._threads)
+        self._kinds: dict[int, Kind] = {}
+        self._prepared: dict[int, Prepared] = {}
+        self._tries: dict[int, int] = {}
+        self._workers = [_Worker(number) for number in range(count)]
+        self._started = 1  # the others wait until the first has compiled what all need, and has found a device
+        self.respawned = 0
+        self._start(self._workers[0])
+
+    @property
+    def choice(self) -> str:
+        """How measurements share the cores, and why."""
+        return self._chosen.why
+
+    def prepare(self, kind: Kind) -> None:
+        """See `Runner`."""
+        self._kinds[kind.number] = kind
+        for worker in self._workers:
+            self._next_kind(worker)
+
+    def forget(self, kind: Kind) -> None:
+        """See `Runner`."""
+        self._kinds.pop(kind.number, None)
+        self._prepared.pop(kind.number, None)
+        for worker in self._workers:
+            if kind.number in worker.kinds and worker.child is not None:
+                worker.kinds.discard(kind.number)
+                worker.child.pipe.send(Forget(kind=kind.number))
+
+    def takes(self, kind: Kind) -> bool:
+        """See `Runner`."""
+        busy = sum(worker.job is not None for worker in self._workers)
+        return busy < self._chosen.mode.at_once and self._idle(kind) is not None
+
+    def _idle(self, kind: Kind) -> _Worker | None:
+        for worker in self._workers:
+            if worker.state == "idle" and kind.number in worker.kinds and worker.free:
+                return worker
+        return None
+
+    def submit(self, job: Job) -> None:
+        """See `Runner`."""
+        worker = self._idle(job.kind)
+        if worker is None or worker.child is None:
+            raise AssertionError("a job is submitted that no worker takes; ask takes() first")
+        worker.job, worker.mode = job, self._chosen.mode
+        worker.slot = slot = worker.free.pop(0)
+        slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
+        worker.deadline_s = time.monotonic() + self._options.deadline_s
+        worker.child.pipe.send(
+            Process(
+                job=job.number,
+                kind=job.kind.number,
+                slot=slot.number,
+                words_bytes=job.words.nbytes,
+                threads=worker.mode.threads,
+                points=job.points,
+            )
+        )
+
+    def give_back(self, slot: Slot) -> None:
+        """See `Runner`."""
+        worker = self._workers[slot.number // _SLOTS]
+        if slot in worker.slots:
+            worker.free.append(slot)
+
+    def fds(self) -> Iterable[int]:
+        """See `Runner`."""
+        return [worker.child.pipe.fileno() for worker in self._workers if worker.child is not None]
+
+    def ready(self, fd: int) -> Sequence[Event]:
+        """See `Runner`."""
+        for worker in self._workers:
+            if worker.child is not None and worker.child.pipe.fileno() == fd:
+                return self._heard(worker)
+        return []
+
+    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
+        """See `Runner`."""
+        found: list[Event] = []
+        for worker in self._workers[: self._started]:
+            if worker.child is None:
+                if now_s >= worker.start_s:
+                    self._start(worker)
+                continue
+            worker.child.pipe.flush()
+            if now_s > worker.deadline_s:
+                self._log.warning("worker_killed", pid=worker.child.pid, text="it was not done in time")
+                worker.child.kill()
+            if worker.child.ended:
+                found += self._heard(worker)  # it may have told something before
+            else:
+                self._next_kind(worker)
+        if self._chosen.look(now_s, rate_hz):
+            self._log.info("choice", text=self._chosen.why)
+        return found
+
+    def status(self) -> list[WorkerStatus]:
+        """See `Runner`."""
+        return [
+            WorkerStatus(pid=worker.child.pid, state=worker.state, done=worker.done)
+            for worker in self._workers
+            if worker.child is not None
+        ]
+
+    def close(self) -> None:
+        """See `Runner`."""
+        for worker in self._workers:
+            if worker.child is not None:
+                worker.child.pipe.close()  # all notice at the same time
+        for worker in self._workers:
+            if worker.child is not None:
+                worker.child.close(_CLOSED_S)
+                worker.child = None
+            for slot in worker.slots:
+                slot.close()
+            worker.slots, worker.free = [], []
+
+    def _start(self, worker: _Worker) -> None:
+        threads = str(self._threads)
+        worker.child = Child(
+            _MODULE,
+            FromWorker,
+            [
+                self._options.device,
+                self._options.dtype,
+                threads,
+                str(len(self._workers)),
+                str(self._options.deadline_s),
+            ],
+        )
+        worker.deadline_s = time.monotonic() + _LOADING_S
+
+    def _heard(self, worker: _Worker) -> list[Event]:
+        """Return what a worker has to tell."""
+        found: list[Event] = []
+        if worker.child is None:
+            return found
+        for note in worker.child.pipe.receive():
+            match note:
+                case Ready(device=device, threads=threads):
+                    self._loaded(worker, device, threads)
+                case Prepared():
+                    found += self._became_ready(worker, note)
+                case Unusable(kind=kind, text=text):
+                    self._kinds.pop(kind, None)
+                    worker.preparing, worker.deadline_s = None, float("inf")
+                    found.append(KindFailed(kind, text))
+                case Made() | Failed():
+                    found += self._finished(worker, note)
+        if worker.child.pipe.closed or worker.child.ended:
+            worker.child.kill()
+            found += self._died(worker)
+        else:
+            self._next_kind(worker)
+        return found
+
+    def _loaded(self, worker: _Worker, device: str, threads: int) -> None:
+        worker.ready, worker.deadline_s = True, float("inf")
+        if self._started == 1 and not self._kinds_known:
+            if threads == 1 and self._options.workers is None and len(self._workers) > 1:
+                # A GPU, say, that serves one measurement faster than it serves several.
+                self._log.info("choice", text=f"device {device} has one worker")
+                del self._workers[1:]
+                self._chosen = Choice(1, 1)
+            elif threads < self._threads:
+                self._chosen = Choice(len(self._workers), threads)
+
+    @property
+    def _kinds_known(self) -> bool:
+        return bool(self._prepared)
+
+    def _became_ready(self, worker: _Worker, note: Prepared) -> list[Event]:
+        kind = worker.preparing
+        worker.preparing, worker.deadline_s = None, float("inf")
+        if kind is None or kind.number not in self._kinds:
+            return []
+        worker.kinds.add(kind.number)
+        self._give_memory(worker, kind.words_bytes, self._image_bytes(note))
+        self._started = len(self._workers)
+        if kind.number in self._prepared:
+            return []
+        self._prepared[kind.number] = note
+        self._chosen.seed(note.wide_s, note.many_s)
+        return [KindReady(note)]
+
+    def _image_bytes(self, note: Prepared) -> int:
+        return int(np.prod(note.shape)) * np.dtype(self._options.dtype).itemsize
+
+    def _give_memory(self, worker: _Worker, words_bytes: int, image_bytes: int) -> None:
+        """See to it that a worker has slots that are large enough; those that are read elsewhere are given later."""
+        if worker.child is None:
+            return
+        if not worker.slots:
+            numbers = range(_SLOTS * worker.number, _SLOTS * (worker.number + 1))
+            worker.slots = [Slot(number, words_bytes, image_bytes) for number in numbers]
+            worker.free = list(worker.slots)
+        elif not all(slot.holds(words_bytes, image_bytes) for slot in worker.slots):
+            # What the publisher reads of the old ones, it has as long as it needs it.
+            most = max(words_bytes, worker.slots[0].words_bytes), max(image_bytes, worker.slots[0].image_bytes)
+            for slot in worker.slots:
+                slot.close()
+            worker.slots = [Slot(slot.number, *most) for slot in worker.slots]
+            worker.free = list(worker.slots)
+        for slot in worker.slots:
+            note = Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
+            worker.child.pipe.send(note, files=(slot.descriptor,))
+
+    def _finished(self, worker: _Worker, note: Made | Failed) -> list[Event]:
+        job, slot = worker.job, worker.slot
+        if job is None or slot is None or note.job != job.number:
+            return []
+        worker.job = worker.slot = None
+        worker.deadline_s = float("inf")
+        if isinstance(note, Failed):
+            worker.free.append(slot)
+            return [Lost(job, note.text, note.again)]
+        worker.done += 1
+        worker.deaths = 0
+        if worker.mode in (self._chosen.wide, self._chosen.many) and worker.mode is not None:
+            self._chosen.took(worker.mode, note.took_s)
+        job.slot, job.n_points = slot, note.n_points
+        return [Done(job, note.took_s)]
+
+    def _next_kind(self, worker: _Worker) -> None:
+        """Let a worker that has nothing else to do get ready for a kind that it does not know."""
+        if worker.child is None or worker.state != "idle":
+            return
+        if worker.kinds and any(other.preparing for other in self._workers):
+            return  # one after the other, so that sensors which are served go on to be
+        for number, kind in self._kinds.items():
+            if number not in worker.kinds:
+                worker.preparing = kind
+                worker.deadline_s = time.monotonic() + self._options.prepare_s
+                measure = not self._prepared
+                worker.child.pipe.send(Prepare(kind=number, settings=kind.settings, measure=measure))
+                return
+
+    def _died(self, worker: _Worker) -> list[Event]:
+        """Clear up after a worker, and return what became of its job."""
+        if worker.child is None:
+            return []
+        pid, found = worker.child.pid, list[Event]()
+        worker.child.close()
+        worker.child, worker.ready = None, False
+        worker.kinds.clear()
+        worker.deadline_s = float("inf")
+        worker.start_s = time.monotonic() + _BACK_OFF_S[min(worker.deaths, len(_BACK_OFF_S) - 1)]
+        worker.deaths += 1
+        self.respawned += 1
+        kind, job, slot = worker.preparing, worker.job, worker.slot
+        worker.preparing = worker.job = worker.slot = None
+        self._log.warning("worker_died", pid=pid, text="another takes its place")
+        if kind is not None and kind.number in self._kinds:
+            self._tries[kind.number] = self._tries.get(kind.number, 0) + 1
+            if self._tries[kind.number] >= _TRIES:
+                del self._kinds[kind.number]
+                found.append(KindFailed(kind.number, "workers die of getting ready for it"))
+        if slot is not None:
+            worker.free.append(slot)
+        if job is not None:
+            found.append(Lost(job, f"worker {pid} has died of it or was killed", again=True))
+        return found
+
+
+def _n_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,217 @@
+"""What a publisher sends, read: from messages to frames."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
+from ertis_numba.geometry import microphones
+from ertis_numba.network.messages import Description, Group, Image, Points, Raw, Report
+from ertis_numba.network.status import Status
+from ertis_numba.settings import Settings
+
+__all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader"]
+
+Item: TypeAlias = Energyscape | PointCloud | Measurement | Group | Status
+"""What an application gets."""
+Header: TypeAlias = Image | Points | Raw | Group | Report
+"""What stands before it on the wire: its number, what was dropped, times."""
+Payload: TypeAlias = Sequence[bytes | memoryview]
+
+_AXES = 3
+_MOST_OF_SENSOR = 64  # descriptions
+_COLUMNS = 4  # of a point: x, y, z and energy
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrival:
+    """A product, and what came with it.
+
+    Attributes
+    ----------
+    item : Energyscape, PointCloud, Measurement, Group or Status
+    header : Image, Points, Raw, Group or Report
+        As in `ertis_numba.network.messages`.
+    arrived_ns : int
+        When all of it was here, by a clock that nobody sets (`time.monotonic_ns`); that of ``header.monotonic_ns``
+        if the sensor node is on this machine.
+    arrived_utc_ns : int
+        The same by the clock of the wall.
+    connection : int
+        Numbers of products count from 0 in each.
+    translation_m, rotation_xyzw
+        Where the sensor is on its platform, where there is one.
+    """
+
+    item: Item
+    header: Header
+    arrived_ns: int
+    arrived_utc_ns: int
+    connection: int
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def age_s(self) -> float | None:
+        """From the emission to its being here, as far as the clocks of both machines agree; None if it has no time."""
+        stamped = getattr(self.header, "timestamp_ns", None)
+        return None if stamped is None else (self.arrived_utc_ns - stamped) / 1e9
+
+    @property
+    def made_in_s(self) -> float | None:
+        """From the measurement reaching the central node to the product leaving it; None if it is not made there."""
+        if not isinstance(self.header, Image | Points):
+            return None
+        return (self.header.published_ns - self.header.received_ns) / 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Described:
+    header: Description
+    settings: Settings
+    axes: list[NDArray[np.float64]]
+
+    @classmethod
+    def of(cls, header: Description, payload: Payload) -> "_Described":
+        if len(payload) != 1 + _AXES:
+            raise DataError(f"a description has {len(payload)} payloads; send settings and {_AXES} axes")
+        try:
+            settings = Settings.from_toml(bytes(payload[0]).decode(), f"settings of sensor {header.sensor}")
+        except (UnicodeDecodeError, ErtisError) as error:
+            raise DataError(f"a description cannot be used ({error})") from error
+        axes = []
+        for axis in payload[1:]:
+            if len(axis) % 8:
+                raise DataError(f"an axis has {len(axis)} bytes; send float64")
+            axes.append(np.frombuffer(axis, dtype="<f8").astype(np.float64))  # a copy, which outlives its frame
+        return cls(header, settings, axes)
+
+
+@dataclass(slots=True)
+class ProductReader:
+    """Makes frames of what has come through one connection, whose descriptions it keeps.
+
+    Arrays are copies of their own, which the caller may change.
+    """
+
+    _described: dict[int, _Described] = field(default_factory=dict)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._described
+
+    def describe(self, header: Description, payload: Payload) -> None:
+        """Take what later products refer to.
+
+        Raises
+        ------
+        DataError
+            It cannot be used.
+        """
+        # Each change of settings brings one: a connection that lasts for months must not keep them all.
+        of_sensor = [number for number, kept in self._described.items() if kept.header.sensor == header.sensor]
+        stale = of_sensor[: max(0, len(of_sensor) - _MOST_OF_SENSOR)]
+        for number in stale:
+            del self._described[number]
+        self._described[header.number] = _Described.of(header, payload)
+
+    def description(self, number: int) -> Description:
+        """Return what a product refers to."""
+        return self._of(number).header
+
+    def read(self, header: Header, payload: Payload) -> Item:
+        """Return the frame of a message.
+
+        Raises
+        ------
+        DataError
+            The payload is not what the header says, or nothing describes it.
+        """
+        if isinstance(header, Group):
+            return header
+        if isinstance(header, Report):
+            return _status(payload)
+        described = self._of(header.description)
+        stamp = Stamp(
+            sensor=header.sensor,
+            sequence=header.sequence,
+            sync_count=header.sync_count,
+            timestamp_ns=header.timestamp_ns,
+            timestamp_uncertainty_ns=header.uncertainty_ns,
+            epoch=header.epoch,
+        )
+        if isinstance(header, Image):
+            return _image(header, payload, described, stamp)
+        if isinstance(header, Points):
+            return _points(header, payload, described, stamp)
+        return _measurement(header, payload, described, stamp)
+
+    def _of(self, number: int) -> _Described:
+        if number not in self._described:
+            raise DataError(f"a product refers to description {number}, which has not come; send it before")
+        return self._described[number]
+
+
+def _image(header: Image, payload: Payload, described: _Described, stamp: Stamp) -> Energyscape:
+    azimuth_rad, elevation_rad, range_m = described.axes
+    wanted = (len(azimuth_rad), len(range_m))
+    if header.shape != wanted or len(elevation_rad) != len(azimuth_rad):
+        raise DataError(f"an image has shape {header.shape}, its axes {wanted}; send the same")
+    energy = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
+    return Energyscape(energy, azimuth_rad, elevation_rad, range_m, described.settings, stamp)
+
+
+def _points(header: Points, payload: Payload, described: _Described, stamp: Stamp) -> PointCloud:
+    rows = _array(payload, (header.n_points, _COLUMNS), "float32")
+    return PointCloud(
+        np.ascontiguousarray(rows[:, :3]),
+        np.ascontiguousarray(rows[:, 3]),
+        described.settings,
+        stamp,
+        described.header.translation_m,
+        described.header.rotation_xyzw,
+    )
+
+
+def _measurement(header: Raw, payload: Payload, described: _Described, stamp: Stamp) -> Measurement:
+    settings = described.settings
+    layout = microphones(settings.array)
+    shape = (settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
+    words = _array(payload, shape, f"uint{layout.word_bits}")
+    if zlib.crc32(words.data) != header.crc32:
+        raise DataError(f"measurement {header.sequence} of sensor {header.sensor} has another CRC-32 than its header")
+    air = settings.air.replace(
+        temperature_c=header.temperature_c,
+        humidity_percent=header.humidity_percent,
+        pressure_pa=header.pressure_pa,
+    )
+    return Measurement(words, settings if air == settings.air else settings.replace(air=air), stamp)
+
+
+def _status(payload: Payload) -> Status:
+    try:
+        return msgspec.msgpack.decode(b"".join(payload), type=Status)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise DataError(f"a status cannot be read ({' '.join(str(error).split())[:200]})") from error
+
+
+def _array(payload: Payload, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
+    """Return an array of what has come in one or more frames."""
+    came = sum(len(frame) for frame in payload)
+    kind = np.dtype(dtype).newbyteorder("<")
+    wanted = kind.itemsize
+    for size in shape:
+        wanted *= size  # whole numbers of any size: nothing is allocated by what a header says
+    if came != wanted:
+        raise DataError(f"{came} bytes came for {dtype} of shape {shape}; send {wanted}")
+    made = np.empty(shape, kind)
+    flat, start = made.reshape(-1).view(np.uint8), 0
+    for frame in payload:
+        flat[start : start + len(frame)] = np.frombuffer(frame, np.uint8)
+        start += len(frame)
+    return made.astype(kind.newbyteorder("="), copy=False)

@@ -1,0 +1,312 @@
+"""A spool on a disk: a journal for each run, of which goes what the central node has."""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import Final, Literal
+
+from ertis_numba import checks
+from ertis_numba.errors import DamagedError, DataError, InUseError, NetworkError
+from ertis_numba.journal import SUFFIX, Entry, Gap, Journal
+from ertis_numba.network.sensor_node._runs import Item, Run
+from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
+
+__all__ = ["DAMAGED", "SPOOL_FULL", "DiskSpool"]
+
+SPOOL_FULL: Final = "the spool was full"
+DAMAGED: Final = "damaged in the spool"
+
+_SWEEP_S = 0.5  # journals are cleared in one commit per sensor and this time
+_GAP_NUMBERS = 64  # of refused measurements, before the journal is told
+
+
+class DiskSpool(Spool):
+    """Measurements in journals of a folder, and in memory as well while there is room.
+
+    Parameters
+    ----------
+    folder : Path
+        It is made if it is not there.
+    ring_bytes : int
+        Of words in memory.
+    most_bytes : int or None
+        Of words in the journals.
+    on_note : callable
+        Called with a line, from whatever thread.
+    """
+
+    def __init__(
+        self, folder: Path, ring_bytes: int, most_bytes: int | None, *, on_note: Callable[[str], None]
+    ) -> None:
+        super().__init__(ring_bytes)
+        self._folder, self._on_note = folder, on_note
+        self._limit_bytes = None if most_bytes is None else checks.whole("spool_bytes", most_bytes, 1)
+        self._writing = threading.RLock()  # taken before `turn`, and never while that is held
+        self._journals: dict[int, Journal] = {}  # that measurements of this process go to, by epoch
+        self._found: list[Journal] = []
+        self._open_gaps: dict[tuple[str, int], Gap] = {}  # that the journal has not been told of
+        self._discards: dict[tuple[str, int], tuple[Journal, int]] = {}
+        self._failing = ""
+        self._sweep_now, self._stopping = threading.Event(), threading.Event()
+        self._sweeper = threading.Thread(target=self._sweep, name="spool", daemon=True)
+
+    @property
+    def is_durable(self) -> bool:
+        """Whether what is held outlives this process."""
+        return True
+
+    def open(self) -> None:
+        """Take up the journals that earlier nodes have left, oldest first."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise NetworkError(f"{self._folder}: {error.strerror}; give a folder for the spool") from error
+        for path in sorted(self._folder.glob(f"*{SUFFIX}")):
+            try:
+                journal = Journal.open(path)
+                try:
+                    self._take_up(journal)
+                except BaseException:
+                    journal.close()
+                    raise
+            except InUseError:
+                continue  # another sensor node's, or being sealed
+            except DataError as error:
+                self._on_note(f"what is in {path.name} is not sent: {error}")
+        self._sweeper.start()
+
+    def _take_up(self, journal: Journal) -> None:
+        runs: dict[tuple[str, int], Run] = {}
+        found = [(key.sequence, key.sequence, "", key.sensor, key.epoch) for key in journal.index()]
+        found += [(gap.first, gap.last, gap.reason, gap.sensor, gap.epoch) for gap in journal.gaps]
+        for first, last, reason, name, epoch in sorted(found):
+            run = runs.setdefault((name, epoch), Run(journal.sensors[name], epoch, journal))
+            if reason:
+                run.add_gap(first, last, reason)
+            elif run.following is None or first >= run.following:
+                run.add_measurement(first, run.sensor.n_bytes, entry=None)
+        if not runs:
+            journal.remove()
+            return
+        with self.turn:
+            if runs.keys() & self.runs.keys():
+                raise DataError(f"{journal.path} holds runs that another journal holds, too; move it elsewhere")
+            self.runs.update(runs)
+            for run in runs.values():
+                self.counts.setdefault(run.sensor.name, SensorCounts())
+                for _ in filter(lambda item: not item.reason, run.items):
+                    self._count_kept(run, run.sensor.n_bytes)
+        self._found.append(journal)
+
+    def append(self, entries: Sequence[Entry]) -> list[Entry]:
+        """Keep measurements, durable when this returns, and return those that are kept; the others become gaps."""
+        kept: list[Entry] = []
+        with self._writing:
+            with self.turn:
+                self.check(entries)
+                free_bytes = self._free_bytes()
+            taken: list[Entry] = []
+            refused: list[Entry] = []
+            for entry in entries:
+                free_bytes -= entry.measurement.words.nbytes
+                (taken if free_bytes >= 0 else refused).append(entry)
+            for epoch, group in groupby(sorted(taken, key=_epoch), _epoch):
+                fitting = list(group)
+                try:
+                    journal = self._journal(epoch, {entry.measurement.stamp.sensor for entry in fitting})
+                    journal.append(fitting)
+                except DataError as error:
+                    self._tell_failure(str(error))
+                    refused += fitting
+                else:
+                    self._failing = ""
+                    kept += fitting
+                    self._add(journal, fitting)
+            for entry in refused:
+                self._refuse(entry)
+        return kept
+
+    def _free_bytes(self) -> float:
+        if self._limit_bytes is None:
+            return float("inf")
+        return self._limit_bytes - sum(counts.unsettled_bytes for counts in self.counts.values())
+
+    def _journal(self, epoch: int, sensors: Iterable[str]) -> Journal:
+        """Return the journal of an epoch, made if it is not there, which knows these sensors."""
+        if epoch not in self._journals:
+            with self.turn:
+                found = next((run.journal for run in self.runs.values() if run.epoch == epoch and run.journal), None)
+            self._journals[epoch] = found or self._make_journal(epoch)
+        journal = self._journals[epoch]
+        for name in sensors:
+            if name not in journal.sensors:
+                sensor = self._known(name)
+                journal.add_sensor(
+                    name,
+                    sensor.settings,
+                    firmware=sensor.firmware,
+                    translation_m=sensor.translation_m,
+                    rotation_xyzw=sensor.rotation_xyzw,
+                )
+        return journal
+
+    def _make_journal(self, epoch: int) -> Journal:
+        name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{epoch:016x}.h5"
+        return Journal.create(self._folder / f"{name}{SUFFIX}", target=name, source="spool of a sensor node")
+
+    def _add(self, journal: Journal, entries: Iterable[Entry]) -> None:
+        """Make measurements that are in the journal items to be sent."""
+        for entry in entries:
+            stamp, n_bytes = entry.measurement.stamp, entry.measurement.words.nbytes
+            self._tell_gap((stamp.sensor, stamp.epoch))
+            with self.turn:
+                run = self._run(stamp.sensor, stamp.epoch)
+                run.journal = journal
+                if self._held_bytes + n_bytes <= self._most_bytes:
+                    self._keep(run, entry)
+                else:
+                    run.add_measurement(stamp.sequence, n_bytes, entry=None)
+                    self._count_kept(run, n_bytes)
+
+    def _refuse(self, entry: Entry) -> None:
+        """Make a gap of a measurement for which there is no room."""
+        stamp = entry.measurement.stamp
+        key = stamp.sensor, stamp.epoch
+        gap = self._open_gaps.get(key)
+        if gap is not None and gap.last + 1 != stamp.sequence:
+            self._tell_gap(key)
+            gap = None
+        first = stamp.sequence if gap is None else gap.first
+        self._open_gaps[key] = Gap(stamp.sensor, first, stamp.sequence, SPOOL_FULL, stamp.epoch)
+        with self.turn:
+            self.counts[stamp.sensor].refused += 1
+            self._run(*key).add_gap(stamp.sequence, stamp.sequence, SPOOL_FULL)
+        if stamp.sequence - first >= _GAP_NUMBERS:
+            self._tell_gap(key)
+
+    def _tell_gap(self, key: tuple[str, int]) -> None:
+        """Make a gap durable; where the disk is too full even for that, it stays in memory."""
+        gap = self._open_gaps.get(key)
+        if gap is None:
+            return
+        with suppress(DataError):
+            self._journal(gap.epoch, [gap.sensor]).note_gap(
+                gap.sensor, gap.first, gap.last, gap.reason, epoch=gap.epoch
+            )
+            del self._open_gaps[key]
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+        """Keep which of a sensor's numbers are missing, and why; durably, if the disk allows."""
+        with self._writing:
+            super().note_gap(sensor, first, last, reason, epoch=epoch)
+            try:
+                journal = self._journal(epoch, [sensor])
+                journal.note_gap(sensor, first, last, reason, epoch=epoch)
+            except DataError as error:
+                self._tell_failure(str(error))
+            else:
+                with self.turn:
+                    self._run(sensor, epoch).journal = journal
+
+    def entry(self, item: Item, run: Run) -> Entry | None:
+        """Return the measurement of an item, read if it is not in memory; None if it is a gap."""
+        entry = item.entry
+        if entry is not None or item.reason or run.journal is None:
+            return entry
+        try:
+            return run.journal.entry(run.journal.find(run.sensor.name, run.epoch, item.first))
+        except DamagedError as error:
+            self._on_note(str(error))
+            with self.turn:
+                item.reason = DAMAGED
+                counts = self.counts[run.sensor.name]
+                counts.damaged += 1
+                counts.unsettled -= 1
+                counts.unsettled_bytes -= item.n_bytes
+                item.n_bytes = 0
+            return None
+
+    def settle(
+        self,
+        run: Run,
+        done: Iterable[Item],
+        status: Literal["stored", "accepted"],
+        dropped: Sequence[tuple[int, str]] = (),
+    ) -> None:
+        """Let go of what the central node has, and count it; it leaves its journal a little later."""
+        with self.turn:
+            super().settle(run, done, status, dropped)
+            if run.journal is not None:
+                self._discards[run.key] = run.journal, run.settled
+                self._sweep_now.set()
+
+    def _sweep(self) -> None:
+        while not self._stopping.is_set():
+            self._sweep_now.wait()
+            self._stopping.wait(_SWEEP_S)
+            self._sweep_now.clear()
+            self._clear()
+        self._clear()
+
+    def _clear(self) -> None:
+        """Discard what is settled, and remove journals of the past in which nothing is left."""
+        with self.turn:
+            discards, self._discards = self._discards, {}
+        for (sensor, epoch), (journal, settled) in discards.items():
+            try:
+                journal.discard(sensor, epoch, settled)
+            except DataError as error:
+                self._tell_failure(str(error))
+                with self.turn:  # with the next that is settled, or at the next start
+                    self._discards.setdefault((sensor, epoch), (journal, settled))
+        with self._writing:
+            for key in list(self._open_gaps):
+                self._tell_gap(key)
+            for journal in [journal for journal in self._found if journal not in self._journals.values()]:
+                if self._is_empty(journal):
+                    self._found.remove(journal)
+                    self._end(journal)
+
+    def _is_empty(self, journal: Journal) -> bool:
+        with self.turn:
+            return not len(journal) and not any(run.items for run in self.runs.values() if run.journal is journal)
+
+    def _end(self, journal: Journal) -> None:
+        """Remove a journal that is empty, or close it."""
+        try:
+            if self._is_empty(journal) and not journal.gaps:
+                journal.remove()
+                with self.turn:
+                    for run in [run for run in self.runs.values() if run.journal is journal]:
+                        del self.runs[run.key]
+        except DataError as error:
+            self._tell_failure(str(error))
+        journal.close()
+
+    def _tell_failure(self, text: str) -> None:
+        """Tell of a disk that is full or fails, once until it works again."""
+        if not self._failing:
+            self._on_note(text)
+        self._failing = text
+
+    def close(self) -> None:
+        """Close the journals; what they hold is sent at the next start."""
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        self._sweep_now.set()
+        if self._sweeper.ident is not None:
+            self._sweeper.join()
+        with self._writing:
+            for journal in self._all():
+                self._end(journal)
+
+    def _all(self) -> Iterator[Journal]:
+        yield from dict.fromkeys([*self._found, *self._journals.values()])
+
+
+def _epoch(entry: Entry) -> int:
+    return entry.measurement.stamp.epoch

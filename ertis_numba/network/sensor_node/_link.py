@@ -1,0 +1,349 @@
+"""The thread that speaks with the central node: greets, sends, takes acks, and begins again where it has to."""
+
+import socket as pairs
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final, Literal
+
+import zmq
+
+from ertis_numba.errors import DataError, ErtisError, FormatVersionError
+from ertis_numba.network import messages, sockets
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.sensor_node._runs import Run
+from ertis_numba.network.sensor_node._spool import Spool
+from ertis_numba.network.sensor_node._wire import Frames, Settled, frames_of, greeting
+
+__all__ = ["Central", "Link"]
+
+Central = Literal["away", "storage", "processing", "fault", "closing"]
+
+_PING_S = 1.0
+_DEAD_S = 3.0
+_GREET_AGAIN_S = 2.0
+_REFUSED_S = 5.0
+_FAILED_S = 1.0
+_TURN_MS = 100
+_UNDER_WAY_BYTES = 32_000_000
+_AT_ONCE = 32  # messages sent or received before the others have a turn
+_LINE_CHARACTERS = 400
+_WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused)
+
+
+class Link(threading.Thread):
+    """Sends what a spool holds until it is stopped, whatever becomes of the connection.
+
+    Parameters
+    ----------
+    address : str
+    keys : ClientKeys or None
+    spool : Spool
+    on_settled, on_note : callable
+        Called from this thread.
+
+    Attributes
+    ----------
+    central : {"away", "storage", "processing", "fault", "closing"}
+        How the central node is, as it says.
+    reconnects : int
+        How often it was away and came back.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        keys: ClientKeys | None,
+        spool: Spool,
+        on_settled: Callable[[Settled], None],
+        on_note: Callable[[str], None],
+    ) -> None:
+        super().__init__(name=f"link to {address}", daemon=True)
+        self._address, self._keys, self._spool = address, keys, spool
+        self._on_settled, self._on_note = on_settled, on_note
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: sockets.Monitor | None = None
+        self._poller = zmq.Poller()
+        self._wake_in, self._wake_out = pairs.socketpair()
+        self._wake_in.setblocking(False)  # noqa: FBT003  the name of this argument is the function's
+        self._wake_out.setblocking(False)  # noqa: FBT003
+        self._stopping = threading.Event()
+        self._heard_s = self._ping_s = 0.0
+        self._is_blocked = False
+        self._was_there = False
+        self._told: set[str] = set()
+        self._next_sensor = 0
+        self._greeted: set[tuple[str, int]] = set()
+        self.central: Central = "away"
+        self.reconnects = 0
+        self._connect()  # so that an address that cannot be used is refused where it was given
+
+    def wake(self) -> None:
+        """Say that there is something to send."""
+        with suppress(BlockingIOError):  # then it is awake
+            self._wake_in.send(b"\0")
+
+    def stop(self) -> None:
+        """End, and wait for it."""
+        self._stopping.set()
+        self.wake()
+        if self.ident is not None:
+            self.join()
+        self._disconnect(linger_ms=_TURN_MS)
+        self._context.term()
+        self._wake_in.close()
+        self._wake_out.close()
+
+    def run(self) -> None:
+        """Speak with the central node until stopped."""
+        while not self._stopping.is_set():
+            try:
+                self._turn()
+            except Exception as error:  # noqa: BLE001  measurements are kept whatever happens, and sent later
+                self._note(f"the link to {self._address} has failed ({_line(error)}); it is made again")
+                self._stopping.wait(_FAILED_S)
+                with suppress(ErtisError, zmq.ZMQError):
+                    self._connect()
+        if self._socket is not None:
+            self._send(self._socket, [messages.encode(messages.Bye())])
+
+    def _connect(self) -> None:
+        """Make a new socket: what was in the old one was settled, or will be sent again."""
+        self._disconnect()
+        self._socket = sockets.client(self._context, self._address, keys=self._keys)
+        self._monitor = sockets.Monitor(self._socket)
+        self._poller = zmq.Poller()
+        self._poller.register(self._wake_out.fileno(), zmq.POLLIN)
+        self._poller.register(self._monitor.socket, zmq.POLLIN)
+        self._is_blocked = False
+        self._greeted.clear()
+        self._heard_s, self._ping_s = time.monotonic(), 0.0
+        with self._spool.turn:
+            for run in self._spool.runs.values():
+                if run.stage != "waiting":
+                    run.stage = "new"
+
+    def _disconnect(self, linger_ms: int = 0) -> None:
+        if self._monitor is not None:
+            self._monitor.close()
+        if self._socket is not None:
+            self._socket.close(linger=linger_ms)
+        self._socket = self._monitor = None
+
+    def _turn(self) -> None:
+        socket, monitor = self._socket, self._monitor
+        if socket is None or monitor is None:
+            self._connect()
+            return
+        self._poller.register(socket, zmq.POLLIN | (zmq.POLLOUT if self._is_blocked else 0))
+        events = dict(self._poller.poll(_TURN_MS))
+        if self._wake_out.fileno() in events:
+            with suppress(BlockingIOError):
+                self._wake_out.recv(4096)
+        if monitor.socket in events:
+            for text in monitor.read():
+                self._note(text)
+        if events.get(socket, 0) & zmq.POLLOUT:
+            self._is_blocked = False
+        self._receive(socket)
+        now_s = time.monotonic()
+        if now_s - self._heard_s > _DEAD_S:
+            self._lose()
+            return
+        if now_s - self._ping_s > _PING_S and self._send(socket, [messages.encode(messages.Ping())]):
+            self._ping_s = now_s
+        self._send_what_may_go(socket, now_s)
+
+    def _lose(self) -> None:
+        if self.central != "away" or not self._was_there:
+            self._note(f"the central node at {self._address} does not answer; measurements are kept meanwhile")
+        self.central = "away"
+        self._connect()
+
+    # What comes.
+
+    def _receive(self, socket: "zmq.Socket[bytes]") -> None:
+        for _ in range(_AT_ONCE):
+            try:
+                frames = socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            try:
+                message = messages.decode(frames[0], _WANTED)
+            except FormatVersionError as error:
+                self._heard_s = time.monotonic()
+                with self._spool.turn:
+                    self._wait(list(self._spool.runs.values()), str(error))
+            except DataError as error:
+                self._note(f"the central node says what cannot be understood: {error}")
+            else:
+                self._heard_s = time.monotonic()
+                self._take(message)
+
+    def _take(self, message: messages.Message) -> None:
+        match message:
+            case messages.Refused():
+                self._take_refusal(message)
+            case messages.Pong():
+                self._see(message.state, message.text)
+            case messages.Welcome():
+                with self._spool.turn:
+                    run = self._spool.runs.get((message.sensor, message.epoch))
+                    if run is None or run.stage != "asked":
+                        return
+                    done = run.welcome(message.settled, message.window, time.monotonic())
+                    self._spool.settle(run, done, message.acks)
+                self._see(message.state)
+                if done:
+                    self._on_settled(Settled(*run.key, run.settled, message.acks))
+            case messages.Ack():
+                with self._spool.turn:
+                    run = self._spool.runs.get((message.sensor, message.epoch))
+                    if run is None:
+                        return
+                    done = run.settle(message.settled, time.monotonic())
+                    dropped = run.newly_dropped(message.dropped)
+                    self._spool.settle(run, done, message.status, dropped)
+                if done or dropped:
+                    self._on_settled(Settled(*run.key, run.settled, message.status, dropped))
+
+    def _see(self, state: Literal["storage", "processing", "fault", "closing"], text: str | None = None) -> None:
+        """Note how the central node is, and why if it says so."""
+        before, self.central = self.central, state
+        if before == "away":
+            self.reconnects += self._was_there
+            if self._was_there or self._told:
+                self._on_note(f"the central node at {self._address} is there")
+            self._was_there = True
+            self._told.clear()
+        if state == "fault" and text is not None:
+            self._note(f"the central node cannot store: {text or 'it does not say why'}; measurements are kept")
+        elif state != "fault" and before == "fault":
+            self._on_note("the central node stores again")
+            self._told.clear()
+            with self._spool.turn:
+                for run in self._spool.runs.values():
+                    run.go_back(time.monotonic())
+
+    def _take_refusal(self, message: messages.Refused) -> None:
+        with self._spool.turn:
+            runs = [
+                run
+                for run in self._spool.runs.values()
+                if message.sensor in ("", run.sensor.name) and (not message.sensor or message.epoch in (0, run.epoch))
+            ]
+        if message.code == "hello":
+            for run in runs:
+                if run.stage == "welcome":
+                    run.stage = "new"
+            return
+        if message.code == "size" and self._say_bye():
+            return
+        about = f" of sensor {message.sensor}" if message.sensor else ""
+        self._wait(runs, f"the central node refuses measurements{about}: {message.reason}")
+
+    def _say_bye(self) -> bool:
+        """Have the central node forget runs that are over, which it has room for some of; whether there were any."""
+        socket = self._socket
+        with self._spool.turn:
+            going_on = {run.key for run in self._spool.runs.values() if run.items}
+        if socket is None or not self._greeted - going_on or not self._send(socket, [messages.encode(messages.Bye())]):
+            return False
+        self._greeted.clear()
+        with self._spool.turn:
+            for run in self._spool.runs.values():
+                if run.stage != "waiting":
+                    run.stage = "new"
+        return True
+
+    def _wait(self, runs: list[Run], text: str) -> None:
+        """Try again later, and let others pass meanwhile."""
+        self._note(text)
+        for run in runs:
+            run.stage, run.since_s = "waiting", time.monotonic() + _REFUSED_S
+
+    def _note(self, text: str) -> None:
+        """Tell something once, until it has changed."""
+        if text not in self._told:
+            self._told.add(text)
+            self._on_note(text)
+
+    # What goes.
+
+    def _active(self, now_s: float) -> list[Run]:
+        """Return the runs to send of: of each sensor the oldest one that has something and is not refused."""
+        active: dict[str, Run] = {}
+        with self._spool.turn:
+            for run in self._spool.runs.values():
+                if run.stage == "waiting" and now_s > run.since_s:
+                    run.stage = "new"
+                if run.items and run.stage != "waiting":
+                    active.setdefault(run.sensor.name, run)
+        return list(active.values())
+
+    def _send_what_may_go(self, socket: "zmq.Socket[bytes]", now_s: float) -> None:
+        runs = self._active(now_s)
+        for run in runs:
+            with self._spool.turn:
+                if run.stage == "welcome" and run.is_stuck(now_s):
+                    run.go_back(now_s)
+                    run.stage = "new"  # the central node may know less than it did: it hears what there is
+            if run.stage == "new" or (run.stage == "asked" and now_s - run.since_s > _GREET_AGAIN_S):
+                self._greet(socket, run, now_s)
+        runs = [run for run in runs if run.stage == "welcome"]
+        n_sent, before = 0, -1
+        while runs and not self._is_blocked and before < n_sent < _AT_ONCE:
+            before = n_sent
+            for _ in runs:  # in turn, and another first each time
+                self._next_sensor += 1
+                n_sent += self._send_next(socket, runs, runs[self._next_sensor % len(runs)])
+        if n_sent >= _AT_ONCE:
+            self.wake()
+
+    def _greet(self, socket: "zmq.Socket[bytes]", run: Run, now_s: float) -> None:
+        with self._spool.turn:
+            if not run.items:
+                return
+            frames = greeting(run)
+        if self._send(socket, frames):
+            run.stage, run.since_s = "asked", now_s
+            self._greeted.add(run.key)
+
+    def _send_next(self, socket: "zmq.Socket[bytes]", runs: list[Run], run: Run) -> bool:
+        """Send the next item of a run, and return whether there was one that might and could go."""
+        window = 1 if self.central == "fault" else run.window
+        with self._spool.turn:
+            item = None if self._is_blocked else run.to_send(window)
+            if item is None:
+                return False
+            under_way = sum(sent.n_bytes for each in runs for sent in each.under_way())
+            if under_way and under_way + item.n_bytes > _UNDER_WAY_BYTES:
+                return False
+        try:
+            entry = self._spool.entry(item, run)
+        except DataError as error:  # the disk of the spool
+            self._wait([run], str(error))
+            return False
+        if entry is None and not item.reason:  # it has made room for later ones meanwhile
+            return False
+        frames, last = frames_of(run, item, entry)
+        if not self._send(socket, frames):
+            return False
+        with self._spool.turn:
+            run.mark_sent(last, time.monotonic())
+        return True
+
+    def _send(self, socket: "zmq.Socket[bytes]", frames: Frames) -> bool:
+        try:
+            socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+        except zmq.Again:  # not connected, or the other side is slow
+            self._is_blocked = True
+            return False
+        return True
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:_LINE_CHARACTERS]

@@ -1,0 +1,212 @@
+"""Runs of sensors on their way to the central node: what of them is held, and how far it has been sent."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final, Literal
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import Entry, Journal, Sensor
+
+__all__ = ["MEMORY_FULL", "NEVER_GIVEN", "Item", "Run"]
+
+MEMORY_FULL: Final = "the sensor node's memory was full"
+NEVER_GIVEN: Final = "the sensor node never had it"
+
+_GAPS = 64  # at the front of a run; where there are more, the memory is too full to tell them apart
+_PATIENCE_S = 1.0  # without progress, before all under way is sent again; doubled while there is none
+_MOST_PATIENCE_S = 8.0
+
+
+@dataclass(slots=True, eq=False)
+class Item:
+    """A measurement or a gap, to be settled in its turn.
+
+    Attributes
+    ----------
+    first, last : int
+        Its numbers; one, for a measurement.
+    reason : str
+        Why they are missing; empty for a measurement.
+    n_bytes : int
+        Of its words.
+    entry : Entry or None
+        The measurement, if it is in memory.
+    """
+
+    first: int
+    last: int
+    reason: str = ""
+    n_bytes: int = 0
+    entry: Entry | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Run:
+    """The items of one epoch of a sensor, oldest first, and a window over them that is sent: go-back-N.
+
+    Where sending is, is kept as numbers, so that items may change places or become others meanwhile. Who uses a run
+    sees to it that two threads do not use it at once.
+
+    Attributes
+    ----------
+    sensor : Sensor
+    epoch : int
+    journal : Journal or None
+    items : deque of Item
+    following : int or None
+        The number after the last item; None before the first.
+    settled : int
+        Up to which the central node has everything.
+    sent : int
+        Up to which everything was sent.
+    reached : int
+        Up to which anything was ever sent: an ack beyond is none of these items'.
+    stage : {"new", "asked", "welcome", "waiting"}
+        Of greeting the central node.
+    since_s : float
+        When the stage was reached; of "waiting", when it ends.
+    window : int
+    """
+
+    sensor: Sensor
+    epoch: int
+    journal: Journal | None = None
+    items: deque[Item] = field(default_factory=deque)
+    following: int | None = None
+    settled: int = -1
+    sent: int = -1
+    reached: int = -1
+    stage: Literal["new", "asked", "welcome", "waiting"] = "new"
+    since_s: float = 0.0
+    window: int = 1
+    _under_way: int = 0  # items at the front of which all was sent
+    _patience_s: float = field(default_factory=lambda: _PATIENCE_S)
+    _moved_s: float = 0.0
+    _dropped: deque[int] = field(default_factory=lambda: deque(maxlen=256))
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Sensor and epoch."""
+        return self.sensor.name, self.epoch
+
+    def add_measurement(self, number: int, n_bytes: int, *, entry: Entry | None) -> Item:
+        """Add a measurement at the end; what is missing before it is a gap, too."""
+        self.require_above(number)
+        self._fill(number)
+        return self._add(Item(number, number, "", n_bytes, entry))
+
+    def require_above(self, number: int) -> None:
+        """Refuse a number that does not rise."""
+        if self.following is not None and number < self.following:
+            raise ArgumentError(
+                f"measurement {number} of sensor {self.sensor.name} comes after {self.following - 1}; give them in "
+                "order, or with another epoch"
+            )
+
+    def add_gap(self, first: int, last: int, reason: str) -> None:
+        """Add a gap at the end; what is known of its numbers already stays."""
+        if self.following is not None:
+            first = max(first, self.following)
+        if first > last:
+            return
+        self._fill(first)
+        before = self.items[-1] if self.items else None
+        if before is not None and before.reason == reason:  # sent again, even if its beginning was
+            before.last = last
+            self._under_way = min(self._under_way, len(self.items) - 1)
+            self.following = last + 1
+        else:
+            self._add(Item(first, last, reason))
+
+    def _fill(self, number: int) -> None:
+        if self.following is not None and self.following < number:
+            self.add_gap(self.following, number - 1, NEVER_GIVEN)
+
+    def _add(self, item: Item) -> Item:
+        if self.following is None:
+            self.settled = self.sent = self.reached = item.first - 1
+        self.items.append(item)
+        self.following = item.last + 1
+        return item
+
+    def forget_oldest(self) -> Item | None:
+        """Make a gap of the oldest measurement, and return what it was."""
+        gaps = []
+        while self.items and self.items[0].reason:
+            gaps.append(self.items.popleft())
+        if not self.items:
+            self.items.extend(gaps)
+            return None
+        oldest = self.items.popleft()
+        gaps.append(Item(oldest.first, oldest.last, MEMORY_FULL))
+        while len(gaps) > 1 and (gaps[-2].reason == MEMORY_FULL or len(gaps) > _GAPS):
+            gaps[-2:] = [Item(gaps[-2].first, gaps[-1].last, MEMORY_FULL)]
+        self.items.extendleft(reversed(gaps))
+        self._under_way = 0  # counted again by `to_send`
+        return oldest
+
+    def to_send(self, window: int) -> Item | None:
+        """Return the first item that was not sent, if the window has room for it."""
+        self._count_under_way()
+        if self._under_way >= min(window, len(self.items)):
+            return None
+        return self.items[self._under_way]
+
+    def _count_under_way(self) -> None:
+        while self._under_way < len(self.items) and self.items[self._under_way].last <= self.sent:
+            self._under_way += 1
+
+    def under_way(self) -> Iterator[Item]:
+        """Yield what was sent and is not settled."""
+        self._count_under_way()
+        return islice(self.items, self._under_way)
+
+    def mark_sent(self, last: int, now_s: float) -> None:
+        """Note that an item was sent."""
+        if not self._under_way:
+            self._moved_s = now_s
+        self.sent = max(self.sent, last)
+        self.reached = max(self.reached, last)
+        self._count_under_way()
+
+    def go_back(self, now_s: float) -> None:
+        """Send everything that is not settled again."""
+        self.sent, self._under_way, self._moved_s = self.settled, 0, now_s
+
+    def welcome(self, settled: int, window: int, now_s: float) -> list[Item]:
+        """Begin to send, and return what was settled before."""
+        self.stage, self.since_s, self.window = "welcome", now_s, window
+        last = -1 if self.following is None else self.following - 1
+        self.reached = max(self.reached, min(settled, last))
+        done = self.settle(settled, now_s)
+        self.go_back(now_s)
+        return done
+
+    def settle(self, number: int, now_s: float) -> list[Item]:
+        """Return what an ack settles, which is not held any more; none where it is late or no ack of this."""
+        if not self.settled < number <= self.reached:
+            return []
+        self.settled, self._moved_s, self._patience_s = number, now_s, _PATIENCE_S
+        self.sent = max(self.sent, number)
+        done = []
+        while self.items and self.items[0].last <= number:
+            done.append(self.items.popleft())
+        self._under_way = max(0, self._under_way - len(done))
+        if self.items and self.items[0].first <= number:
+            self.items[0].first = number + 1
+        return done
+
+    def is_stuck(self, now_s: float) -> bool:
+        """Whether acks have not moved for too long; asked again, it is patient for longer."""
+        if not self._under_way or now_s - self._moved_s < self._patience_s:
+            return False
+        self._patience_s = min(2 * self._patience_s, _MOST_PATIENCE_S)
+        return True
+
+    def newly_dropped(self, dropped: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
+        """Return those of what an ack says to be thrown away that no ack said before."""
+        new = tuple((number, reason) for number, reason in dropped if number not in self._dropped)
+        self._dropped.extend(number for number, _ in new)
+        return new

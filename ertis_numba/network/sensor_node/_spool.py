@@ -1,0 +1,263 @@
+"""What a sensor node holds until the central node has it: a ring in memory, and what every spool does."""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import Entry, Sensor, require_same
+from ertis_numba.network.sensor_node._runs import Item, Run
+
+if TYPE_CHECKING:
+    from ertis_numba.settings import Settings
+
+__all__ = ["SensorCounts", "Spool"]
+
+_NAME_CHARACTERS = 64  # of a sensor, on the wire
+_SETTLED_IN_ORDER = 1000  # items
+
+
+@dataclass(slots=True)
+class SensorCounts:
+    """What became of one sensor's measurements at its node so far.
+
+    ``accepted = stored + taken + overwritten + damaged + unsettled``, of those that this process has accepted or found
+    in its spool.
+
+    Attributes
+    ----------
+    accepted : int
+        Measurements that were kept.
+    refused : int
+        Measurements that were not, as the spool had no room.
+    stored : int
+        Measurements that the central node has on its disk, as it says.
+    taken : int
+        Measurements that it had in memory, as it says.
+    dropped : Counter of str
+        Of all these, those that it has thrown away, by reason.
+    overwritten : int
+        Measurements that made room in memory for later ones.
+    damaged : int
+        Measurements that the spool holds damaged.
+    missing : Counter of str
+        Numbers that were told to be missing, by reason, by whoever gives measurements.
+    unsettled : int
+        Measurements that are held.
+    unsettled_bytes : int
+    """
+
+    accepted: int = 0
+    refused: int = 0
+    stored: int = 0
+    taken: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    overwritten: int = 0
+    damaged: int = 0
+    missing: Counter[str] = field(default_factory=Counter)
+    unsettled: int = 0
+    unsettled_bytes: int = 0
+
+
+class Spool:
+    """Measurements in memory; where there is no more room, the oldest become gaps.
+
+    Parameters
+    ----------
+    most_bytes : int
+        Of words in memory.
+
+    Attributes
+    ----------
+    turn : threading.RLock
+        To be held while `runs` or `counts` are looked at.
+    settled : threading.Condition
+        Of that lock; told whenever something has been settled.
+    runs : dict of (sensor, epoch) to Run
+        Oldest first.
+    counts : dict of str to SensorCounts
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = checks.whole("ring_bytes", most_bytes, 1)
+        self._held_bytes = 0
+        self.turn = threading.RLock()
+        self.settled = threading.Condition(self.turn)
+        self.runs: dict[tuple[str, int], Run] = {}
+        self.counts: dict[str, SensorCounts] = {}
+        self._sensors: dict[str, Sensor] = {}
+        self._accepted: dict[str, Settings] = {}
+        self._order: deque[tuple[Run, Item]] = deque()  # of arrival
+
+    def add_sensor(self, sensor: Sensor) -> None:
+        """Tell of a sensor before its first measurement, or of what it is in epochs that will follow."""
+        if len(sensor.name) > _NAME_CHARACTERS:
+            raise ArgumentError(
+                f"sensor name {sensor.name!r} has {len(sensor.name)} characters; give {_NAME_CHARACTERS} at most"
+            )
+        if sensor.n_bytes > self._most_bytes:
+            raise ArgumentError(
+                f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, and the memory has room for "
+                f"{self._most_bytes}; give ring_bytes that hold some"
+            )
+        with self.turn:
+            self._sensors[sensor.name] = sensor
+            self._accepted.pop(sensor.name, None)
+            self.counts.setdefault(sensor.name, SensorCounts())
+
+    def append(self, entries: Sequence[Entry]) -> list[Entry]:
+        """Keep measurements, and return those that are kept; their CRC-32 is filled in where it is None."""
+        with self.turn:
+            self.check(entries)
+            for entry in entries:
+                run = self._run(entry.measurement.stamp.sensor, entry.measurement.stamp.epoch)
+                self._keep(run, entry)
+            self._forget_oldest()
+            self._tidy()
+        return list(entries)
+
+    def check(self, entries: Iterable[Entry]) -> None:
+        """Refuse measurements that do not fit to their sensors, or whose numbers do not rise."""
+        last: dict[tuple[str, int], int] = {}
+        for entry in entries:
+            stamp, settings = entry.measurement.stamp, entry.measurement.settings
+            sensor = self._known(stamp.sensor)
+            if settings is not self._accepted.get(sensor.name):
+                require_same(sensor, settings)
+                self._accepted[sensor.name] = settings
+            words = sensor.entry_row(entry, 0)[-1]  # checked, contiguous and little-endian; and the CRC-32 is there
+            if words is not entry.measurement.words:
+                entry.measurement = type(entry.measurement)(words, settings, stamp)
+            key = stamp.sensor, stamp.epoch
+            if stamp.sequence <= last.get(key, -1):
+                raise ArgumentError(
+                    f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in "
+                    "order, or with another epoch"
+                )
+            if key in self.runs:
+                self.runs[key].require_above(stamp.sequence)
+            last[key] = stamp.sequence
+
+    def _known(self, name: str) -> Sensor:
+        if name not in self._sensors:
+            raise ArgumentError(f"sensor {name!r} is not known to this sensor node; add it first")
+        return self._sensors[name]
+
+    def _run(self, sensor: str, epoch: int) -> Run:
+        """Return a run, begun if it is new; then earlier ones of this sensor that are empty are over."""
+        key = sensor, epoch
+        if key not in self.runs:
+            for run in [run for run in self.runs.values() if run.sensor.name == sensor and not run.items]:
+                del self.runs[run.key]
+            self.runs[key] = Run(self._known(sensor), epoch)
+        return self.runs[key]
+
+    def _keep(self, run: Run, entry: Entry) -> Item:
+        """Add a measurement that is in memory to its run, and count it."""
+        n_bytes = entry.measurement.words.nbytes
+        item = run.add_measurement(entry.measurement.stamp.sequence, n_bytes, entry=entry)
+        self._held_bytes += n_bytes
+        self._order.append((run, item))
+        self._count_kept(run, n_bytes)
+        return item
+
+    def _count_kept(self, run: Run, n_bytes: int) -> None:
+        counts = self.counts[run.sensor.name]
+        counts.accepted += 1
+        counts.unsettled += 1
+        counts.unsettled_bytes += n_bytes
+
+    def _forget_oldest(self) -> None:
+        """Make gaps of the oldest measurements, until the others have room."""
+        while self._held_bytes > self._most_bytes:
+            run, item = self._order.popleft()
+            if item.entry is None:  # settled already
+                continue
+            run.forget_oldest()  # which is this one: both are in the order of arrival
+            item.entry = None
+            self._held_bytes -= item.n_bytes
+            counts = self.counts[run.sensor.name]
+            counts.overwritten += 1
+            counts.unsettled -= 1
+            counts.unsettled_bytes -= item.n_bytes
+
+    def _tidy(self) -> None:
+        """Forget the order of what has been settled, which a sensor that is not let in would keep for ever."""
+        if len(self._order) > 2 * sum(counts.unsettled for counts in self.counts.values()) + _SETTLED_IN_ORDER:
+            self._order = deque(pair for pair in self._order if pair[1].entry is not None)
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+        """Keep which of a sensor's numbers are missing, and why."""
+        checks.gap(first, last, reason)
+        checks.whole("epoch", epoch, 0, 2**63 - 1)
+        with self.turn:
+            self._run(sensor, epoch).add_gap(first, last, reason)
+            self.counts[sensor].missing[reason] += last - first + 1
+
+    def entry(self, item: Item, run: Run) -> Entry | None:  # noqa: ARG002  another spool has to ask the run
+        """Return the measurement of an item; None if it has become a gap."""
+        return item.entry
+
+    def settle(
+        self,
+        run: Run,
+        done: Iterable[Item],
+        status: Literal["stored", "accepted"],
+        dropped: Sequence[tuple[int, str]] = (),
+    ) -> None:
+        """Let go of what the central node has, and count it."""
+        with self.turn:
+            counts = self.counts[run.sensor.name]
+            counts.dropped.update(reason for _, reason in dropped)
+            for item in done:
+                if item.reason:
+                    continue
+                if status == "stored":
+                    counts.stored += 1
+                else:
+                    counts.taken += 1
+                counts.unsettled -= 1
+                counts.unsettled_bytes -= item.n_bytes
+                self._let_go(item)
+            while self._order and self._order[0][1].entry is None:
+                self._order.popleft()
+            self.settled.notify_all()
+
+    def _let_go(self, item: Item) -> None:
+        if item.entry is not None:
+            item.entry = None
+            self._held_bytes -= item.n_bytes
+
+    def wait(self, timeout_s: float, stop: Callable[[], bool]) -> bool:
+        """Wait until everything is settled, and return whether it is."""
+        with self.turn:
+            end_s = time.monotonic() + timeout_s
+            while any(run.items for run in self.runs.values()):
+                left_s = end_s - time.monotonic()
+                if left_s <= 0 or stop():
+                    return False
+                self.settled.wait(min(left_s, 0.1))
+            return True
+
+    @property
+    def is_durable(self) -> bool:
+        """Whether what is held outlives this process."""
+        return False
+
+    def counts_now(self) -> dict[str, SensorCounts]:
+        """Return a copy of the counts."""
+        with self.turn:
+            return {
+                name: replace(counts, dropped=counts.dropped.copy(), missing=counts.missing.copy())
+                for name, counts in self.counts.items()
+            }
+
+    def open(self) -> None:
+        """Take up what was left."""
+
+    def close(self) -> None:
+        """End it; what is in memory is lost."""

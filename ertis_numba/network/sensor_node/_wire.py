@@ -1,0 +1,80 @@
+"""What a sensor node says, as it goes over the wire, and what it hears."""
+
+import zlib
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from ertis_numba.journal import Entry
+from ertis_numba.network import messages
+from ertis_numba.network.sensor_node._runs import Item, Run
+
+__all__ = ["Frames", "Settled", "frames_of", "greeting"]
+
+Frames: TypeAlias = "list[bytes | memoryview]"
+
+_FIRMWARE_CHARACTERS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What an ack has brought.
+
+    Attributes
+    ----------
+    sensor : str
+    epoch : int
+    settled : int
+        Up to which every number is stored or accepted, or known to be missing.
+    status : {"stored", "accepted"}
+        What is settled is on the disk of the central node, or in its memory.
+    dropped : tuple of (sequence, reason)
+        What it has thrown away since it said so before.
+    """
+
+    sensor: str
+    epoch: int
+    settled: int
+    status: Literal["stored", "accepted"]
+    dropped: tuple[tuple[int, str], ...] = ()
+
+
+def greeting(run: Run) -> Frames:
+    """Return what introduces a run that has items."""
+    settings = run.sensor.settings.to_toml().encode()
+    x_m, y_m, z_m = run.sensor.translation_m
+    x, y, z, w = run.sensor.rotation_xyzw
+    hello = messages.Hello(
+        sensor=run.sensor.name,
+        epoch=run.epoch,
+        next_sequence=run.items[0].first,
+        settings_crc32=zlib.crc32(settings),
+        firmware=run.sensor.firmware[:_FIRMWARE_CHARACTERS],
+        translation_m=(x_m, y_m, z_m),
+        rotation_xyzw=(x, y, z, w),
+    )
+    return [messages.encode(hello), settings]
+
+
+def frames_of(run: Run, item: Item, entry: Entry | None) -> tuple[Frames, int]:
+    """Return an item as it goes over the wire, and its last number as it was then."""
+    if entry is None:
+        first, last = item.first, item.last
+        gap = messages.Gap(
+            sensor=run.sensor.name, epoch=run.epoch, first=first, last=max(first, last), reason=item.reason
+        )
+        return [messages.encode(gap)], last
+    stamp, air = entry.measurement.stamp, entry.measurement.settings.air
+    data = messages.Data(
+        sensor=run.sensor.name,
+        epoch=run.epoch,
+        sequence=stamp.sequence,
+        sync_count=stamp.sync_count,
+        timestamp_ns=stamp.timestamp_ns,
+        uncertainty_ns=stamp.timestamp_uncertainty_ns,
+        monotonic_ns=entry.monotonic_ns,
+        temperature_c=float(air.temperature_c),
+        humidity_percent=float(air.humidity_percent),
+        pressure_pa=float(air.pressure_pa),
+        crc32=entry.crc32 or 0,
+    )
+    return [messages.encode(data), entry.measurement.words.data.cast("B")], stamp.sequence

@@ -1,0 +1,254 @@
+"""An application node: images, points, measurements and groups as they come."""
+
+import queue
+import socket as system
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
+
+import zmq
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.network import addresses
+from ertis_numba.network._subscription import SubscriberCounts, Subscription
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.messages import PRODUCTS, Group, Product
+from ertis_numba.network.products import Arrival
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Energyscape, Measurement, PointCloud
+    from ertis_numba.network.products import Item
+    from ertis_numba.network.status import Status
+
+__all__ = ["Arrival", "Subscriber", "SubscriberCounts"]
+
+Kind_co = TypeVar("Kind_co", covariant=True)
+
+_MOST_SENSORS: Final = 32
+_STOP_S: Final = 5.0
+
+
+class _Options(TypedDict, total=False):
+    sensors: Sequence[str] | None
+    keys: ClientKeys | None
+    on_note: Callable[[str], None] | None
+    credit: int
+
+
+class Subscriber(Generic[Kind_co]):
+    """Receives what a central node publishes; use it in a ``with`` statement and a loop.
+
+    ::
+
+        with Subscriber("tcp://127.0.0.1:5602", sensors=["front"], products=["points"]) as subscriber:
+            for cloud in subscriber:
+                print(cloud.stamp.sequence, cloud.position_m.min(axis=0))
+
+    The loop ends when `close` is called, by another thread or a signal's handler. A central node that goes away is
+    connected to again when it is back. What this is too slow for is dropped there, the latest is kept, and how many
+    were dropped is counted.
+
+    Parameters
+    ----------
+    address : str
+        Where the central node publishes, ``tcp://HOST:PORT``.
+    sensors : sequence of str, optional
+        All by default.
+    products : sequence of {"energyscape", "points", "raw", "group", "status"}
+    keys : ClientKeys, optional
+        None on loopback only.
+    on_note : callable, optional
+        Is called by a thread with lines on what happens to the connection.
+    credit : int
+        How many products may be under way or wait here; more give a higher rate over a slow connection, and older
+        products to who is slow.
+
+    Attributes
+    ----------
+    latest : Arrival or None
+        What came with the product that was received last: its number and times, and where its sensor is.
+    counts : SubscriberCounts
+
+    Raises
+    ------
+    ArgumentError
+        The address, a sensor or a product cannot be used, or the address not without keys.
+    """
+
+    @overload
+    def __init__(
+        self: "Subscriber[Energyscape]",
+        address: str,
+        *,
+        products: Sequence[Literal["energyscape"]] = ...,
+        **options: Unpack[_Options],
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "Subscriber[PointCloud]",
+        address: str,
+        *,
+        products: Sequence[Literal["points"]],
+        **options: Unpack[_Options],
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "Subscriber[Measurement]",
+        address: str,
+        *,
+        products: Sequence[Literal["raw"]],
+        **options: Unpack[_Options],
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "Subscriber[Group]",
+        address: str,
+        *,
+        products: Sequence[Literal["group"]],
+        **options: Unpack[_Options],
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "Subscriber[Status]",
+        address: str,
+        *,
+        products: Sequence[Literal["status"]],
+        **options: Unpack[_Options],
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "Subscriber[Item]",
+        address: str,
+        *,
+        products: Sequence[Product],
+        **options: Unpack[_Options],
+    ) -> None: ...
+    def __init__(
+        self: "Subscriber[Any]",
+        address: str,
+        *,
+        products: Sequence[Product] = ("energyscape",),
+        sensors: Sequence[str] | None = None,
+        keys: ClientKeys | None = None,
+        on_note: Callable[[str], None] | None = None,
+        credit: int = 2,
+    ) -> None:
+        address = addresses.endpoint(address)
+        addresses.require_keys(address, keys=keys)
+        given: list[Product] = (
+            [cast("Product", products)] if isinstance(products, str) else list(dict.fromkeys(products))
+        )
+        for product in given:
+            checks.choice("product", product, PRODUCTS)
+        if not given:
+            raise ArgumentError(f"products are none; give some of {', '.join(PRODUCTS)}")
+        named = None if sensors is None else tuple([sensors] if isinstance(sensors, str) else dict.fromkeys(sensors))
+        if named is not None and not 0 < len(named) <= _MOST_SENSORS:
+            raise ArgumentError(f"sensors are {len(named)}; give 1 to {_MOST_SENSORS}, or None for all")
+        for sensor in named or ():
+            checks.sensor_name(sensor)
+        checks.whole("credit", credit, 1, 64)
+        self.latest: Arrival | None = None
+        self.counts = SubscriberCounts()
+        # A queue of this kind may be put to by a signal's handler that has come over a thread which is taking.
+        self._waiting: queue.SimpleQueue[Arrival | Exception | None] = queue.SimpleQueue()
+        self._closed = False
+        self._wake, self._woken = system.socketpair()
+        self._wake.settimeout(0)
+        self._woken.settimeout(0)
+        self._subscription = Subscription(
+            address,
+            sensors=named,
+            products=tuple(given),
+            keys=keys,
+            on_note=on_note or (lambda _: None),
+            credit=credit,
+            counts=self.counts,
+            deliver=self._waiting.put,
+        )
+        self._thread = threading.Thread(target=self._run, name="ertis-subscriber", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Kind_co]:
+        while (item := self.receive()) is not None:
+            yield item
+
+    @property
+    def connected(self) -> bool:
+        """Whether a publisher answers."""
+        return self._subscription.connected
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called, after which nothing comes."""
+        return self._closed
+
+    def receive(self, timeout_s: float | None = None) -> Kind_co | None:
+        """Return the next product; None after ``timeout_s``, or when this was closed.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            How long to wait; for ever by default.
+
+        Raises
+        ------
+        RefusedError
+            The central node has refused this application from the start. Once it was let in, it goes on trying.
+        """
+        try:
+            arrival = self._waiting.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        if not isinstance(arrival, Arrival):
+            self._waiting.put(arrival)  # for whoever asks next
+        if arrival is None or self._closed:
+            return None
+        if isinstance(arrival, Exception):
+            raise arrival
+        self.latest = arrival
+        self.counts.received += 1
+        self._subscription.taken(arrival)
+        self._rouse()
+        return cast("Kind_co", arrival.item)
+
+    def close(self) -> None:
+        """End the loop; what was not taken is lost."""
+        self._closed = True
+        with suppress(queue.Empty):
+            while True:
+                self._waiting.get_nowait()
+        self._waiting.put(None)
+        self._rouse()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_STOP_S)
+
+    def _rouse(self) -> None:
+        with suppress(OSError):  # full: it is roused anyway; closed: nobody to rouse
+            self._wake.send(b"\0")
+
+    def _run(self) -> None:
+        """Serve the connection until this is closed."""
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        try:
+            with self._subscription.within(context):
+                while not self._closed:
+                    self._subscription.turn(self._woken, time.monotonic())
+                    with suppress(BlockingIOError):
+                        while self._woken.recv(4096):
+                            pass
+        except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
+            self._waiting.put(error)
+        finally:
+            context.destroy(linger=0)
+            self._woken.close()
+            self._wake.close()

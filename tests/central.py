@@ -1,0 +1,118 @@
+"""A sensor node of a few lines, and a central node in a thread, for the tests of the central node."""
+
+import threading
+import zlib
+from contextlib import contextmanager
+
+import zmq
+
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.network import messages, sockets
+from ertis_numba.network.central_node import Archive, CentralNode
+from ertis_numba.storage import open_recording, sensor_names
+from tests.journals import EPOCH, TINY
+
+WAIT_MS = 10_000
+
+
+class Node:
+    """Speaks the protocol word by word."""
+
+    def __init__(self, address, keys=None):
+        self._context = zmq.Context()
+        self.socket = sockets.client(self._context, address, keys=keys)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._context.destroy(linger=200)
+
+    def send(self, message, *payload):
+        self.socket.send_multipart([messages.encode(message), *payload])
+
+    def hear(self, kind=None):
+        """The next message, or the next of a kind."""
+        while True:
+            assert self.socket.poll(WAIT_MS), f"no {kind} came"
+            message = messages.decode(self.socket.recv_multipart()[0])
+            if kind is None or isinstance(message, kind):
+                return message
+
+    def hear_settled(self, settled):
+        """Acks until one says that a number is settled."""
+        while True:
+            ack = self.hear(messages.Ack)
+            if ack.settled >= settled:
+                return ack
+
+    def hello(self, sensor="left", *, epoch=EPOCH, first=10, settings=TINY, **more):
+        text = settings if isinstance(settings, bytes) else settings.to_toml().encode()
+        crc32 = more.pop("settings_crc32", zlib.crc32(text))
+        self.send(messages.Hello(sensor=sensor, epoch=epoch, next_sequence=first, settings_crc32=crc32, **more), text)
+        return self.hear((messages.Welcome, messages.Refused))
+
+    def measure(self, *given, **changes):
+        for entry in given:
+            self.send(*data_of(entry, **changes))
+
+
+def data_of(entry, **changes):
+    """The message of an entry."""
+    stamp, air = entry.measurement.stamp, entry.measurement.settings.air
+    words = changes.pop("words", entry.measurement.words.tobytes())
+    fields = {
+        "sensor": stamp.sensor,
+        "epoch": stamp.epoch,
+        "sequence": stamp.sequence,
+        "sync_count": stamp.sync_count,
+        "timestamp_ns": stamp.timestamp_ns,
+        "uncertainty_ns": stamp.timestamp_uncertainty_ns,
+        "monotonic_ns": entry.monotonic_ns,
+        "temperature_c": air.temperature_c,
+        "humidity_percent": air.humidity_percent,
+        "pressure_pa": air.pressure_pa,
+        "crc32": zlib.crc32(words),
+    }
+    return messages.Data(**fields | changes), words
+
+
+@contextmanager
+def running(folder=None, **options):
+    """A central node that runs; its archive is in ``folder``."""
+    events = []
+    archive = options.pop("archive", None) or (None if folder is None else Archive(folder, seal=False))
+    with CentralNode("tcp://127.0.0.1:0", archive=archive, on_event=events.append, **options) as central:
+        central.events = events
+        stop = threading.Event()
+        thread = threading.Thread(target=central.run, args=(stop,))
+        thread.start()
+        try:
+            yield central
+        finally:
+            stop.set()
+            thread.join()
+
+
+def stored(folder):
+    """What recordings and journals hold: (sensor, epoch, sequence) and words, in order, and what is missing."""
+    found, missing = [], []
+    for path in sorted(folder.glob(f"*.h5{SUFFIX}")):
+        with Journal.open(path) as journal:
+            found += wanted(journal.entries())
+            missing += [(gap.sensor, gap.epoch, gap.first, gap.last, gap.reason) for gap in journal.gaps]
+    for path in sorted(folder.glob("*.h5")):
+        for name in sensor_names(path):
+            with open_recording(path, sensor=name) as reader:
+                found += wanted(Entry(measurement, 0) for measurement in reader)
+                missing += [(name, gap.epoch, gap.first, gap.last, gap.reason) for gap in reader.gaps]
+    return found, missing
+
+
+def wanted(entries):
+    """What `stored` returns of entries."""
+    return [
+        ((stamp.sensor, stamp.epoch, stamp.sequence), entry.measurement.words.tobytes())
+        for entry in entries
+        for stamp in [entry.measurement.stamp]
+    ]

@@ -1,0 +1,152 @@
+"""Processing as a central node drives it, for tests: a small loop, measurements, and an application."""
+
+import select
+import time
+import zlib
+from contextlib import contextmanager
+
+import zmq
+
+from ertis_numba.network import sockets
+from ertis_numba.network.log import Log
+from ertis_numba.network.messages import Data, Description, Hello, Subscribe, decode, encode
+from ertis_numba.network.processing import Options, Processing
+from ertis_numba.settings import Settings
+from tests.cases import SHORT, noise
+
+TIMEOUT_S = 60.0
+ANY = "tcp://127.0.0.1:0"
+MEASUREMENT = noise(SHORT)
+
+
+def hello(sensor="front", settings=SHORT, epoch=7, **changes):
+    text = settings.to_toml().encode()
+    return Hello(sensor=sensor, epoch=epoch, next_sequence=0, settings_crc32=zlib.crc32(text), **changes)
+
+
+def data(sensor="front", sequence=0, *, epoch=7, settings=SHORT, **changes):
+    now_ns = time.time_ns()
+    values = {
+        "sync_count": sequence,
+        "timestamp_ns": now_ns,
+        "uncertainty_ns": 1000,
+        "monotonic_ns": time.monotonic_ns(),
+        "temperature_c": settings.air.temperature_c,
+        "humidity_percent": settings.air.humidity_percent,
+        "pressure_pa": settings.air.pressure_pa,
+        "crc32": 0,
+    }
+    return Data(sensor=sensor, epoch=epoch, sequence=sequence, **(values | changes))
+
+
+class Loop:
+    """Drives a `Processing`, and looks at its counts after every step."""
+
+    def __init__(self, processing):
+        self.processing = processing
+        self.offered = 0
+        self._sensors = set()
+        self._tick_s = 0.0
+
+    def step(self):
+        processing = self.processing
+        poll = select.poll()
+        for fd in processing.fds():
+            poll.register(fd, select.POLLIN)
+        for fd, _ in poll.poll(5):
+            if fd in processing.fds():
+                processing.ready(fd)
+        if time.monotonic() - self._tick_s > 0.05:
+            self._tick_s = time.monotonic()
+            processing.tick(self._tick_s)
+        self.check()
+
+    def counts(self):
+        return [self.processing.counts(sensor) for sensor in self._sensors]
+
+    def check(self):
+        for counts in self.counts():
+            assert counts.in_flight >= 0
+            assert counts.received == counts.published + sum(counts.dropped.values()) + counts.in_flight
+
+    def until(self, condition):
+        end_s = time.monotonic() + TIMEOUT_S
+        while not condition():
+            assert time.monotonic() < end_s, (self.processing.status(), self.counts())
+            self.step()
+
+    def offer(self, sensor="front", words=None, **values):
+        self._sensors.add(sensor)
+        words = MEASUREMENT.words if words is None else words
+        self.processing.offer(data(sensor, self.offered, **values), words, time.monotonic_ns())
+        self.offered += 1
+        self.check()
+
+    def settle(self):
+        self.until(lambda: not any(counts.in_flight for counts in self.counts()))
+
+    def workers(self, state):
+        return [worker for worker in self.processing.status().workers if worker.state == state]
+
+
+@contextmanager
+def driven(**options):
+    log = Lines("processing")
+    processing = Processing(Options(**({"publish": ANY, "device": "numpy", "workers": 1} | options)), log)
+    processing.start()
+    loop = Loop(processing)
+    loop.lines = log.lines
+    try:
+        yield loop
+    finally:
+        processing.close()
+
+
+class Lines(Log):
+    """A log that is remembered: events and their fields."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.lines = []
+
+    def _log(self, level, event, fields):  # noqa: ARG002  as it is called
+        self.lines.append((event, fields))
+
+
+class Application:
+    """A DEALER that subscribes as it is told to, message by message."""
+
+    def __init__(self, address, keys=None):
+        self._context = zmq.Context()
+        self.socket = sockets.client(self._context, address, keys=keys)
+        self.consumed = 0
+        self.descriptions = {}
+        self.got = []
+        self.others = []
+
+    def subscribe(self, *products, **values):
+        self.socket.send(encode(Subscribe(products=products, consumed=self.consumed, **values)))
+
+    def send(self, message):
+        self.socket.send(encode(message))
+
+    def read(self):
+        while self.socket.poll(0):
+            header, *payloads = self.socket.recv_multipart()
+            message = decode(header)
+            if isinstance(message, Description):
+                settings = Settings.from_toml(payloads[0].decode(), "description")
+                self.descriptions[message.number] = message, settings, payloads[1:]
+            elif hasattr(message, "number"):
+                self.got.append((message, b"".join(payloads)))
+            else:
+                self.others.append(message)
+
+    def kinds(self):
+        return [type(message).__name__ for message, _ in self.got]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._context.destroy(linger=0)

@@ -1,0 +1,281 @@
+"""What an archive tells to be stored is durable and there once, whatever becomes of its disk."""
+
+import select
+import shutil
+import time
+import zlib
+
+import pytest
+
+from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor
+from ertis_numba.network.central_node import Archive
+from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Item, Resumed, Run, SealedOne, Stored
+from tests.central import stored, wanted
+from tests.journals import EPOCH, TINY, create, entries
+
+SOURCE = Sensor.of("left", TINY)
+RUN = Run("left", EPOCH)
+WAIT_S = 20.0
+
+
+def item_of(entry, source=SOURCE):
+    stamp = entry.measurement.stamp
+    entry.crc32 = zlib.crc32(entry.measurement.words.data)
+    return Item(Run(stamp.sensor, stamp.epoch), stamp.sequence, stamp.sequence, entry, source, time.monotonic(), b"")
+
+
+def gap_of(first, last, reason="lost", sensor="left"):
+    return Item(Run(sensor, EPOCH), first, last, Gap(sensor, first, last, reason, EPOCH), SOURCE, 0.0, b"")
+
+
+class Opened:
+    """An archive that is open, and what it has told."""
+
+    def __init__(self, folder, **options):
+        self.archive = Archive(folder, **{"seal": False} | options)
+        self.events = []
+
+    def __enter__(self):
+        self.fd = self.archive.open()
+        return self
+
+    def __exit__(self, *_):
+        self.archive.close()
+        self.events += self.archive.read()
+
+    def give(self, *items):
+        for item in items:
+            self.archive.offer(item)
+
+    def until(self, kind, test=lambda _: True):
+        """Wait for an event, also one that has been."""
+        end_s = time.monotonic() + WAIT_S
+        seen = 0
+        while True:
+            for event in self.events[seen:]:
+                if isinstance(event, kind) and test(event):
+                    return event
+            seen = len(self.events)
+            assert time.monotonic() < end_s, f"no {kind} among {self.events}"
+            select.select([self.fd], [], [], 1.0)
+            self.events += self.archive.read()
+
+    def until_stored(self, number):
+        self.until(Stored, lambda event: event.items[-1].last >= number)
+
+
+def told(opened):
+    """Numbers that were told to be stored, in that order."""
+    return [item.last for event in opened.events if isinstance(event, Stored) for item in event.items]
+
+
+def from_zero(count, first=0, **options):
+    return entries(count, first=first, **options)
+
+
+def test_it_stores_in_order_and_tells_of_each_once(tmp_path):
+    given = from_zero(40)
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, given), gap_of(40, 44), *map(item_of, from_zero(2, 45)))
+        opened.until_stored(46)
+        assert opened.archive.settled(RUN) == 46
+    assert told(opened) == [*range(40), 44, 45, 46]
+    assert stored(tmp_path) == (wanted([*given, *from_zero(2, 45)]), [("left", EPOCH, 40, 44, "lost")])
+
+
+def test_what_does_not_follow_is_sent_back(tmp_path):
+    given = from_zero(3)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(given[0]), item_of(given[2]), item_of(given[1]))
+        opened.until_stored(1)
+    assert [event.item.first for event in opened.events if isinstance(event, Forgotten)] == [2]
+    assert stored(tmp_path)[0] == wanted(given[:2])
+
+
+def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
+    others = from_zero(2, sensor="right")
+    bad = item_of(from_zero(1)[0], Sensor.of("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192))))
+    with Opened(tmp_path) as opened:
+        right = Sensor.of("right", TINY)
+        opened.give(item_of(others[0], right), bad, item_of(others[1], right))
+        opened.until_stored(1)
+    assert [event.reason for event in opened.events if isinstance(event, Forgotten)] != [""]
+    assert stored(tmp_path)[0] == wanted(others)
+
+
+def test_full_recordings_are_sealed_while_it_goes_on(tmp_path):
+    given = from_zero(600)
+    with Opened(tmp_path, seal=True, rotate_bytes=1e6) as opened:
+        for begin in range(0, 600, 100):
+            opened.give(*map(item_of, given[begin : begin + 100]))
+            opened.until_stored(begin + 99)
+        opened.until(SealedOne)
+    assert opened.archive.status().sealing == 0
+    assert opened.archive.status().sealed == len(list(tmp_path.glob("*.h5"))) >= 2
+    assert not list(tmp_path.glob(f"*{SUFFIX}"))
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+def test_time_makes_a_recording_full(tmp_path, monkeypatch):
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+        monkeypatch.setattr(opened.archive, "_rotate_s", 0.0)
+        while opened.archive._shelf.volume is not None:  # noqa: SLF001
+            select.select([opened.fd], [], [], 0.05)
+        monkeypatch.undo()
+        opened.give(item_of(from_zero(1, 1)[0]))
+        opened.until_stored(1)
+    assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
+
+
+def failing(monkeypatch, *, times, before=True, error=None):
+    """Have commits fail: before anything is written, or after it was."""
+    append, left = Journal.append, [times]
+
+    def fails(journal, given):
+        if left[0] and not before:
+            append(journal, given)
+        if left[0]:
+            left[0] -= 1
+            raise error or DataError("the disk fails")
+        append(journal, given)
+
+    monkeypatch.setattr(Journal, "append", fails)
+    monkeypatch.setattr("ertis_numba.network.central_node._archive._AGAIN_S", 0.01)
+
+
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize("times", [1, 4])
+def test_a_commit_that_fails_is_done_once(before, times, tmp_path, monkeypatch):
+    failing(monkeypatch, times=times, before=before)
+    given = from_zero(3)
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(2)
+        opened.until(Resumed)
+    assert [type(event) for event in opened.events if not isinstance(event, Stored)][:2] == [Fault, Resumed]
+    assert sorted(told(opened)) == [0, 1, 2]
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+def test_any_error_is_a_fault_that_passes(tmp_path, monkeypatch):
+    failing(monkeypatch, times=3, error=OSError(5, "Input/output error"))
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, from_zero(2)))
+        opened.until_stored(1)
+    faults = [event.text for event in opened.events if isinstance(event, Fault)]
+    assert faults == ["[Errno 5] Input/output error"]
+
+
+def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.central_node._archive._AGAIN_S", 0.01)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+        (path,) = tmp_path.glob(f"*{SUFFIX}")
+        path.unlink()
+        opened.give(item_of(from_zero(1, 1)[0]))
+        opened.until_stored(1)
+    assert "removed or replaced" in opened.until(Fault).text
+    assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
+
+
+def test_a_journal_that_cannot_be_read_again_is_set_aside(tmp_path, monkeypatch):
+    failing(monkeypatch, times=1)
+    opens = Journal.open
+
+    def broken(path):
+        if path.name == first[0]:
+            raise DataError("unreadable")
+        return opens(path)
+
+    first = [""]
+    with Opened(tmp_path) as opened:
+        monkeypatch.setattr(Journal, "open", broken)
+        opened.give(gap_of(0, 0))
+        opened.until_stored(0)
+        first[0] = next(tmp_path.glob(f"*{SUFFIX}")).name
+        opened.give(item_of(from_zero(1, 1)[0]))
+        opened.until_stored(1)
+        monkeypatch.undo()
+    assert len(list(tmp_path.glob("*.damaged"))) == 1
+    assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
+
+
+def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):
+    failing(monkeypatch, times=10**9)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until(Fault)
+    monkeypatch.undo()
+    assert told(opened) == []
+    with Opened(tmp_path) as opened:
+        assert opened.archive.settled(RUN) == -1
+
+
+def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
+    given, left = from_zero(3), tmp_path / "left"
+    left.mkdir()
+    tmp_path = tmp_path / "running"
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(2)
+        for path in tmp_path.iterdir():
+            shutil.copy(path, left)
+    with Opened(left, seal=True) as opened:
+        assert opened.archive.settled(RUN) == 2
+        opened.until(SealedOne)
+    assert stored(left)[0] == wanted(given)
+
+
+def test_a_folder_without_a_ledger_is_read(tmp_path):
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, from_zero(3)))
+        opened.until_stored(2)
+    (tmp_path / ".ertis-ledger").unlink()
+    create(tmp_path, from_zero(2, 3), name="other.h5").close()
+    with Opened(tmp_path) as opened:
+        assert opened.archive.settled(RUN) == 4
+
+
+def test_a_journal_that_somebody_else_has_is_not_guessed(tmp_path):
+    with create(tmp_path, from_zero(2)), pytest.raises(InUseError, match="in use by another process"):
+        Archive(tmp_path).open()
+    with Opened(tmp_path) as opened:  # and the folder is free again
+        assert opened.archive.settled(RUN) == 1
+
+
+def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing._AGAIN_S", 0.05)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+    (path,) = tmp_path.glob(f"*{SUFFIX}")
+    in_the_way = path.with_name(path.name.removesuffix(SUFFIX))
+    in_the_way.write_text("something else")
+    with Opened(tmp_path, seal=True) as opened:
+        assert "exists and holds something else" in opened.until(Failed).text
+        assert opened.archive.status().sealing_failed >= 1
+        in_the_way.unlink()
+        opened.until(SealedOne)
+    assert opened.archive.status().sealing == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "a/b"}, "sensor name"),
+        ({"rotate_bytes": 1}, "size of a recording is 1"),
+        ({"rotate_s": 0}, "time of a recording is 0"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused(options, message, tmp_path):
+    with pytest.raises(ArgumentError, match=message):
+        Archive(tmp_path, **options)
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    with pytest.raises(DataError, match="give a folder that can be written"):
+        Archive(tmp_path / "no" / "folder").open()

@@ -1,0 +1,267 @@
+"""``ertis capture --to``: what sensors measure reaches a central node, or the command says that it does not."""
+
+import json
+import signal
+import subprocess
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+from ertis_numba.capture import Session
+from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.setup import Setup
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.network.keys import AllowList, KeyPair, Permission, ServerKeys
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.storage import open_recording, sensor_names
+from tests.emulated import N_SAMPLES
+from tests.journals import ENVIRONMENT
+from tests.stand_in import StandIn
+
+ERTIS = (sys.executable, "-m", "ertis_cli")
+SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
+SOON_S = 30.0
+MOUNTING = """
+[[sensors]]
+name = "one"
+position_m = [0.2, 0.0, 0.4]
+
+[[sensors]]
+name = "two"
+position_m = [0.0, -0.5, 0.4]
+yaw_deg = -90.0
+"""
+TURNED = ((0.0, -0.5, 0.4), (0.0, 0.0, -(0.5**0.5), 0.5**0.5))
+
+
+@pytest.fixture(scope="module")
+def words():
+    """Four measurements, different parts of a simulated one."""
+    whole = open_recording("data/synthetic/reflectors.h5")[0].words
+    return [np.ascontiguousarray(whole[start : start + N_SAMPLES]) for start in range(0, 4 * N_SAMPLES, N_SAMPLES)]
+
+
+@pytest.fixture
+def sensors(tmp_path, words):
+    (tmp_path / "settings.toml").write_text(SETTINGS.to_toml())
+    (tmp_path / "mounting.toml").write_text(MOUNTING)
+    with (
+        Emulator(words, name="one", link=tmp_path / "one") as one,
+        Emulator(words[::-1], name="two", link=tmp_path / "two") as two,
+    ):
+        yield one, two
+
+
+def start(tmp_path, *arguments, ports=("one",)):
+    given = [part for port in ports for part in ("--port", str(tmp_path / port), "--name", port)]
+    command = [*ERTIS, "capture", "--settings", "settings.toml", "--json", *given, *map(str, arguments)]
+    return subprocess.Popen(
+        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def run(tmp_path, *arguments, **options):
+    with start(tmp_path, *arguments, **options) as process:
+        out, err = process.communicate(timeout=SOON_S)
+    return process.returncode, [json.loads(line) for line in out.splitlines()], err
+
+
+def checks(central):
+    """CRC-32 of what a central node holds, by sensor, epoch and number."""
+    return {
+        (*key, number): message.crc32 for key, held in central.held.items() for number, (message, _) in held.items()
+    }
+
+
+def kept(events):
+    return {(each["sensor"], each["epoch"], each["sequence"]): each["crc32"] for each in events if "crc32" in each}
+
+
+@pytest.mark.usefixtures("sensors")
+def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
+    with StandIn() as central:
+        code, events, err = run(
+            tmp_path,
+            "--to",
+            central.address,
+            "-n",
+            4,
+            "--rate",
+            20,
+            "--mounting",
+            "mounting.toml",
+            ports=("one", "two"),
+        )
+        hellos = {hello.sensor: hello for hello, _ in central.hellos.queue}
+    assert code == 0, err
+    assert kept(events) == checks(central)
+    (epoch,) = {epoch for _, epoch, _ in kept(events)}
+    given = {"one": words, "two": words[::-1]}
+    assert checks(central) == {
+        (name, epoch, number): zlib.crc32(each.tobytes())
+        for name, several in given.items()
+        for number, each in enumerate(several)
+    }
+    assert hellos["one"].translation_m == (0.2, 0.0, 0.4)
+    assert hellos["two"].translation_m == TURNED[0]
+    assert hellos["two"].rotation_xyzw == pytest.approx(TURNED[1])
+    final = events[-1]
+    assert (final["event"], final["output"], final["kept"], final["lost"]) == ("captured", central.address, 8, 0)
+    assert final["central"] == {"stored": 8, "accepted": 0, "dropped": {}}
+    assert [final[name] for name in ("refused", "overwritten", "damaged", "unsettled", "reconnects")] == [0] * 5
+    settled = [each for each in events if each["event"] == "settled" and each["sensor"] == "one"]
+    assert settled[-1] == {
+        "event": "settled", "sensor": "one", "epoch": epoch, "settled": 3, "status": "stored", "dropped": []
+    }  # fmt: skip
+    assert not list(tmp_path.glob("*.h5*"))
+
+
+@pytest.mark.usefixtures("sensors")
+def test_a_recording_says_where_sensors_are(tmp_path):
+    code, events, err = run(tmp_path, "-o", "rec.h5", "-n", 1, "--mounting", "mounting.toml", ports=("two", "one"))
+    assert code == 0, err
+    assert {each["event"] for each in events} == {"stored", "captured"}
+    assert sensor_names(tmp_path / "rec.h5") == ("two", "one")
+    with open_recording(tmp_path / "rec.h5", sensor="two") as recording:
+        assert tuple(recording.translation_m) == TURNED[0]
+        assert tuple(recording.rotation_xyzw) == pytest.approx(TURNED[1])
+
+
+@pytest.mark.usefixtures("sensors")
+def test_what_never_arrives_is_an_error(tmp_path):
+    code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
+    assert code == 1
+    message = "3 measurements did not reach the central node at tcp://127.0.0.1:9; give --spool DIR, which keeps them"
+    assert err.splitlines()[-1].startswith(f"ertis: error: {message}")
+    assert (events[-1]["event"], events[-1]["kept"], events[-1]["unsettled"]) == ("captured", 3, 3)
+
+
+@pytest.mark.usefixtures("sensors")
+def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
+    code, first, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "--spool", "spool", "-n", 3, "--patience", "0.1")
+    assert code == 0, err
+    assert "3 measurements wait in spool; the next capture with --spool sends what is there" in err
+    with StandIn() as central:
+        code, second, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 2)
+    assert code == 0, err
+    assert kept(first) | kept(second) == checks(central)
+    assert len(checks(central)) == 5
+    assert not list((tmp_path / "spool").iterdir())
+
+
+@pytest.mark.usefixtures("sensors")
+@pytest.mark.parametrize("kill", [False, True])
+def test_what_ends_a_capture_loses_nothing(tmp_path, kill):
+    """A signal once: everything is sent first. SIGKILL: the spool has what was told of."""
+    with StandIn() as central:
+        events = []
+        central.silent = kill
+        with start(tmp_path, "--to", central.address, "--rate", 50, "--spool", "spool") as process:
+            for line in process.stdout:
+                events.append(json.loads(line) if line.endswith("\n") else {})
+                if len(events) == 12:
+                    process.send_signal(signal.SIGKILL if kill else signal.SIGTERM)
+        assert process.returncode == (-signal.SIGKILL if kill else 0)
+        central.silent = False
+        if kill:
+            code, more, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 1)
+            assert code == 0, err
+            events += more
+    assert kept(events).items() <= checks(central).items()
+    assert len(checks(central)) <= len(kept(events)) + kill
+    assert not list((tmp_path / "spool").iterdir())
+
+
+@pytest.mark.usefixtures("sensors")
+def test_a_second_signal_ends_it_at_once(tmp_path):
+    with start(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 2, "--patience", 3600) as process:
+        for line in process.stdout:
+            if json.loads(line).get("sequence") == 1:
+                break
+        for line in process.stdout:  # it waits for the central node by now
+            if "does not answer" in json.loads(line).get("text", ""):
+                break
+        process.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.8)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=SOON_S)
+    assert process.returncode == 130
+    assert "measurements that the central node does not have yet are lost" in err
+
+
+@pytest.mark.usefixtures("sensors")
+def test_keys(tmp_path):
+    mine, theirs = KeyPair.new("node"), KeyPair.new("central")
+    secret, _ = mine.save(tmp_path / "keys")
+    allow = tmp_path / "allow.toml"
+    AllowList().allow(Permission(name="node", public=mine.public, role="sensor", serials=("one",))).save(allow)
+    with StandIn(keys=ServerKeys(theirs, allow)) as central:
+        to = ("--to", central.address, "-n", 2, "--patience", "1")
+        code, events, err = run(tmp_path, *to, "--key", secret, "--server-key", theirs.public)
+        assert (code, events[-1]["kept"], central.taken) == (0, 2, 2), err
+        code, _, err = run(tmp_path, *to)
+        assert (code, central.taken) == (1, 2)
+        assert "give --key and --server-key" in err
+
+
+@pytest.mark.usefixtures("sensors")
+@pytest.mark.parametrize(
+    ("arguments", "message", "code"),
+    [
+        (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output both say where measurements go; give one", 2),
+        (["--spool", "spool"], "--spool, --key and --server-key are about a central node; give --to, too", 2),
+        (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
+        (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, and there are no keys", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),
+        (["--mounting", "none.toml"], "none.toml", 1),
+        (["--mounting", "empty.toml"], "says nothing of sensor 'one'; add it, or call it one of sensor by --name", 1),
+    ],
+)
+def test_errors_are_one_line(tmp_path, arguments, message, code):
+    (tmp_path / "empty.toml").touch()
+    came, events, err = run(tmp_path, *arguments)
+    assert (came, events) == (code, [])
+    assert message in err.splitlines()[-1]
+    assert len(err.splitlines()) == 1
+    assert not list(tmp_path.glob("*.h5*"))
+
+
+def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
+    del sensors
+    with (
+        Sonar.open(str(tmp_path / "one")) as sonar,
+        SensorNode("tcp://127.0.0.1:9", spool=tmp_path / "spool", spool_bytes=2 * 4 * N_SAMPLES) as node,
+    ):
+        sonar.configure(Setup.of(SETTINGS))
+        told = []
+        session = Session({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=told.extend)
+        session.run(node)
+        counts = session.counts["one"]
+        assert (counts.stored, dict(counts.missing)) == (2, {"there was no room for it": 3})
+        assert [entry.measurement.stamp.sequence for entry in told] == [0, 1]
+        assert node.counts["one"].refused == 3
+
+
+@pytest.mark.usefixtures("sensors")
+def test_a_central_node_records_it(tmp_path):
+    command = [*ERTIS, "record", "--listen", "tcp://127.0.0.1:*", "-o", "recordings", "--json"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as central:
+        address = json.loads(central.stdout.readline())["address"]
+        code, events, err = run(tmp_path, "--to", address, "-n", 4, "--rate", 20, ports=("one", "two"))
+        central.send_signal(signal.SIGTERM)
+        central.communicate(timeout=SOON_S)
+    assert (code, events[-1]["central"]["stored"]) == (0, 8), err
+    (path,) = (tmp_path / "recordings").glob("*.h5")
+    found = {}
+    for name in ("one", "two"):
+        with open_recording(path, sensor=name) as recording:
+            found |= {
+                (name, each.stamp.epoch, each.stamp.sequence): zlib.crc32(each.words.tobytes()) for each in recording
+            }
+    assert found == kept(events)

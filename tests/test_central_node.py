@@ -1,0 +1,399 @@
+"""The central node takes measurements in once and in order, and answers whatever comes."""
+
+import random
+from collections import Counter
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+
+from ertis_numba.errors import ArgumentError, InUseError
+from ertis_numba.network import messages
+from ertis_numba.network.central_node import Archive, CentralNode
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.messages import Ack, Gap, Ping, Pong, Refused, Report, Welcome
+from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
+from ertis_numba.settings import Air, Recording
+from tests.central import Node, data_of, running, stored, wanted
+from tests.files import line
+from tests.journals import EPOCH, TINY, entries
+
+
+def test_what_is_acked_is_in_the_recording(tmp_path):
+    given = entries(5)
+    with running(archive=Archive(tmp_path / "a")) as central, Node(central.address) as node:
+        welcome = node.hello(first=10)
+        assert (welcome.state, welcome.acks, welcome.settled) == ("storage", "stored", -1)
+        node.measure(*given)
+        assert node.hear_settled(14).status == "stored"
+    assert stored(tmp_path / "a") == (wanted(given), [("left", EPOCH, 0, 9, "never reached the central node")])
+    assert [event["event"] for event in central.events] == ["listening", "joined", "sealed"]
+
+
+def test_a_number_is_stored_once_and_acked_again(tmp_path):
+    given = entries(3)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*given)
+        node.hear_settled(12)
+        node.measure(*given[1:])
+        node.send(Ping())
+        assert node.hear(Pong).state == "storage"
+        assert node.hear(Ack).settled == 12
+    assert stored(tmp_path)[0] == wanted(given)
+    assert (central.latest.sensors["left"].received, central.latest.sensors["left"].repeated) == (3, 2)
+
+
+def test_nothing_beyond_a_hole_is_taken(tmp_path):
+    given = entries(4)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(given[0])
+        node.hear_settled(10)
+        node.measure(given[2], given[3])
+        assert [node.hear(Ack).settled for _ in range(1)] == [10]
+        node.measure(*given[1:])
+        node.hear_settled(13)
+    assert stored(tmp_path)[0] == wanted(given)
+
+
+def test_gaps_settle_in_order(tmp_path):
+    given = entries(6)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(given[0])
+        node.send(Gap(sensor="left", epoch=EPOCH, first=12, last=13, reason="beyond a hole"))
+        node.send(Gap(sensor="left", epoch=EPOCH, first=10, last=12, reason="the ring was full"))
+        node.send(Gap(sensor="left", epoch=EPOCH, first=11, last=12, reason="the ring was full"))
+        node.measure(*given[3:])
+        node.hear_settled(15)
+    found, missing = stored(tmp_path)
+    assert found == wanted([given[0], *given[3:]])
+    assert [each[2:] for each in missing] == [(0, 9, "never reached the central node"), (11, 12, "the ring was full")]
+    assert central.latest.sensors["left"].missing == {"never reached the central node": 10, "the ring was full": 2}
+
+
+def test_a_node_that_comes_back_goes_on_where_it_was(tmp_path):
+    given = entries(6)
+    with running(tmp_path) as central:
+        with Node(central.address) as node:
+            node.hello()
+            node.measure(*given[:3])
+            node.hear_settled(12)
+        with Node(central.address) as node:
+            assert node.hello(first=12).settled == 12
+            node.measure(*given[2:])
+            node.hear_settled(15)
+    assert stored(tmp_path)[0] == wanted(given)
+
+
+def test_the_next_run_of_the_central_node_knows_what_is_stored(tmp_path):
+    given = entries(6)
+    for first, last in ((0, 3), (2, 6)):
+        with running(tmp_path) as central, Node(central.address) as node:
+            assert node.hello(first=10 + first).settled == (-1 if first == 0 else 12)
+            node.measure(*given[first:last])
+            node.hear_settled(9 + last)
+    found, missing = stored(tmp_path)
+    assert found == wanted(given)
+    assert [each[2:4] for each in missing] == [(0, 9)]
+
+
+def test_another_measurement_of_a_number_is_kept_too(tmp_path):
+    given, others = entries(3), entries(3, seed=2)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*given)
+        node.hear_settled(12)
+        for other in (others[1], others[0], others[1]):
+            node.measure(other)
+            node.hear(Ack)
+    twins = sorted(tmp_path.glob("*_conflicts.h5.journal"))
+    found = stored(tmp_path)[0]
+    assert sorted(found) == sorted(wanted([*given, *others[:2]]))
+    assert len(twins) == 2  # numbers of one recording rise
+    sensor = central.latest.sensors["left"]
+    assert (sensor.stored, sensor.conflicts, sensor.repeated) == (3, 2, 3)
+
+
+def test_other_settings_begin_another_recording(tmp_path):
+    given, others = entries(2), entries(2, first=12, settings=TINY.replace(call=TINY.call.replace(duration_s=2e-3)))
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*given)
+        node.hear_settled(11)
+        node.hello(first=12, settings=others[0].measurement.settings)
+        node.measure(*others)
+        node.hear_settled(13)
+        node.hello(first=14, settings=TINY, translation_m=(1.0, 0.0, 0.0))
+        node.measure(*entries(1, first=14))
+        node.hear_settled(14)
+    assert len(list(tmp_path.glob("*.h5.journal"))) == 3
+    assert len(stored(tmp_path)[0]) == 5
+
+
+def test_air_may_change(tmp_path):
+    settings = TINY.replace(air=Air(temperature_c=5.0))
+    given = [entries(1)[0], *entries(1, first=11, settings=settings)]
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*given)
+        node.hear_settled(11)
+    assert stored(tmp_path)[0] == wanted(given)
+
+
+WRONG = {
+    "before its hello": ({"epoch": 6}, "hello", "say hello first"),
+    "too short": ({"words": b"1234"}, "message", "has 4 bytes, its settings say 4096"),
+    "of another CRC-32": ({"crc32": 1}, "message", "another CRC-32"),
+    "in no air": ({"temperature_c": float("nan")}, "message", "air.temperature_c"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
+    changes, code, reason = WRONG[what]
+    given = entries(2)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(given[0], **changes)
+        refused = node.hear(Refused)
+        node.measure(*given)
+        node.hear_settled(11)
+    assert (refused.code, refused.sensor) == (code, "left")
+    assert reason in refused.reason
+    assert sum(central.latest.refused.values()) == 1
+    assert stored(tmp_path)[0] == wanted(given)
+
+
+HELLOS = {
+    "settings of another CRC-32": ({"settings_crc32": 1}, "another CRC-32"),
+    "no settings": ({"settings": b"["}, "settings of sensor left"),
+    "no text": ({"settings": b"\xff"}, "no text"),
+    "a file for a layout": ({"settings": b'[array]\nlayout = "/etc/passwd"'}, "send its positions"),
+    "a file for directions": ({"settings": b'[processing]\ndirections = "x.csv"'}, "name a grid"),
+    "a name with a line feed": ({"settings": b'[array]\nlayout = "a\\n"'}, "cannot be printed"),
+    "a firmware with zeros": ({"firmware": "\0"}, "printable"),
+    "a quaternion of length 0": ({"rotation_xyzw": (0.0, 0.0, 0.0, 0.0)}, "rotation_xyzw"),
+    "more than is taken": ({"settings": line(8, 8).replace(recording=Recording(n_samples=2**23))}, "this node takes"),
+    "too much": ({"settings": b"#" * 300_000}, "at most"),
+}
+
+
+@pytest.mark.parametrize("what", HELLOS)
+def test_settings_that_cannot_be_used_are_refused(what, tmp_path):
+    changes, reason = HELLOS[what]
+    with running(tmp_path) as central, Node(central.address) as node:
+        refused = node.hello(**changes)
+        assert isinstance(refused, Refused)
+        assert refused.code == "settings"
+        assert reason in refused.reason
+        assert isinstance(node.hello(), Welcome)
+
+
+def test_garbage_is_counted_and_harms_nobody(tmp_path):
+    generator = random.Random(1)
+    given = entries(3)
+    known = [messages.encode(Ping()), *(messages.encode(data_of(entry)[0]) for entry in given)]
+    with running(tmp_path) as central, Node(central.address) as node, Node(central.address) as stranger:
+        node.hello()
+        for _ in range(300):
+            header = bytearray(generator.choice(known))
+            header[generator.randrange(len(header))] ^= 1 << generator.randrange(8)
+            stranger.socket.send_multipart([bytes(header), *[b"1234"] * generator.randrange(8)])
+        stranger.socket.send_multipart([b"eRTN\x02more"])
+        stranger.socket.send_multipart([b""])
+        node.measure(*given)
+        node.hear_settled(12)
+        while stranger.hear(Refused).code != "version":
+            pass
+    assert stored(tmp_path)[0] == wanted(given)
+    refused = central.latest.refused
+    assert refused["version"] >= 1
+    assert "internal" not in refused
+    assert 200 < sum(refused.values()) <= 302
+
+
+def test_a_gap_that_no_file_can_hold_is_refused(tmp_path):
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello(first=0)
+        node.send(Gap(sensor="left", epoch=EPOCH, first=0, last=3, reason="two\nlines"))
+        assert node.hear(Refused).code == "message"
+
+
+def test_status_is_told_to_who_asks(tmp_path):
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*entries(2))
+        node.hear_settled(11)
+        node.send(messages.AskStatus())
+        assert node.socket.poll(5000)
+        header, payload = node.socket.recv_multipart()
+        assert messages.decode(header) == Report()
+        status = msgspec.msgpack.decode(payload, type=Status)
+    assert (status.state, status.peers, status.sensors["left"].stored) == ("storage", 1, 2)
+    assert status.archive is not None
+    assert status.archive.free_bytes > 0
+    assert status.archive.ack.max_ms > 0
+
+
+def test_nodes_that_are_silent_are_forgotten(tmp_path, monkeypatch):
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*entries(1))
+        node.hear_settled(10)
+        monkeypatch.setattr("ertis_numba.network.central_node._intake._SILENT_S", 0.01)
+        while not any(event["event"] == "left" for event in central.events):
+            node.socket.poll(10)
+        monkeypatch.undo()
+        node.measure(*entries(1, first=11))
+        assert node.hear(Refused).code == "hello"
+        assert node.hello(first=11).settled == 10
+
+
+def keys(folder, *permissions):
+    server = KeyPair.new("server")
+    AllowList(keys=permissions).save(folder / "allow.toml")
+    return ServerKeys(server, folder / "allow.toml")
+
+
+def permission(pair, role="sensor", serials=("left",)):
+    return Permission(name=pair.name, public=pair.public, role=role, serials=serials if role == "sensor" else ())
+
+
+def test_a_key_speaks_for_its_serials_and_role_only(tmp_path):
+    pairs = [KeyPair.new(name) for name in ("node", "screen")]
+    given = keys(tmp_path, permission(pairs[0]), permission(pairs[1], "application"))
+    with running(tmp_path / "a", keys=given) as central:
+        sensor, screen = (ClientKeys(pair, given.pair.public) for pair in pairs)
+        with Node(central.address, sensor) as node, Node(central.address, screen) as listener:
+            assert node.hello("right").code == "serial"
+            assert isinstance(node.hello("left"), Welcome)
+            node.measure(*entries(1), sensor="right")
+            assert node.hear(Refused).code == "serial"
+            node.send(messages.AskStatus())
+            assert node.hear(Refused).code == "role"
+            assert listener.hello("left").code == "role"
+            listener.send(messages.AskStatus())
+            assert listener.hear() == Report()
+            node.measure(*entries(1))
+            node.hear_settled(10)
+    assert central.latest.refused["serial"] == 2
+    assert central.latest.refused["role"] == 2
+
+
+def test_a_key_that_is_removed_is_not_heard_any_more(tmp_path):
+    pair = KeyPair.new("node")
+    given = keys(tmp_path, permission(pair))
+    known = ClientKeys(pair, given.pair.public)
+    with running(tmp_path / "a", keys=given) as central, Node(central.address, known) as node:
+        node.hello()
+        node.measure(*entries(1))
+        node.hear_settled(10)
+        AllowList(keys=()).save(given.allow)
+        while not any(event["event"] == "left" for event in central.events):
+            node.socket.poll(20)
+        node.measure(*entries(1, first=11))
+        assert node.hear(Refused).code == "role"
+    assert central.latest.refused["removed key"] >= 1
+    assert len(stored(tmp_path / "a")[0]) == 1
+
+
+class Images:
+    """Stands for what makes images."""
+
+    def __init__(self):
+        self.known, self.offered = [], []
+
+    def know(self, hello, settings):
+        self.known.append((hello.sensor, settings))
+
+    def offer(self, data, words, arrived_ns):
+        self.offered.append((data.sequence, words.copy(), arrived_ns))
+
+    def counts(self, _):
+        return SimpleNamespace(published=2, dropped=Counter(late=1), in_flight=1, queue=1, latency=Percentiles())
+
+    def status(self):
+        return ProcessingStatus()
+
+    def fds(self):
+        return ()
+
+    def start(self):
+        pass
+
+    def tick(self, _):
+        pass
+
+    publish_status = close = ready = tick
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_processing_gets_each_measurement_once(archive, tmp_path):
+    images, given = Images(), entries(3)
+    with running(tmp_path if archive else None, processing=images) as central, Node(central.address) as node:
+        welcome = node.hello()
+        assert (welcome.state, welcome.acks) == ("processing", "stored" if archive else "accepted")
+        assert welcome.settled == (-1 if archive else 9)
+        node.measure(*given, given[0])
+        assert node.hear_settled(12).status == welcome.acks
+        node.send(Ping())
+        node.hear(Pong)
+    assert [each[0] for each in images.offered] == [10, 11, 12]
+    assert all(
+        (words == entry.measurement.words).all() for (_, words, _), entry in zip(images.offered, given, strict=True)
+    )
+    assert images.known[0][0] == "left"
+    sensor = central.latest.sensors["left"]
+    assert (sensor.received, sensor.repeated, sensor.published, sensor.dropped) == (3, 1, 2, {"late": 1})
+
+
+def test_without_an_archive_a_run_is_remembered():
+    with running(processing=Images()) as central:
+        with Node(central.address) as node:
+            node.hello()
+            node.measure(*entries(3))
+            node.hear_settled(12)
+            node.send(messages.Bye())
+        with Node(central.address) as node:
+            assert node.hello(first=11).settled == 12
+            node.measure(entries(2)[1])
+            node.send(Ping())
+            assert node.hear(Ack).settled == 12
+    assert central.latest.sensors["left"].received == 3
+
+
+def test_a_central_node_needs_something_to_do():
+    with pytest.raises(ArgumentError, match="neither archive nor processing"):
+        CentralNode("tcp://127.0.0.1:0")
+
+
+def test_it_is_run_in_a_with_statement(tmp_path):
+    with pytest.raises(ArgumentError, match="not open"):
+        CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path)).run(lambda: True)
+
+
+def test_a_folder_belongs_to_one_central_node(tmp_path):
+    with running(tmp_path), pytest.raises(InUseError, match="in use by another central node"), running(tmp_path):
+        pass
+
+
+def test_others_cannot_reach_it_without_keys(tmp_path):
+    with (
+        pytest.raises(ArgumentError, match="there are no keys"),
+        CentralNode("tcp://0.0.0.0:0", archive=Archive(tmp_path)),
+    ):
+        pass
+
+
+def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
+    given = entries(2)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        with monkeypatch.context() as patch:
+            patch.setattr("ertis_numba.network.central_node._intake.Intake.ping", lambda *_: 1 / 0)
+            node.send(Ping())
+            node.measure(*given)
+            node.hear_settled(11)
+    assert central.latest.refused["internal"] == 1

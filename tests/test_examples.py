@@ -1,0 +1,248 @@
+"""The examples that listen to a central node do what they say."""
+
+import contextlib
+import csv
+import importlib.util
+import io
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Processing
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.scene import Scene
+from tests.publishing import Publisher, cloud, image
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+WAIT_S = 10.0
+
+
+def example(name):
+    (path,) = EXAMPLES.glob(f"?_{name}.py")
+    spec = importlib.util.spec_from_file_location(f"example_{name}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def safety_stop():
+    return example("safety_stop")
+
+
+@pytest.fixture(scope="module")
+def acoustic_flow():
+    return example("acoustic_flow")
+
+
+@pytest.fixture(scope="module")
+def log_points():
+    return example("log_points")
+
+
+@contextlib.contextmanager
+def running(monkeypatch, main, *arguments):
+    """Run an example's main in a thread until the block ends; yield the lines that it has printed."""
+    subscribers, printed = [], io.StringIO()
+
+    class Kept(Subscriber):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            subscribers.append(self)
+
+    monkeypatch.setattr("ertis_numba.Subscriber", Kept, raising=False)
+    monkeypatch.setattr(sys, "stdout", printed)
+    thread = threading.Thread(target=main, args=arguments, daemon=True)
+    thread.start()
+    try:
+        yield lambda: printed.getvalue().splitlines()
+    finally:
+        for subscriber in subscribers:
+            subscriber.close()
+        thread.join(WAIT_S)
+
+
+# Safety stop: bands at 0.8 m and 1.6 m, left at a quarter more, after three images.
+
+
+def test_stops_at_once_and_goes_on_late(safety_stop):
+    way, speeds = safety_stop.Way(), []
+    far, near = 5.0, 0.5
+    for now_s, nearest_m in enumerate([far, far, far, far, far, far, near, far, far, far, near]):
+        way.see(nearest_m, now_s)
+        speeds.append(safety_stop.SPEEDS[way.speed])
+    assert speeds == ["stop"] * 2 + ["slow"] * 3 + ["go", "stop", "stop", "stop", "slow", "stop"]
+
+
+def test_between_both_thresholds_of_a_band_nothing_changes(safety_stop):
+    way = safety_stop.Way()
+    for now_s in range(20):
+        way.see(0.9, now_s)  # farther than what stops, nearer than what lets go
+    assert way.speed == 0
+    for now_s in range(3):
+        way.see(1.1, now_s)
+    assert way.speed == 1
+    for now_s in range(20):
+        way.see(0.9, now_s)
+    assert way.speed == 1
+    way.see(0.79, 20)
+    assert way.speed == 0
+
+
+def test_a_gap_in_the_echoes_does_not_let_go(safety_stop):
+    way = safety_stop.Way()
+    for now_s in range(30):
+        way.see(0.5 if now_s % 3 == 0 else 5.0, now_s)
+    assert way.speed == 0
+
+
+def test_silence_stops(safety_stop):
+    way = safety_stop.Way()
+    for number in range(6):
+        way.see(9.0, 0.1 * number)
+    way.wait(0.9)
+    assert way.speed == 2
+    way.wait(1.1)
+    assert way.speed == 0
+
+
+def test_what_is_beside_or_behind_is_not_in_the_way(safety_stop):
+    points = [[2.0, 0.3, 0.1], [0.4, 0.5, 0.0], [0.3, -0.41, 0.0], [-0.2, 0.0, 0.0]]
+    assert safety_stop.nearest_in_way_m(cloud(position_m=points)) == 2.0
+    assert safety_stop.nearest_in_way_m(cloud(position_m=[])) == np.inf
+
+
+def test_says_when_it_changes_its_mind(safety_stop, monkeypatch):
+    def now(sequence, x_m, late_s=0.0):
+        made = cloud(sequence, position_m=[[x_m, 0, 0]])
+        stamp = image(sequence, timestamp_ns=time.time_ns() - round(1e9 * late_s)).stamp
+        return made.replace(stamp=stamp)
+
+    def until(lines):
+        publisher.pump(lambda: printed() == lines)
+
+    def see(x_m, count=3, late_s=0.0):
+        for _ in range(count):
+            sequence = next(numbers)
+            publisher.pump(lambda: all(peer.has_room for peer in publisher.peers.values()))
+            publisher.publish(now(sequence, x_m, late_s))
+
+    numbers = iter(range(100))
+    with Publisher() as publisher, running(monkeypatch, safety_stop.main, publisher.address, "front") as printed:
+        publisher.pump(lambda: len(publisher.peers) == 1)
+        until(["stop"])  # nothing was seen yet
+        see(4.0, late_s=2.0)  # too old
+        see(4.0)
+        until(["stop", "slow"])
+        see(4.0)
+        until(["stop", "slow", "go"])
+        see(0.5, count=1)
+        until(["stop", "slow", "go", "stop"])
+        see(1.3)
+        until(["stop", "slow", "go", "stop", "slow"])
+        until(["stop", "slow", "go", "stop", "slow", "stop"])  # silence
+
+
+# Acoustic flow
+
+
+def test_flow_of_echoes_that_move_in_range(acoustic_flow):
+    before = image(0, reflectors=[(-36, 1.2, 1.0), (36, 2.0, 0.5)])
+    now = image(1, reflectors=[(-36, 1.15, 1.0), (36, 2.013, 0.5)])  # 0.1 s later
+    directions, speeds_m_s = acoustic_flow.flow(before, now)
+    azimuth_deg = np.degrees(now.azimuth_rad[directions])
+    assert {-36, 36} <= set(np.round(azimuth_deg))
+    np.testing.assert_allclose(speeds_m_s[azimuth_deg < 0], -0.5, atol=0.02)
+    np.testing.assert_allclose(speeds_m_s[azimuth_deg > 0], 0.13, atol=0.02)
+
+
+def test_no_flow_where_there_is_no_echo_or_another(acoustic_flow):
+    directions, _ = acoustic_flow.flow(image(0, reflectors=[(0, 1.2, 1.0)]), image(1, reflectors=[(0, 2.2, 1.0)]))
+    assert not len(directions)  # faster than anything it looks for
+    directions, _ = acoustic_flow.flow(image(0), image(1))
+    assert not len(directions)
+
+
+def test_flow_of_a_simulated_person_is_the_truth(acoustic_flow):
+    scene = Scene.from_toml(
+        """
+        seed = 5
+        rate_hz = 10.0
+        count = 2
+        [[sensors]]
+        name = "front"
+        electronics.noise_dbfs = -60.0
+        [[points]]
+        position_m = [2.0, 0.5, 0.0]
+        velocity_m_s = [-0.8, -0.2, 0.0]
+        """
+    )
+    simulator = Simulator(scene)
+    settings = simulator.sensor.settings()
+    pipeline = Pipeline(settings.replace(processing=Processing(directions="90", range_m=(0.6, 4.0))), device="cpu")
+    before, now = (pipeline.process(simulator.render(index)) for index in range(2))
+    directions, speeds_m_s = acoustic_flow.flow(before, now)
+    towards = np.array([2.0, 0.5]) / np.hypot(2.0, 0.5)
+    nearest = np.abs(now.azimuth_rad[directions] - np.arctan2(0.5, 2.0)).argmin()
+    assert speeds_m_s[nearest] == pytest.approx(np.array([-0.8, -0.2]) @ towards, abs=0.02)
+
+
+def test_flow_is_told_of_images_that_follow(acoustic_flow, monkeypatch):
+    items = [image(k, reflectors=[(12, 2 - 0.05 * k, 1.0)]) for k in range(3)]
+    with (
+        Publisher() as publisher,
+        running(monkeypatch, acoustic_flow.main, publisher.address, "front") as printed,
+    ):
+        publisher.pump(lambda: publisher.peers)
+        for item in items:
+            publisher.pump(lambda: all(peer.has_room for peer in publisher.peers.values()))
+            publisher.publish(item)
+        publisher.pump(lambda: len(printed()) == 2)
+        assert printed()[0].startswith("#1: -0.5")
+        assert printed()[1].startswith("#2: -0.5")
+
+
+# Log of points
+
+
+def logged(log_points, path, capsys):
+    items = [cloud(1, position_m=[[1, 0, 0], [0, 2, 0]]), cloud(2, position_m=[]), cloud(3, sensor="left")]
+    with Publisher() as publisher, publisher.playing(items):
+        log_points.main(publisher.address, str(path), "3")
+    assert capsys.readouterr().out == f"{path}: 3 points of 3 clouds, 0 clouds dropped\n"
+    return items
+
+
+def test_log_as_csv_in_the_frame_of_the_platform(log_points, tmp_path, capsys):
+    path = tmp_path / "points.csv"
+    items = logged(log_points, path, capsys)
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["sensor"], row["sequence"]) for row in rows] == [("front", "1"), ("front", "1"), ("left", "3")]
+    assert rows[0]["time_ns"] == str(items[0].stamp.timestamp_ns)
+    # Turned by half a turn about z, then moved by 1, 2, 3.
+    places = [[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in rows]
+    np.testing.assert_allclose(places, [[0, 2, 3], [1, 0, 3], [0, 2, 3]], atol=1e-6)
+    assert [float(row["energy"]) for row in rows] == [1.0, 0.5, 1.0]
+    assert [each.name for each in tmp_path.iterdir()] == ["points.csv"]
+
+
+def test_log_as_npz(log_points, tmp_path, capsys):
+    path = tmp_path / "points.npz"
+    logged(log_points, path, capsys)
+    with np.load(path) as table:
+        assert set(table) == set(log_points.COLUMNS)
+        assert table["sequence"].tolist() == [1, 1, 3]
+        assert table["sensor"].tolist() == ["front", "front", "left"]
+        np.testing.assert_allclose(table["x_m"], [0, 1, 0], atol=1e-6)
+
+
+def test_an_empty_log_is_a_table_without_rows(log_points, tmp_path):
+    log_points.Log().save(tmp_path / "none.csv")
+    assert (tmp_path / "none.csv").read_text() == ",".join(log_points.COLUMNS) + "\n"

@@ -1,0 +1,161 @@
+"""Which measurements belong together, whatever happens to pulses, clocks and networks."""
+
+import pytest
+
+from ertis_numba.network.processing.groups import Groups
+from tests.driven import data
+
+INTERVAL_NS = 100_000_000
+HOUR_NS = 3_600_000_000_000
+LATENCY_NS = 3_000_000
+
+
+class Platform:
+    """Sensors on one SYNC chain: a clock of each run that nobody sets, and one that somebody may."""
+
+    def __init__(self, *runs):
+        self.groups = Groups()
+        self.closed = []
+        self.ahead = {}  # of a sensor's clock
+        self.shift = {}  # of its count
+        self.runs = dict(runs)  # sensor: epoch
+
+    def know(self):
+        for sensor in self.runs:
+            self.groups.know(sensor, 10**12)
+
+    def pulse(self, number, *, without=(), late=0):
+        at_ns = 10**12 + number * INTERVAL_NS
+        for sensor, epoch in self.runs.items():
+            if sensor in without:
+                continue
+            measured = data(
+                sensor,
+                number,
+                epoch=epoch,
+                sync_count=number + self.shift.get(sensor, 0),
+                timestamp_ns=10**18 + at_ns + self.ahead.get(sensor, 0),
+                monotonic_ns=at_ns + 1000 * epoch * INTERVAL_NS,
+            )
+            self.closed += self.groups.add(measured, at_ns + LATENCY_NS + late)
+        return at_ns
+
+    def wait(self, number):
+        self.closed += self.groups.tick(10**12 + number * INTERVAL_NS)
+
+    def told(self):
+        return [(group.group, group.sensors, group.flags) for group in self.closed]
+
+
+@pytest.fixture
+def four():
+    made = Platform(*((name, 1) for name in "abcd"))
+    made.know()
+    return made
+
+
+def test_a_group_is_closed_when_all_have_come(four):
+    four.pulse(0)
+    assert four.told() == [(0, ("a", "b", "c", "d"), ())]
+    assert four.closed[0].members == tuple((name, 1, 0) for name in "abcd")
+    assert (four.closed[0].missing, four.closed[0].spread_ns) == ((), 0)
+    assert four.groups.closed == {"complete": 1}
+
+
+def test_a_group_that_lacks_a_sensor_is_closed_after_a_while_and_says_so(four):
+    for number in range(3):
+        four.pulse(number, without=("c",) if number == 1 else ())
+    assert [group.group for group in four.closed] == [0, 2]
+    four.wait(20)
+    assert four.told()[-1] == (1, ("a", "b", "d"), ("incomplete",))
+    assert four.closed[-1].missing == ("c",)
+
+
+def test_a_sensor_that_has_left_is_not_waited_for(four):
+    four.pulse(0)
+    for number in range(1, 80):
+        four.pulse(number, without=("d",))
+        four.wait(number)
+    assert four.told()[-1] == (79, ("a", "b", "c"), ())
+
+
+def test_a_clock_that_steps_by_an_hour_flags_the_group_and_moves_nothing(four):
+    for number in range(20):
+        four.ahead["b"] = HOUR_NS if number >= 10 else 0
+        four.pulse(number)
+    assert [group.group for group in four.closed] == list(range(20))
+    assert all(group.sensors == ("a", "b", "c", "d") for group in four.closed)
+    assert [group.flags for group in four.closed] == [()] * 10 + [("clock",)] * 10
+    assert four.closed[-1].spread_ns == HOUR_NS
+
+
+def test_counts_of_several_runs_are_aligned_by_time():
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    platform.shift["b"] = -7  # it was armed seven pulses later
+    for number in range(20):
+        platform.pulse(number)
+    platform.wait(40)
+    assert platform.told() == [(number, ("a", "b"), ()) for number in range(20)]
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
+    platform = Platform(("a", 1), ("b", 2), ("c", 3))
+    platform.know()
+    for number in range(60):
+        platform.shift["b"] = shift if number >= 20 else 0
+        platform.pulse(number)
+    platform.wait(90)
+    told = platform.told()
+    # Some groups are flagged while nobody can know yet.
+    flagged = [group for group, _, flags in told if flags]
+    assert any("pulse" in flags for _, _, flags in told)
+    assert all(19 <= group <= 30 for group in flagged)
+    for group in platform.closed:
+        pulses = {sensor: sequence for sensor, _, sequence in group.members}
+        assert pulses.get("a") == pulses.get("c")  # they have lost nothing
+        if not group.flags:
+            assert len(pulses) == 3
+            assert len(set(pulses.values())) == 1
+    assert sum(not group.flags for group in platform.closed) >= 52
+
+
+def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    for number in range(30):
+        platform.ahead["b"] = HOUR_NS if number >= 15 else 0
+        platform.pulse(number)
+    platform.wait(50)
+    assert [group.group for group in platform.closed] == list(range(30))
+    assert platform.told()[-1] == (29, ("a", "b"), ("clock",))
+
+
+def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    for number in range(10):
+        platform.pulse(number, without=("b",))
+    platform.ahead["b"] = HOUR_NS
+    for number in range(10, 30):
+        platform.pulse(number)
+    platform.wait(50)
+    assert platform.told()[-1] == (29, ("a", "b"), ("clock",))
+
+
+def test_a_measurement_that_comes_too_late_is_counted(four):
+    four.pulse(0, without=("d",))
+    four.wait(20)
+    four.runs = {"d": 1}
+    four.pulse(0)
+    assert four.groups.closed == {"incomplete": 1, "late": 1}
+
+
+def test_runs_that_come_and_go_are_forgotten(four):
+    for epoch in range(2, 80):
+        four.runs = dict.fromkeys("abcd", epoch)
+        for number in range(3):
+            four.pulse(3 * epoch + number)
+    four.wait(250)  # who comes after all others have gone is compared by the interval, after a while
+    assert four.told()[-1] == (233, ("a", "b", "c", "d"), ())

@@ -1,0 +1,315 @@
+"""Addresses, keys, the list of those that are let in, and the commands that make them."""
+
+import contextlib
+import json
+import os
+import stat
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli import _network
+from ertis_cli.keys import keys as keys_command
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.network import addresses
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, default_folder, public_key
+
+PAIR = KeyPair.new("robot")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_KEYS_DIR", str(tmp_path / "keys"))
+    return tmp_path / "keys"
+
+
+def _permission(**changes):
+    return Permission(
+        **{"name": "robot", "public": PAIR.public, "role": "sensor", "serials": ("front", "left")} | changes
+    )
+
+
+# Addresses
+
+
+@pytest.mark.parametrize(
+    ("text", "loopback"),
+    [
+        ("tcp://127.0.0.1:5601", True),
+        ("tcp://127.8.9.10:0", True),
+        ("tcp://localhost:*", True),
+        ("tcp://[::1]:5601", True),
+        ("tcp://[::ffff:127.0.0.1]:5601", False),
+        ("tcp://0.0.0.0:5601", False),
+        ("tcp://*:5601", False),
+        ("tcp://192.168.1.7:5601", False),
+        ("tcp://128.0.0.1:1", False),
+        ("tcp://127.1:5601", False),
+        ("tcp://localhost.example.org:5601", False),
+        ("tcp://127.0.0.1.example.org:5601", False),
+        ("tcp://[::]:5601", False),
+    ],
+)
+def test_only_a_literal_loopback_address_may_do_without_keys(text, loopback):
+    endpoint = addresses.endpoint(text)
+    assert endpoint == text
+    assert addresses.is_loopback(endpoint) is loopback
+    addresses.require_keys(endpoint, keys=object())
+    if loopback:
+        addresses.require_keys(endpoint, keys=None)
+    else:
+        with pytest.raises(ArgumentError, match="can be reached from other machines, and there are no keys; make some"):
+            addresses.require_keys(endpoint, keys=None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "127.0.0.1:5601",
+        "tcp://127.0.0.1",
+        "tcp://127.0.0.1:",
+        "tcp://:5601",
+        "tcp://127.0.0.1:65536",
+        "tcp://127.0.0.1:5601/",
+        "tcp://127.0.0.1:5601\n",
+        "tcp://a b:5601",
+        "tcp://eth0;127.0.0.1:5601",
+        "tcp://[::1:5601",
+        "tcp://[1.2.3]:5601",
+        "ipc:///tmp/socket",
+        "inproc://zeromq.zap.01",
+        "udp://127.0.0.1:5601",
+        "tcp://127.0.0.1:٥٦٠١",
+    ],
+)
+def test_what_is_no_address_is_refused(text):
+    with pytest.raises(ArgumentError, match="cannot be used") as caught:
+        addresses.endpoint(text)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@given(st.text(max_size=40))
+def test_whatever_is_given_for_an_address_is_one_or_refused(text):
+    with contextlib.suppress(ArgumentError):
+        assert addresses.endpoint("tcp://" + text).startswith("tcp://")
+
+
+# Keys
+
+
+def test_keys_are_read_as_they_were_saved_and_nobody_else_can(folder):
+    secret, public = PAIR.save(folder)
+    assert KeyPair.load(secret) == PAIR
+    assert public_key(public) == (PAIR.public, "robot")
+    assert public_key(PAIR.public) == (PAIR.public, "")
+    assert PAIR.secret not in public.read_text()
+    assert PAIR.secret not in repr(PAIR)
+    assert PAIR.secret not in repr(ClientKeys(PAIR, PAIR.public))
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (folder, secret)] == [0o700, 0o600]
+    assert sorted(path.name for path in folder.iterdir()) == ["robot.public.toml", "robot.secret.toml"]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o610, 0o602])
+def test_a_secret_that_others_may_use_is_refused(folder, mode):
+    secret, _ = PAIR.save(folder)
+    secret.chmod(mode)
+    with pytest.raises(SettingsError, match=f"others may use it \\(mode {mode:04o}\\); run 'chmod 600"):
+        KeyPair.load(secret)
+
+
+def test_a_folder_that_others_may_use_holds_no_secrets(folder):
+    folder.mkdir(mode=0o700)
+    folder.chmod(0o750)
+    with pytest.raises(ArgumentError, match="can be used by others \\(mode 0750\\); run 'chmod 700"):
+        PAIR.save(folder)
+    assert not list(folder.iterdir())
+
+
+def test_keys_are_never_written_over(folder):
+    PAIR.save(folder)
+    with pytest.raises(ArgumentError, match="exists; give another name"):
+        KeyPair.new("robot").save(folder)
+    assert KeyPair.load(folder / "robot.secret.toml") == PAIR
+
+
+def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatch):
+    modes, make = [], os.open
+
+    def opened(path, flags, mode=0o777, **options):
+        descriptor = make(path, flags, mode, **options)
+        if flags & os.O_CREAT:
+            modes.append(stat.S_IMODE(os.fstat(descriptor).st_mode))
+        return descriptor
+
+    monkeypatch.setattr(os, "open", opened)
+    PAIR.save(folder)
+    assert modes[0] == 0o600
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "missing"),
+        ('name = "robot"\npublic = "x"\nsecret = "y"\n', "key 'x' is none"),
+        (f'name = "robot"\npublic = "{PAIR.public}"\nsecret = "{KeyPair.new("other").secret}"\n', "does not belong"),
+        (f'name = "../robot"\npublic = "{PAIR.public}"\nsecret = "{PAIR.secret}"\n', "cannot be that of a key"),
+        ("name = ", "robot.secret.toml"),
+    ],
+)
+def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, told):
+    path = tmp_path / "robot.secret.toml"
+    path.write_text(text)
+    path.chmod(0o600)
+    with pytest.raises(SettingsError, match=told) as caught:
+        KeyPair.load(path)
+    assert PAIR.secret not in str(caught.value)
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(SettingsError, match="make keys by 'ertis keys new'"):
+        KeyPair.load(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "..", "a b", "x" * 65, "-x", "ä"])
+def test_a_name_that_is_no_name_of_a_file_is_refused(name):
+    with pytest.raises(ArgumentError, match="cannot be that of a key"):
+        KeyPair.new(name)
+
+
+@pytest.mark.parametrize("key", ["", "short", "~" * 40, "#" * 40, PAIR.public[:-1], PAIR.public + "0"])
+def test_a_key_that_is_none_is_refused(key):
+    with pytest.raises(ArgumentError, match="is none; give the 40 characters"):
+        ClientKeys(PAIR, key)
+    with pytest.raises(ArgumentError, match="is none"):
+        _permission(public=key)
+
+
+def test_a_secret_is_not_taken_for_a_public_key(folder):
+    secret, _ = PAIR.save(folder)
+    with pytest.raises(SettingsError, match="holds a secret key"):
+        public_key(secret)
+
+
+# The list
+
+
+def test_a_list_is_read_as_it_was_saved(tmp_path):
+    other = Permission(name="viewer", public=KeyPair.new("viewer").public, role="application")
+    listed = AllowList().allow(_permission()).allow(other)
+    listed.save(tmp_path / "allow.toml")
+    assert AllowList.load(tmp_path / "allow.toml") == listed
+    assert listed.find(PAIR.public) == _permission()
+    assert listed.find(KeyPair.new("x").public) is None
+    assert listed.remove("robot").keys == listed.remove(PAIR.public).keys == (other,)
+
+
+def test_a_key_that_is_allowed_again_has_what_was_said_last():
+    listed = AllowList().allow(_permission()).allow(_permission(serials=("rear",)))
+    assert listed.keys == (_permission(serials=("rear",)),)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"serials": ()}, "sensor without serials; name those"),
+        ({"serials": ("*",)}, "sensor name '\\*' cannot stand"),
+        ({"serials": ("front", "../x")}, "cannot stand in a file"),
+        ({"role": "application"}, "has serials and is no sensor"),
+        ({"role": "admin"}, "has serials and is no sensor"),
+        ({"role": "root", "serials": ()}, "role 'root' is unknown"),
+        ({"name": "a b"}, "cannot be that of a key"),
+    ],
+)
+def test_a_permission_that_says_too_much_or_too_little_is_refused(changes, told):
+    with pytest.raises(ArgumentError, match=told):
+        _permission(**changes)
+
+
+@pytest.mark.parametrize("what", ["name", "public"])
+def test_a_list_names_each_key_once(what):
+    changes = {"name": "second", "public": KeyPair.new("x").public} | {what: getattr(_permission(), what)}
+    with pytest.raises(ArgumentError, match="is listed twice"):
+        AllowList(keys=(_permission(), _permission(**changes)))
+
+
+def test_a_list_says_what_it_cannot_do():
+    listed = AllowList().allow(_permission())
+    with pytest.raises(ArgumentError, match="another key is listed as 'robot'"):
+        listed.allow(_permission(public=KeyPair.new("x").public))
+    with pytest.raises(ArgumentError, match="key 'robo' is unknown \\(did you mean 'robot'"):
+        listed.remove("robo")
+
+
+@pytest.mark.parametrize(
+    ("role", "sends", "receives"),
+    [("sensor", {"front"}, False), ("application", set(), True), ("admin", {"front", "rear"}, True)],
+)
+def test_a_role_may_do_what_it_is_for(role, sends, receives):
+    permission = _permission(role=role, serials=("front",) if role == "sensor" else ())
+    assert {sensor for sensor in ("front", "rear") if permission.may_send(sensor)} == sends
+    assert permission.may_receive is receives
+
+
+# The commands
+
+
+def _run(*arguments):
+    result = CliRunner().invoke(keys_command, list(arguments), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_keys_are_made_allowed_listed_and_removed(folder):
+    made = json.loads(_run("new", "robot", "--json"))
+    assert KeyPair.load(made["secret_file"]).public == made["public"]
+    allowed = json.loads(
+        _run("allow", made["public_file"], "--role", "sensor", "--serial", "front", "--serial", "left", "--json")
+    )
+    assert allowed["keys"] == [
+        {"name": "robot", "public": made["public"], "role": "sensor", "serials": ["front", "left"]}
+    ]
+    assert json.loads(_run("list", "--json"))["keys"] == allowed["keys"]
+    assert _run("list") == f"robot  sensor       {made['public']}  front left\n"
+    assert AllowList.load(folder / "allow.toml").find(made["public"]).serials == ("front", "left")
+    assert json.loads(_run("remove", "robot", "--json"))["removed"] == allowed["keys"]
+    assert AllowList.load(folder / "allow.toml").keys == ()
+
+
+def test_a_secret_is_never_printed(folder):
+    printed = _run("new", "robot") + _run("allow", str(folder / "robot.public.toml"), "--role", "admin") + _run("list")
+    assert KeyPair.load(folder / "robot.secret.toml").secret not in printed
+
+
+def test_a_key_without_a_file_needs_a_name(tmp_path):
+    result = CliRunner().invoke(keys_command, ["allow", PAIR.public, "--role", "admin"])
+    assert result.exit_code == 2
+    assert "give --name" in result.output
+    _run("allow", PAIR.public, "--role", "admin", "--name", "desk", "--list", str(tmp_path / "other.toml"))
+    assert AllowList.load(tmp_path / "other.toml").find(PAIR.public).name == "desk"
+
+
+def test_keys_may_be_given_by_file_or_by_name(folder):
+    secret, public = PAIR.save(folder)
+    wanted = ClientKeys(PAIR, PAIR.public)
+    assert _network.client_keys("robot", "robot") == wanted
+    assert _network.client_keys(str(secret), str(public)) == wanted
+    assert _network.client_keys(str(secret), PAIR.public) == wanted
+    assert _network.client_keys(None, None) is None
+    assert _network.server_keys(None, None) is None
+    server = _network.server_keys("robot", None)
+    assert (server.pair, server.allow) == (PAIR, default_folder() / "allow.toml")
+
+
+@pytest.mark.parametrize(("key", "server_key"), [("robot", None), (None, "robot")])
+def test_half_of_the_keys_is_refused(folder, key, server_key):
+    PAIR.save(folder)
+    with pytest.raises(Exception, match="give both, or none"):
+        _network.client_keys(key, server_key)
+
+
+def test_a_list_without_a_key_is_refused(tmp_path):
+    with pytest.raises(Exception, match="give --key, too"):
+        _network.server_keys(None, tmp_path / "allow.toml")

@@ -1,0 +1,152 @@
+"""``ertis listen`` against a publisher: what it prints, what it saves and how it ends."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
+from tests.publishing import Publisher, cloud, group, image, measurement, status
+from tests.test_readme import environment
+
+
+def listen(*arguments):
+    return CliRunner().invoke(cli, ["listen", *map(str, arguments)])
+
+
+def heard(items, *arguments):
+    """Return what a command that ends by itself does."""
+    with Publisher() as publisher, publisher.playing(items):
+        return listen(publisher.address, *arguments)
+
+
+def events(done):
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_a_line_for_each_image():
+    done = heard([image(7, reflectors=[(-30, 2.0, 0.9), (24, 1.2, 0.5)]), image(8)], "-n", 2)
+    assert done.exit_code == 0, done.stderr
+    head, first, second = done.stdout.splitlines()
+    assert head.split() == ["sensor", "sequence", "age", "made", "in", "dropped", "what"]
+    assert first.split()[:2] == ["front", "7"]
+    assert first.endswith("1.200 m at +24.0°, +0.0°")
+    assert "12.0 ms" in first
+    assert second.endswith("nothing near")
+    assert done.stderr.splitlines() == ["2 received, 0 dropped"]
+
+
+def test_events_of_every_product():
+    items = [
+        image(1, reflectors=[(0, 1.5, 1)]),
+        cloud(2, position_m=[[3, 0, 0], [0, 0, 2]]),
+        measurement(3),
+        group(4, "front", missing=("left",)),
+        status(),
+    ]
+    products = [word for name in ("energyscape", "points", "raw", "group", "status") for word in ("--product", name)]
+    first, *came, last = events(heard(items, *products, "-n", 5, "--json", "-q"))
+    assert first["event"] == "subscribed"
+    assert [each["event"] for each in came] == ["energyscape", "points", "raw", "group", "status"]
+    assert [each["number"] for each in came] == [0, 1, 2, 3, 4]
+    assert came[0]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 0.0, "range_m": pytest.approx(1.5, abs=1e-3)}
+    assert (came[0]["sensor"], came[0]["epoch"], came[0]["sequence"], came[0]["made_in_ms"]) == ("front", 7, 1, 12.0)
+    assert came[1]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 90.0, "range_m": 2.0}
+    assert came[1]["n_points"] == 2
+    assert came[2]["age_ms"] > 0
+    assert came[3]["missing"] == ["left"]
+    assert came[4]["state"] == "processing"
+    assert (last["event"], last["received"], last["dropped"], last["reconnects"]) == ("listened", 5, 0, 0)
+
+
+def test_saves_energyscapes_of_several_sensors(tmp_path):
+    path = tmp_path / "image.h5"
+    sent = [image(1), image(5, sensor="left"), image(2)]
+    done = heard(sent, "-n", 3, "--save", path)
+    assert done.exit_code == 0, done.stderr
+    assert sensor_names(path) == ("front", "left")
+    with open_energyscapes(path, sensor="front") as images:
+        assert [each.stamp for each in images] == [sent[0].stamp, sent[2].stamp]
+        np.testing.assert_array_equal(images[1].energy, sent[2].energy)
+
+
+def test_saves_measurements_as_a_recording_with_their_place(tmp_path):
+    path = tmp_path / "raw.h5"
+    sent = [measurement(1), measurement(3, temperature_c=25.0)]
+    done = heard(sent, "--product", "raw", "-n", 2, "--save", path, "-q")
+    assert done.exit_code == 0, done.stderr
+    with open_recording(path) as recording:
+        assert [each.stamp for each in recording] == [each.stamp for each in sent]
+        assert [(gap.first, gap.last) for gap in recording.gaps] == [(2, 2)]
+        np.testing.assert_array_equal(recording[1].words, sent[1].words)
+        assert recording[1].settings.air.temperature_c == 25.0
+        np.testing.assert_array_equal(recording.translation_m, Publisher.translation_m)
+    assert [each.name for each in tmp_path.iterdir()] == ["raw.h5"]
+
+
+@pytest.mark.parametrize(("options", "code"), [((), 0), (("-n", "9"), 130)])
+def test_ctrl_c_ends_it_and_keeps_what_came(tmp_path, options, code):
+    path = tmp_path / "image.h5"
+    with Publisher() as publisher, publisher.playing([image(1)]):
+        command = [sys.executable, "-m", "ertis_cli.main", "listen", publisher.address, "--json", "--save", str(path)]
+        with subprocess.Popen(
+            [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
+        ) as process:
+            told = [json.loads(process.stdout.readline())["event"] for _ in range(2)]
+            process.send_signal(signal.SIGINT)
+            rest, errors = process.communicate()
+    assert told == ["subscribed", "energyscape"]
+    assert json.loads(rest)["event"] == "listened"
+    assert process.returncode == code, errors
+    with open_energyscapes(path) as images:
+        assert len(images) == 1
+
+
+def test_what_does_not_fit_into_a_file_ends_it_and_keeps_what_came(tmp_path):
+    path = tmp_path / "image.h5"
+    shorter = image(2).replace(energy=image(2).energy[:, :50].copy(), range_m=image(2).range_m[:50])
+    with Publisher(describes_each=True) as publisher, publisher.playing([image(1), shorter, image(3)]):
+        done = listen(publisher.address, "-n", 3, "--save", path)
+    assert done.exit_code == 1
+    assert "another range_m than the first; write it to its own file" in str(done.stderr) + str(done.exception)
+    with open_energyscapes(path) as images:
+        assert [each.stamp.sequence for each in images] == [1]
+
+
+@pytest.mark.parametrize("product", ["energyscape", "raw"])
+def test_no_file_of_nothing(tmp_path, product):
+    with Publisher() as publisher, publisher.playing([]):
+        done = listen(
+            publisher.address, "--product", product, "--save", tmp_path / "none.h5", "--duration", 0.2, "--json"
+        )
+    assert done.exit_code == 1
+    assert "none.h5 would hold no measurement" in done.stderr or "none.h5 would hold no measurement" in str(
+        done.exception
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_too_few_in_its_time():
+    done = heard([image(1)], "-n", 2, "--duration", 0.5)
+    assert done.exit_code == 1
+    assert "1 of 2 came in 0.5 s; give it more time" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (("--product", "group", "--save", "x.h5"), "--save makes a file of one product; give --product energyscape"),
+        (("--product", "raw", "--product", "energyscape", "--save", "x.h5"), "--save makes a file of one product"),
+        (("--key", "me"), "--key is given without --server-key"),
+    ],
+)
+def test_refuses_usage(arguments, match):
+    done = listen("tcp://127.0.0.1:1", *arguments)
+    assert done.exit_code == 2
+    assert match in done.stderr

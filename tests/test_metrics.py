@@ -1,0 +1,123 @@
+"""Metrics as Prometheus reads them, over HTTP, and log lines."""
+
+import io
+import json
+import logging
+import sys
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.network import log
+from ertis_numba.network.metrics import Metrics
+from ertis_numba.network.status import Status
+from tests.test_status import BUSY
+
+
+def _scraped(address):
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=10) as answer:
+        text = answer.read().decode()
+    return {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_what_is_scraped_is_the_status_as_it_is_now():
+    now = [BUSY]
+    with Metrics("127.0.0.1:0", lambda: now[0]) as metrics:
+        values = _scraped(metrics.address)
+        now[0] = Status(version="1", pid=7, host="here", address="tcp://127.0.0.1:5601", state="storage")
+        after = _scraped(metrics.address)
+    front = ("sensor", "front")
+    assert values["ertis_received_total", front] == 41
+    assert values["ertis_stored_total", front] == 40
+    assert values["ertis_published_total", front] == 37
+    assert values["ertis_connected", front] == 1
+    assert values["ertis_connected", ("sensor", "left")] == 0
+    assert values["ertis_dropped_total", ("reason", "superseded"), front] == 4
+    assert values["ertis_missing_total", ("reason", "the spool was full"), front] == 5
+    assert values["ertis_image_latency_seconds", ("quantile", "0.99"), front] == 0.04
+    assert values["ertis_refused_total", ("reason", "unknown key")] == 3
+    assert values["ertis_state", ("state", "fault")] == 1
+    assert values["ertis_archive_room_bytes",] == 3_000_000_000
+    assert values["ertis_archive_sealing_failed_total",] == 1
+    assert values["ertis_workers",] == 1
+    assert values["ertis_groups_total", ("kind", "complete")] == 9
+    assert after["ertis_state", ("state", "storage")] == 1
+    assert after["ertis_state", ("state", "fault")] == 0
+    assert not any("sensor" in dict(labels) for _, *labels in after)
+
+
+def test_metrics_end():
+    metrics = Metrics("127.0.0.1:0", lambda: BUSY)
+    metrics.start()
+    metrics.close()
+    metrics.close()
+    with pytest.raises(OSError, match="refused"):
+        _scraped(metrics.address)
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:9101", "*:9101", "example.org:9101", "192.0.2.1:9101"])
+def test_metrics_are_of_this_machine_only(address):
+    with pytest.raises(ArgumentError, match=r"can be reached from other machines; give 127\.0\.0\.1:PORT"):
+        Metrics(address, lambda: BUSY)
+
+
+def test_an_address_in_use_is_told():
+    with Metrics("127.0.0.1:0", lambda: BUSY) as first, pytest.raises(NetworkError, match="cannot be served at"):
+        Metrics(first.address, lambda: BUSY).start()
+
+
+def test_without_prometheus_client_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with pytest.raises(ArgumentError, match=r"not installed; run \"pip install 'ertis-numba\[metrics\]'\""):
+        Metrics("127.0.0.1:0", lambda: BUSY)
+
+
+# Log lines
+
+
+@pytest.fixture
+def lines():
+    stream = io.StringIO()
+    root = logging.getLogger("ertis.network")
+    before = root.handlers[:], root.level, root.propagate
+    yield lambda **options: (log.show(stream=stream, **options), stream)[1]
+    root.handlers[:], root.level, root.propagate = before
+
+
+def test_an_event_is_one_line_that_programs_can_take_apart(lines):
+    stream = lines()
+    log.logger("central_node").warning("conflict", sensor="front", epoch=7, sequence=41, text="both are kept", of=None)
+    time, *rest = stream.getvalue().rstrip("\n").split(" ", 1)
+    assert rest == ['warning conflict sensor=front epoch=7 sequence=41 text="both are kept"']
+    assert len(time) == len("2026-11-22T04:31:00.123Z")
+    assert time.endswith("Z")
+
+
+def test_an_event_as_json(lines):
+    stream = lines(as_json=True)
+    log.logger("central_node").error("fault", sensor="front", text='a "b"\nc')
+    told = json.loads(stream.getvalue())
+    assert told.pop("time").endswith("Z")
+    assert told == {"level": "error", "event": "fault", "sensor": "front", "text": 'a "b"\nc'}
+
+
+@pytest.mark.parametrize("text", ["a\nb", "a=b", 'say "x"', "", "tab\t", "\x1b[31m", "\u2028line"])
+def test_what_a_stranger_says_stays_in_its_field(lines, text):
+    stream = lines()
+    log.logger("central_node").info("refused", text=text)
+    (line,) = stream.getvalue().splitlines()
+    assert json.loads(line.partition("text=")[2]) == text
+    assert line.isprintable()
+
+
+def test_what_is_below_the_level_is_not_shown(lines):
+    stream = lines(level="WARNING")
+    log.logger("central_node").info("joined", sensor="front")
+    log.logger("central_node").debug("turn")
+    assert not stream.getvalue()

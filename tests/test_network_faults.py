@@ -1,0 +1,289 @@
+"""What is lost when nodes are killed, disks fail and strangers come: the short form of `ertis bench network-faults`.
+
+Each part is tried with another seed every time that the long form runs; here it is the same one, so that what fails
+can be tried again.
+"""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+from ertis_bench import (
+    network_faults,
+    network_faults_keys,
+    network_faults_kills,
+    network_faults_links,
+    network_faults_peers,
+    network_faults_processing,
+    network_tables,
+    network_zmtp,
+    reliability,
+)
+from ertis_bench.network_diary import Diary, Key, Row
+from ertis_bench.network_oracle import compare, read_diaries, read_folder
+from ertis_bench.network_processes import central
+from ertis_bench.network_receiver import read_received
+from ertis_bench.network_sender import SMALL, Job, words_of
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.storage import RecordingWriter, open_recording
+from tests.files import noise
+
+SEED = 1
+N_KILLS = {"centrals": 14, "nodes": 26, "workers": 10}
+NOTHING_WRONG = dict.fromkeys(
+    ("lost", "missing", "wrong", "twice", "unexpected", "silent", "broken", "left_over", "tracebacks"), 0
+)
+SPOILING = """
+import sys, zlib
+
+if "record" in sys.argv:
+    from dataclasses import replace
+    from ertis_numba.journal import Entry, Journal
+
+    append = Journal.append
+
+    def spoiling(self, entries):
+        kept = []
+        for entry in entries:
+            sequence = entry.measurement.stamp.sequence
+            if sequence == 3:
+                continue
+            if sequence == 5:
+                words = entry.measurement.words.copy()
+                words[1000] ^= 1
+                measurement = replace(entry.measurement, words=words)
+                entry = Entry(measurement, entry.monotonic_ns, zlib.crc32(words.data))
+            kept.append(entry)
+        append(self, kept)
+
+    Journal.append = spoiling
+"""
+
+
+def wrong_in(found):
+    return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
+
+
+def test_killed_central_nodes(tmp_path):
+    found = network_faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"])
+    assert wrong_in(found) == {}
+    assert (found["orphans"], found["unsettled"]) == (0, 0)
+    assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
+
+
+def test_killed_sensor_nodes(tmp_path):
+    found = network_faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
+    assert wrong_in(found) == {}
+    assert (found["in_spool"], found["orphans"]) == (0, 0)
+    assert found["promised"] > 5 * N_KILLS["nodes"]
+
+
+def test_killed_sealings(tmp_path):
+    found = network_faults_kills.sealings(tmp_path, seed=SEED, count=2)
+    assert wrong_in(found) == {}
+    assert found["kills"] == 2
+
+
+def test_killed_workers(tmp_path):
+    found = network_faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
+    assert wrong_in(found) == {}
+    assert {name: found[name] for name in ("unbalanced", "uncounted", "untold", "disordered", "foreign")} == {
+        "unbalanced": 0, "uncounted": 0, "untold": 0, "disordered": 0, "foreign": 0,
+    }  # fmt: skip
+    assert found["respawned"] >= found["kills"] == N_KILLS["workers"]
+    assert found["settled"]
+    assert set(found["dropped"]) <= {"superseded", "failed twice"}
+    assert found["images"] > found["sent"] / 10
+    assert found["orphans"] == 0
+
+
+def test_a_full_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    with reliability.small_disk(disk) as mounted:
+        if mounted is None:
+            pytest.skip("only root may mount a small disk")
+        found = network_faults_links.disk_full(tmp_path, mounted, seed=SEED)
+    assert wrong_in(found) == {}
+    assert (found["state"], found["acked in fault"]) == ("fault", 0)
+    assert found["offered"] == found["stored"] > found["acked before"] > 0
+    assert "free" in found["said"]
+
+
+def test_a_disk_that_fails(tmp_path):
+    found = network_faults_links.disk_fails(tmp_path, seed=SEED)
+    assert wrong_in(found) == {}
+    assert (found["state"], found["acked in fault"]) == ("fault", 0)
+    assert found["offered"] == found["stored"] > found["acked before"] > 0
+
+
+def test_lost_acks_and_dead_cables(tmp_path):
+    found = network_faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
+    assert wrong_in(found) == {}
+    assert found["flushed"]
+    assert {"ack lose", "ack repeat", "ack delay"} <= found["meddled"].keys()
+
+
+def test_keys(tmp_path):
+    found = network_faults_keys.keys(tmp_path, seed=SEED)
+    assert found["let in"] == ["the listed application", "the listed sensor"]
+    assert found["raw"] == 0
+    assert found["removed, s"] < 1.0
+    assert found["unsettled when removed"] > 0
+    assert {"unknown key", "no key", "role", "serial", "removed key"} <= found["refused"].keys()
+    assert wrong_in(found) == {}
+    assert found["notes"]
+
+
+def test_malformed_messages(tmp_path):
+    found = network_faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
+    assert wrong_in(found) == {}
+    assert (found["inputs"], found["restarts"], found["exit code"]) == (10_000, 0, 0)
+    assert found["answers"] > 100
+    assert found["flushed"]
+    assert found["memory grew, MB"] < 50
+
+
+def test_a_node_that_loses_and_spoils_is_found_out(tmp_path, monkeypatch):
+    (tmp_path / "spoiling").mkdir()
+    (tmp_path / "spoiling" / "sitecustomize.py").write_text(SPOILING)
+    monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
+    record = network_faults_kills.Record(tmp_path)
+    diary = tmp_path / "sender.ndjson"
+    with Job(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
+        sender.wait_for("begun")
+        record.finish([sender])
+    found = network_faults_kills.judged(tmp_path, record.archive, [diary])
+    assert (found["lost"], found["wrong"], found["silent"]) == (1, 1, 1)
+    (recording,) = record.archive.glob("*.h5")
+    shutil.copy(recording, record.archive / "again.h5")
+    assert network_faults_kills.judged(tmp_path, record.archive, [diary])["twice"] == 7
+
+
+@pytest.fixture(scope="module")
+def sent(tmp_path_factory):
+    """A diary, and the measurements that it tells of."""
+    path = tmp_path_factory.mktemp("sent") / "sender.ndjson"
+    diary, measurements = Diary(path), []
+    for number, made in enumerate(noise(SMALL, 6, SEED)):
+        stamp = Stamp(sensor="front", sequence=number, epoch=7, sync_count=number, timestamp_ns=1_000 + number)
+        measurements.append(Measurement(words_of(made.words, 7, number), SMALL, stamp))
+        key = Key("front", 7, number)
+        diary.offered(key, Row.of(measurements[-1]), 5)
+        diary.kept(key)
+    diary.settled("front", 7, 3, "stored", 9)
+    return path, measurements
+
+
+def stored(folder, measurements, *, name="rec.h5", gaps=()):
+    folder.mkdir(exist_ok=True)
+    with RecordingWriter(folder / name) as writer:
+        for measurement in measurements:
+            writer.write(measurement)
+        for first, last, reason in gaps:
+            writer.note_gap("front", first, last, reason, epoch=7)
+
+
+def judged(path, folder):
+    told = read_diaries([path])
+    found = compare(told, read_folder(folder), told.kept)
+    return {name: count for name, count in found.items() if name not in ("promised", "stored") and count}
+
+
+def test_the_checker_finds_nothing_where_nothing_is_wrong(tmp_path, sent):
+    path, measurements = sent
+    stored(tmp_path / "a", measurements)
+    assert judged(path, tmp_path / "a") == {}
+    told = read_diaries([path])
+    assert len(told.acked()) == 4
+    assert told.ack_times_ms() == pytest.approx([4e-6] * 4)
+
+
+def test_the_checker_finds_what_is_lost(tmp_path, sent):
+    path, measurements = sent
+    stored(tmp_path / "a", [*measurements[:2], *measurements[3:]])
+    assert judged(path, tmp_path / "a") == {"lost": 1, "silent": 1}
+    stored(tmp_path / "b", [*measurements[:2], *measurements[3:]], gaps=[(2, 2, "memory full")])
+    assert judged(path, tmp_path / "b") == {"missing": 1}
+    stored(tmp_path / "c", measurements[:-1])  # no number above it tells
+    assert judged(path, tmp_path / "c") == {"lost": 1}
+
+
+def test_the_checker_finds_what_is_changed(tmp_path, sent):
+    path, measurements = sent
+    words = measurements[2].words.copy()
+    words[30_000] ^= 1 << 31
+    for number, changed in enumerate(
+        (
+            replace(measurements[2], words=words),
+            replace(measurements[2], stamp=replace(measurements[2].stamp, timestamp_ns=5)),
+            replace(measurements[2], stamp=replace(measurements[2].stamp, sync_count=1)),
+        )
+    ):
+        folder = tmp_path / str(number)
+        stored(folder, [*measurements[:2], changed, *measurements[3:]])
+        assert judged(path, folder) == {"wrong": 1}
+
+
+def test_the_checker_finds_what_is_there_twice_or_never_was(tmp_path, sent):
+    path, measurements = sent
+    stored(tmp_path / "a", measurements)
+    stored(tmp_path / "a", measurements[2:3], name="again.h5")
+    assert judged(path, tmp_path / "a") == {"twice": 1}
+    stranger = replace(measurements[0], stamp=replace(measurements[0].stamp, epoch=8))
+    stored(tmp_path / "a", [stranger], name="other.h5")
+    assert judged(path, tmp_path / "a") == {"twice": 1, "unexpected": 1}
+
+
+def test_the_checker_finds_files_that_are_broken_or_ought_to_be_gone(tmp_path, sent):
+    path, measurements = sent
+    stored(tmp_path / "a", measurements)
+    whole = (tmp_path / "a" / "rec.h5").read_bytes()
+    (tmp_path / "a" / "cut.h5").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "a" / "more.h5.journal").touch()
+    assert judged(path, tmp_path / "a") == {"broken": 1, "left_over": 1}
+    with open_recording(tmp_path / "a" / "rec.h5") as recording:
+        assert len(recording) == 6
+
+
+def test_half_a_line_of_a_diary_is_none(tmp_path, sent):
+    path = tmp_path / "cut.ndjson"
+    path.write_bytes(sent[0].read_bytes()[:-3])
+    told = read_diaries([path])
+    assert (len(told.kept), told.settled) == (6, {})
+
+
+def test_images_are_counted(tmp_path):
+    path = tmp_path / "images.ndjson"
+    path.write_text(
+        '["a", 1, 0, 0, 0, 2000000, false]\n["a", 1, 3, 2, 1, 4000000, true]\n["a", 1, 3, 4, 1, 4000000, false]\n["a",'
+    )
+    found = read_received(path)
+    assert (found.twice, found.disordered, found.wrong, found.dropped, found.untold) == (1, 0, 1, 1, 1)
+    assert found.times_ms == {Key("a", 1, 0): 2.0, Key("a", 1, 3): 4.0}
+
+
+def test_frames_survive_any_cut():
+    frames = [network_zmtp.Frame(1, bytes(300)), network_zmtp.Frame(0, b"x"), network_zmtp.Frame(4, b"\x04PING")]
+    data = b"".join(frame.encode() for frame in frames)
+    for size in (1, 2, 7, 300, len(data)):
+        reader = network_zmtp.Frames()
+        came = [frame for start in range(0, len(data), size) for frame in reader.feed(data[start : start + size])]
+        assert [frame.body for frame in came] == [frame.body for frame in frames]
+        assert [(frame.more, frame.is_command) for frame in came] == [(True, False), (False, False), (False, True)]
+
+
+def test_parts_and_their_texts_agree():
+    assert set(network_faults.PARTS) == set(network_tables.ROWS)
+
+
+def test_a_node_that_does_not_start_is_told(tmp_path):
+    with (
+        central("record", tmp_path, "-o", str(tmp_path / "file"), listen="tcp://nowhere") as node,
+        pytest.raises(
+            DataError, match=r"no event 'listening' came of central; it ended with 1, saying .ertis: error: address"
+        ),
+    ):
+        node.wait_for("listening")

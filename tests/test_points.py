@@ -1,0 +1,150 @@
+"""Point clouds of images whose content is known by formula, and against an obvious reference."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import PointCloud
+from ertis_numba.geometry import direction_grid, unit_vectors
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.stages.detect import _interpolate, find_peaks, neighbours_of
+from ertis_numba.stages.points import PointExtractor
+from tests.test_detect import image_of
+
+
+def noise(directions, range_m=(0.9, 1.2), seed=1):
+    image = image_of([], directions=directions, range_m=range_m)
+    values = np.abs(np.random.default_rng(seed).standard_normal(image.energy.shape)) + 0.01
+    return image.replace(energy=values.astype(np.float32))
+
+
+def position_m(azimuth_deg, elevation_deg, range_m):
+    return range_m * unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg))
+
+
+def reference(image, *, top, min_level_db):
+    """The same, bin by bin."""
+    energy, spacing_m = image.energy, image.range_m[1] - image.range_m[0]
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    neighbours = neighbours_of(directions)
+    reach, found = round(0.04 / spacing_m), []
+    for direction, range_index in np.ndindex(energy.shape):
+        here = energy[direction, range_index]
+        if not 0 < range_index < energy.shape[1] - 1 or here < energy.max() * np.float32(10 ** (min_level_db / 20)):
+            continue
+        side_lobes = energy[:, max(0, range_index - reach) : range_index + reach + 1].max() * np.float32(10**-0.5)
+        row = energy[direction, range_index - 1 : range_index + 2]
+        around = [(energy[other, range_index], -other) for other in neighbours[direction] if other != direction]
+        if here >= side_lobes and row[0] <= here > row[2] and all((here, -direction) > other for other in around):
+            unit, at_m, amplitude = _interpolate(image, directions, neighbours, direction, range_index)
+            found.append((*(at_m * unit), amplitude, here))
+    found.sort(key=lambda point: -point[4])
+    points = np.array(found[:top], dtype=np.float32).reshape(-1, 5)[:, :4]
+    return points[np.argsort(-points[:, 3], kind="stable")]
+
+
+@pytest.mark.parametrize("directions", ["2d:181", "3d:400", "3d:2", "2d:1"])
+@pytest.mark.parametrize("min_level_db", [-3.0, -20.0])
+def test_is_the_reference(directions, min_level_db):
+    image = noise(directions)
+    expected = reference(image, top=300, min_level_db=min_level_db)
+    cloud = PointExtractor(image.settings, top=300, min_level_db=min_level_db)(image)
+    assert len(expected) > 2
+    np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
+    np.testing.assert_allclose(cloud.energy, expected[:, 3], rtol=1e-5)
+    assert cloud.position_m.dtype == cloud.energy.dtype == np.float32
+    assert cloud.settings is image.settings
+    assert cloud.stamp is image.stamp
+
+
+def test_of_much_noise_the_strongest_are_found():
+    image = noise("3d:800")
+    cloud = PointExtractor(image.settings, top=10)(image)
+    assert np.count_nonzero(image.energy > image.energy.max() / 10) > 640  # of which only these are looked at
+    expected = reference(image, top=10, min_level_db=-20.0)
+    np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
+    np.testing.assert_allclose(cloud.energy, expected[:, 3], rtol=1e-5)
+
+
+def test_of_two_equal_bins_the_first_counts():
+    image = noise("2d:31").replace(energy=np.zeros(noise("2d:31").energy.shape, np.float32))
+    image.energy[10:12, 40] = 1.0
+    (point,) = PointExtractor(image.settings)(image).position_m
+    assert np.arctan2(point[1], point[0]) == pytest.approx(image.azimuth_rad[10:12].mean(), abs=1e-3)
+
+
+@pytest.mark.parametrize(("directions", "within_m"), [("2d:181", 1e-3), ("3000", 0.01)])
+def test_reflectors_are_where_they_are(directions, within_m):
+    reflectors = [(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.1, 0.5), (50.1, 0.0, 1.25, 0.4)]
+    image = image_of(reflectors, directions=directions, range_m=(0.9, 1.4), noise=0.001)
+    cloud = PointExtractor(image.settings)(image)
+    assert len(cloud) == len(reflectors)
+    for point, energy, (azimuth_deg, elevation_deg, range_m, amplitude) in zip(
+        cloud.position_m, cloud.energy, reflectors, strict=True
+    ):
+        assert np.linalg.norm(point - position_m(azimuth_deg, elevation_deg, range_m)) < within_m
+        assert energy == pytest.approx(amplitude, rel=0.05)
+
+
+def test_agrees_with_the_slow_way_where_that_masks_no_less():
+    image = image_of([(12.3, 5, 1.0, 1.0), (-33.3, -20, 1.2, 0.5)], directions="3000", range_m=(0.9, 1.3))
+    peaks = find_peaks(image, min_level_db=-20)
+    cloud = PointExtractor(image.settings)(image)
+    expected = [position_m(peak.azimuth_deg, peak.elevation_deg, peak.range_m) for peak in peaks]
+    np.testing.assert_allclose(cloud.position_m, expected, atol=1e-5)
+
+
+def test_top_and_level_limit_the_cloud():
+    image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
+    assert len(PointExtractor(image.settings, top=2)(image)) == 2
+    assert len(PointExtractor(image.settings, min_level_db=-10.0)(image)) == 2
+    assert len(PointExtractor(image.settings)(image)) == 3
+
+
+@pytest.mark.parametrize("n_ranges", [1, 2, 3, 30])
+def test_silence_and_short_images_have_no_points(n_ranges):
+    image = noise("2d:5")
+    short = image.replace(energy=np.zeros((5, n_ranges), np.float32), range_m=image.range_m[:n_ranges])
+    extractor = PointExtractor(image.settings)
+    cloud = extractor(short)
+    assert cloud.position_m.shape == (0, 3)
+    assert len(cloud) == 0
+    ramp = np.broadcast_to(np.arange(1, n_ranges + 1, dtype=np.float32), (5, n_ranges)).copy()
+    assert len(extractor(short.replace(energy=ramp))) == 0  # highest at an end, of which nothing is known
+
+
+def test_the_input_is_left_alone():
+    image = noise("3d:100")
+    before = image.energy.copy()
+    image.energy.flags.writeable = False
+    PointExtractor(image.settings)(image)
+    np.testing.assert_array_equal(image.energy, before)
+
+
+def test_platform_frame_turns_then_shifts():
+    half = np.sqrt(0.5)
+    cloud = PointCloud(
+        np.array([[2, 0, 0], [0, 1, 3]], np.float32),
+        np.ones(2, np.float32),
+        Settings(),
+        translation_m=(10.0, 20.0, 30.0),
+        rotation_xyzw=(0.0, 0.0, half, half),  # a quarter turn to the left
+    )
+    np.testing.assert_allclose(cloud.on_platform_m(), [[10, 22, 30], [9, 20, 33]], atol=1e-5)
+    np.testing.assert_array_equal(cloud.replace(rotation_xyzw=(0, 0, 0, 1)).on_platform_m()[0], [12, 20, 30])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
+)
+def test_refuses(arguments, match):
+    with pytest.raises(ArgumentError, match=match):
+        PointExtractor(Settings(), **arguments)
+
+
+def test_refuses_an_image_of_another_grid():
+    other = Settings(processing=Processing(directions="2d:7"))
+    assert len(direction_grid(other.processing)) == 7
+    with pytest.raises(ArgumentError, match="energy has shape"):
+        PointExtractor(other)(noise("2d:9"))

@@ -1,0 +1,198 @@
+"""Processing in a loop: every measurement is published, dropped for a reason, or on its way, at any moment."""
+
+import time
+
+import msgspec
+import numpy as np
+import pytest
+
+from ertis_numba.errors import NetworkError
+from ertis_numba.geometry import self_contained
+from ertis_numba.network.messages import Image, Points
+from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.status import Status
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Air
+from ertis_numba.stages.points import PointExtractor
+from tests.cases import SHORT
+from tests.driven import MEASUREMENT, Application, driven, hello
+
+WIDE = SHORT.replace(processing=SHORT.processing.replace(directions="2d:9"))
+
+
+def test_images_points_and_raw_words_are_those_of_the_pipeline():
+    place = {"translation_m": (1.0, 2.0, 3.0), "rotation_xyzw": (0.0, 0.0, 1.0, 0.0)}
+    with driven(device="cpu") as loop, Application(loop.processing.address) as application:
+        application.subscribe("energyscape", "points", "raw", credit=8)
+        loop.until(lambda: loop.processing.status().subscribers)
+        loop.processing.know(hello(**place), SHORT)
+        loop.offer()
+        loop.until(lambda: application.read() or len(application.got) == 3)
+    assert application.kinds() == ["Image", "Points", "Raw"]
+    with Pipeline(SHORT, device="cpu") as pipeline:
+        wanted = pipeline.process(MEASUREMENT)
+    (image, energy), (points, cloud), (raw, words) = application.got
+    assert np.array_equal(np.frombuffer(energy, "<f4").reshape(image.shape), wanted.energy)
+    assert words == MEASUREMENT.words.tobytes()
+    extracted = PointExtractor(wanted.settings)(wanted)
+    rows = np.frombuffer(cloud, "<f4").reshape(points.n_points, 4)
+    assert len(rows) > 0
+    assert np.array_equal(rows[:, :3], extracted.position_m)
+    assert np.array_equal(rows[:, 3], extracted.energy)
+    description, settings, (azimuth, elevation, range_m) = application.descriptions[image.description]
+    assert settings == self_contained(wanted.settings)
+    assert np.array_equal(np.frombuffer(azimuth), wanted.azimuth_rad)
+    assert np.array_equal(np.frombuffer(elevation), wanted.elevation_rad)
+    assert np.array_equal(np.frombuffer(range_m), wanted.range_m)
+    assert (description.sensor, description.translation_m) == ("front", place["translation_m"])
+    assert description.rotation_xyzw == place["rotation_xyzw"]
+    description, settings, axes = application.descriptions[raw.description]
+    assert (settings, axes) == (SHORT, [b"", b"", b""])
+    assert image.received_ns < image.published_ns < time.monotonic_ns()
+
+
+def test_options_change_what_a_sensor_says():
+    with (
+        driven(device="cpu", processing={"directions": "2d:5"}, max_error_db=-30.0, dtype="float16") as loop,
+        Application(loop.processing.address) as application,
+    ):
+        application.subscribe("energyscape")
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.know(hello(), SHORT)
+        loop.offer()
+        loop.until(lambda: application.read() or application.got)
+    ((image, energy),) = application.got
+    assert image.shape[0] == 5
+    applied = application.descriptions[image.description][1]
+    assert (applied.processing.directions, applied.accuracy.max_error_db) == ("2d:5", -30.0)
+    with Pipeline(applied, device="cpu") as pipeline:
+        wanted = pipeline.process(MEASUREMENT).energy.astype(np.float16)
+    assert image.dtype == "float16"
+    assert np.array_equal(np.frombuffer(energy, "<f2").reshape(image.shape), wanted)
+
+
+def test_overload_drops_the_oldest_and_counts_each():
+    with driven() as loop:
+        for sensor in ("a", "b"):
+            loop.processing.know(hello(sensor), SHORT)
+        for _ in range(30):  # before any worker is ready
+            loop.offer("a")
+        assert loop.processing.counts("a").dropped == {"superseded": 28}
+        assert (loop.processing.counts("a").queue, loop.processing.counts("a").in_flight) == (2, 2)
+        loop.until(lambda: loop.processing.counts("a").published == 2)
+        for number in range(400):  # eight to each step
+            loop.offer("a")
+            if number % 4 == 0:
+                loop.offer("b")
+            if number % 8 == 0:
+                loop.step()
+        loop.settle()
+        status = loop.processing.status()
+        for sensor, received in (("a", 430), ("b", 100)):
+            counts = loop.processing.counts(sensor)
+            assert counts.received == received
+            assert counts.published + counts.dropped["superseded"] == received
+            assert counts.published > 2  # each has its turn
+        assert sum(worker.done for worker in status.workers) == sum(
+            loop.processing.counts(sensor).published for sensor in ("a", "b")
+        )
+        assert status.process_time.p50_ms > 0
+        assert loop.processing.counts("a").latency.p50_ms > 0
+
+
+def test_two_workers_publish_in_the_order_of_measurements():
+    with driven(workers=2) as loop, Application(loop.processing.address) as application:
+        application.subscribe("energyscape", credit=64)
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: len(loop.workers("idle")) == 2)
+        chosen = loop.processing._runner._chosen  # noqa: SLF001  as under a load that takes longer to build up
+        chosen.mode = chosen.many
+        for _ in range(40):
+            loop.offer()
+            loop.step()
+        loop.settle()
+        published = loop.processing.counts("front").published
+        done = [worker.done for worker in loop.processing.status().workers]
+        loop.until(lambda: application.read() or len(application.got) == published)
+    assert min(done) > 0
+    sequences = [image.sequence for image, _ in application.got]
+    assert sequences == sorted(sequences)
+
+
+def test_other_settings_of_a_sensor_make_other_images_and_what_waited_is_counted():
+    with driven() as loop, Application(loop.processing.address) as application:
+        application.subscribe("energyscape", credit=8)
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.know(hello(), SHORT)
+        loop.offer()
+        loop.settle()
+        loop.offer()
+        loop.offer()
+        loop.processing.know(hello(settings=WIDE), WIDE)
+        loop.offer()
+        loop.settle()
+        warmer = Air(temperature_c=35.0)
+        loop.offer(temperature_c=warmer.temperature_c)  # is of another kind by itself
+        loop.offer(temperature_c=float("nan"))
+        loop.settle()
+        counts = loop.processing.counts("front")
+        loop.until(lambda: application.read() or len(application.got) == counts.published)
+    assert counts.received == 6
+    assert counts.dropped["its settings cannot be used"] == 1
+    assert counts.dropped["the settings of its sensor changed"] in {1, 2}
+    described = [application.descriptions[image.description] for image, _ in application.got]
+    ((_, first, _), *_, (_, other, (_, _, cold)), (_, warm, (_, _, hot))) = described
+    assert (first.processing.directions, other.processing.directions) == ("2d:7", "2d:9")
+    assert warm.air.temperature_c == 35.0
+    assert np.frombuffer(hot)[-1] > np.frombuffer(cold)[-1]
+
+
+def test_what_is_under_way_at_the_end_is_counted():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.offer()
+        loop.offer()
+    counts = loop.processing.counts("front")
+    assert (counts.received, counts.in_flight, counts.dropped) == (2, 0, {"the central node ended": 2})
+
+
+def test_the_end_waits_for_what_is_under_way():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.offer()
+        loop.processing.close(60.0)
+    assert loop.processing.counts("front").published == 1
+
+
+def test_an_address_that_is_taken_is_told_in_a_line():
+    with driven() as loop:
+        other = Processing(Options(publish=loop.processing.address, device="numpy"))
+        with pytest.raises(NetworkError, match="cannot be listened at"):
+            other.start()
+
+
+def test_status_reaches_who_asks_and_who_subscribes():
+    with driven() as loop, Application(loop.processing.address) as application:
+        application.subscribe("status")
+        loop.until(lambda: application.read() or application.others)
+        status = Status(version="1", pid=1, host="here", address="x", state="processing")
+        status.processing = loop.processing.status()
+        loop.processing.publish_status(status)
+        loop.until(lambda: application.read() or application.got)
+    ((_, payload),) = application.got
+    assert msgspec.msgpack.decode(payload, type=Status) == status
+
+
+def test_points_are_made_only_where_somebody_wants_them():
+    with driven() as loop, Application(loop.processing.address) as application:
+        application.subscribe("points", sensors=("left",))
+        loop.until(lambda: loop.processing.status().subscribers)
+        for sensor in ("left", "right"):
+            loop.processing.know(hello(sensor), SHORT)
+            loop.offer(sensor)
+        loop.settle()
+        loop.until(lambda: application.read() or application.got)
+        assert loop.processing.counts("right").published == 1
+    assert [type(message) for message, _ in application.got] == [Points]
+    assert not any(isinstance(message, Image) for message, _ in application.got)

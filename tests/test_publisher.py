@@ -1,0 +1,242 @@
+"""What applications get of the publisher: credit, the latest, exact numbers, and nothing without a right to it."""
+
+import os
+import signal
+from contextlib import contextmanager
+
+import pytest
+
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
+from ertis_numba.network.processing.subscribers import Item, Subscriber
+from ertis_numba.network.status import Status
+from tests.cases import SHORT
+from tests.driven import Application, driven, hello
+
+
+@contextmanager
+def serving(**options):
+    """Processing whose sensor is ready, and an application."""
+    with driven(**options) as loop, Application(loop.processing.address) as application:
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: loop.workers("idle"))
+        yield loop, application
+
+
+def subscribed(loop, application, *products, **values):
+    application.subscribe(*products, **values)
+    loop.until(lambda: application.read() or any(isinstance(other, Pong) for other in application.others))
+
+
+def publish(loop, count):
+    for _ in range(count):
+        loop.offer()
+        loop.settle()
+
+
+def test_without_credit_the_latest_waits_and_what_it_replaces_is_counted():
+    with serving() as (loop, application):
+        subscribed(loop, application, "energyscape", credit=2)
+        publish(loop, 7)
+        loop.until(lambda: application.read() or len(application.got) == 2)
+        application.consumed = 1
+        application.subscribe("energyscape", credit=2)
+        loop.until(lambda: application.read() or len(application.got) == 3)
+        told = loop.processing.status
+        loop.until(lambda: told().subscribers and told().subscribers[0].sent == 3)
+        (status,) = told().subscribers
+    images = [image for image, _ in application.got]
+    assert [(image.sequence, image.number, image.dropped) for image in images] == [(0, 0, 0), (1, 1, 0), (6, 6, 4)]
+    assert (status.sent, status.dropped, status.products) == (3, 4, ("energyscape",))
+    assert loop.processing.counts("front").published == 7  # a slow application drops nothing of others
+
+
+def test_each_product_of_each_sensor_waits_by_itself():
+    with serving() as (loop, application):
+        loop.processing.know(hello("left"), SHORT)
+        subscribed(loop, application, "raw", "energyscape", credit=1)
+        for sensor in ("front", "left", "front", "left"):
+            loop.offer(sensor)
+            loop.settle()
+        for consumed in range(1, 6):
+            application.consumed = consumed
+            application.subscribe("raw", "energyscape", credit=1)
+            loop.until(lambda consumed=consumed: application.read() or len(application.got) == min(consumed + 1, 5))
+    got = [(type(message), message.sensor, message.sequence, message.number) for message, _ in application.got]
+    assert got == [
+        (Image, "front", 0, 0),
+        (Image, "front", 2, 4),
+        (Raw, "front", 2, 5),
+        (Image, "left", 3, 6),
+        (Raw, "left", 3, 7),
+    ]
+    assert [message.dropped for message, _ in application.got][-1] == 3
+
+
+def test_sensors_and_products_are_those_that_were_asked_for():
+    with serving() as (loop, application):
+        loop.processing.know(hello("left"), SHORT)
+        subscribed(loop, application, "energyscape", sensors=("left",), credit=8)
+        for sensor in ("front", "left"):
+            loop.offer(sensor)
+        loop.settle()
+        loop.until(lambda: application.read() or application.got)
+    assert [(type(message), message.sensor) for message, _ in application.got] == [(Image, "left")]
+
+
+def test_a_publisher_that_is_killed_comes_back_at_its_address_and_what_it_had_is_counted():
+    with serving() as (loop, application):
+        subscribed(loop, application, "energyscape", credit=64)
+        publisher = loop.processing.status().publisher_pid
+        os.kill(publisher, signal.SIGSTOP)
+        loop.offer()
+        loop.until(lambda: loop.processing.status().workers[0].done == 1)
+        os.kill(publisher, signal.SIGKILL)
+        loop.settle()
+        counts = loop.processing.counts("front")
+        assert (counts.published, counts.dropped) == (0, {"the publisher died": 1})
+        loop.until(lambda: loop.processing.status().publisher_pid not in {0, publisher})
+        application.others.clear()
+        loop.until(lambda: application.subscribe("energyscape", credit=64) or application.read() or application.others)
+        publish(loop, 1)
+        loop.until(lambda: application.read() or application.got)
+        assert loop.processing.status().publisher_respawned == 1
+    assert [image.sequence for image, _ in application.got] == [1]
+
+
+def test_a_publisher_that_hangs_is_killed(monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.processing.publisher._HUNG_S", 1.5)
+    with serving() as (loop, _):
+        os.kill(loop.processing.status().publisher_pid, signal.SIGSTOP)
+        for _ in range(5):
+            loop.offer()  # more than there are slots
+        loop.until(lambda: loop.processing.status().publisher_respawned == 1)
+        loop.settle()
+        publish(loop, 1)
+        counts = loop.processing.counts("front")
+    assert counts.received == 6
+    assert counts.dropped["the publisher died"] >= 1
+    assert counts.published >= 1
+
+
+def test_messages_that_nobody_can_use_are_refused_and_counted():
+    with serving() as (loop, application):
+        application.socket.send(b"garbage")
+        application.socket.send_multipart([encode(Ping()), b"more"])
+        application.socket.send(encode(Ping())[:4] + b"\xff" + encode(Ping())[5:])
+        application.send(Refused(code="hello", reason="no application sends this"))
+        application.send(Ping())
+        loop.until(lambda: application.read() or len(application.others) == 5)
+        loop.until(lambda: sum(loop.processing.refused.values()) == 4)
+        assert loop.processing.refused == {"message": 3, "version": 1}
+    codes = [message.code for message in application.others if isinstance(message, Refused)]
+    assert codes == ["message", "message", "version", "message"]
+    assert isinstance(application.others[-1], Pong)
+
+
+def test_who_says_goodbye_gets_nothing_more():
+    with serving() as (loop, application):
+        subscribed(loop, application, "energyscape", credit=8)
+        loop.until(lambda: loop.processing.status().subscribers)
+        application.send(Bye())
+        loop.until(lambda: not loop.processing.status().subscribers)
+        publish(loop, 1)
+    assert application.got == []
+
+
+class TestKeys:
+    @pytest.fixture
+    def pairs(self, tmp_path):
+        pairs = {name: KeyPair.new(name) for name in ("central", "viewer", "front", "stranger")}
+        listed = AllowList(
+            keys=(
+                Permission(name="viewer", public=pairs["viewer"].public, role="application"),
+                Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
+            )
+        )
+        listed.save(tmp_path / "allow.toml")
+        return pairs
+
+    def connected(self, loop, pairs, name):
+        return Application(loop.processing.address, ClientKeys(pairs[name], pairs["central"].public))
+
+    def test_a_listed_application_is_served_until_its_key_is_removed(self, pairs, tmp_path):
+        keys = ServerKeys(pairs["central"], tmp_path / "allow.toml")
+        with driven(keys=keys) as loop, self.connected(loop, pairs, "viewer") as application:
+            loop.processing.know(hello(), SHORT)
+            subscribed(loop, application, "energyscape", "status", credit=8)
+            publish(loop, 1)
+            loop.until(lambda: application.read() or application.got)
+            status = Status(version="1", pid=1, host="here", address="x", state="processing")
+            loop.processing.publish_status(status)
+            application.send(AskStatus())
+            loop.until(lambda: application.read() or len(application.got) == 3)
+            (told,) = loop.processing.status().subscribers
+            assert told.name == "viewer"
+            AllowList.load(tmp_path / "allow.toml").remove("viewer").save(tmp_path / "allow.toml")
+            loop.until(lambda: not loop.processing.status().subscribers)
+            publish(loop, 1)
+            application.send(AskStatus())
+            loop.until(lambda: loop.processing.refused.get("removed key", 0) >= 2)
+            application.read()
+        assert application.kinds() == ["Image", "Report", "Report"]
+
+    def test_a_sensor_is_no_application_and_a_stranger_is_nobody(self, pairs, tmp_path):
+        keys = ServerKeys(pairs["central"], tmp_path / "allow.toml")
+        with (
+            driven(keys=keys) as loop,
+            self.connected(loop, pairs, "front") as sensor,
+            self.connected(loop, pairs, "stranger") as stranger,
+        ):
+            sensor.subscribe("energyscape")
+            loop.until(lambda: sensor.read() or sensor.others)
+            loop.until(lambda: {"role", "unknown key"} <= loop.processing.refused.keys())
+            assert loop.processing.refused["role"] == 1
+            stranger.read()
+        (refused,) = sensor.others
+        assert refused.code == "role"
+        assert stranger.others == stranger.got == []
+
+
+class TestSubscriber:
+    def item(self, n_bytes=100):
+        return Item("raw", "front", None, (bytes(n_bytes),))
+
+    def made(self, **values):
+        wants = Subscribe(products=("raw",), **values)
+        return Subscriber((), "app", wants, before=wants.consumed)
+
+    def test_credit_is_what_it_says_less_what_is_under_way(self):
+        one = self.made(credit=1)
+        one.offer(self.item())
+        key, number, _ = one.next()
+        one.was_sent(key)
+        one.offer(self.item())
+        assert number == 0
+        assert one.next() is None
+        one.consumed(Subscribe(products=("raw",), consumed=1, credit=1))
+        assert one.next()[1] == 1
+
+    def test_bytes_under_way_are_bounded_whatever_the_credit(self):
+        one = self.made(credit=64)
+        for _ in range(64):
+            one.offer(self.item(14_000_000))
+            if one.next() is not None:
+                one.was_sent(("raw", "front"))
+        assert sum(one.under_way) < 80_000_000
+        assert (one.sent, one.dropped) == (5, 58)
+
+    def test_a_count_that_cannot_be_gives_no_more_credit_than_there_is(self):
+        one = self.made(credit=1, consumed=50)
+        one.offer(self.item())
+        one.was_sent(("raw", "front"))
+        one.consumed(Subscribe(products=("raw",), consumed=10**9, credit=1))
+        assert len(one.under_way) == 0
+        one.consumed(Subscribe(products=("raw",), consumed=0, credit=1))
+        assert len(one.under_way) == 0
+
+    def test_what_is_not_wanted_any_more_is_counted(self):
+        one = self.made()
+        one.offer(self.item())
+        one.consumed(Subscribe(products=("status",)))
+        assert (one.next(), one.dropped) == (None, 1)

@@ -1,0 +1,104 @@
+"""``ertis record``: whatever ends it, what it has told is there once."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.journal import SUFFIX
+from ertis_numba.network.messages import Ping
+from tests.central import Node, stored, wanted
+from tests.journals import ENVIRONMENT, entries
+
+
+class Recording:
+    """A process that records; its events are read one after the other."""
+
+    def __init__(self, folder, *options):
+        command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(folder)]
+        self.process = subprocess.Popen(
+            [*command, "--json", "-q", *options], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+        )
+        self.address = self.event("listening")["address"]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+        self.process.stdout.close()
+
+    def event(self, name):
+        for line in self.process.stdout:
+            event = json.loads(line)
+            if event["event"] == name:
+                return event
+        raise AssertionError(f"it ended with {self.process.wait()} without {name}")
+
+
+def test_it_listens_soon(tmp_path):
+    begun_s = time.monotonic()
+    with Recording(tmp_path):
+        assert time.monotonic() - begun_s < 5.0  # 0.3 s where nothing else runs
+
+
+def test_nothing_that_was_acked_is_lost_or_there_twice_when_it_is_killed(tmp_path):
+    given = entries(60, first=0)
+    settled = -1
+    for kill in range(5):
+        with Recording(tmp_path, "--rotate-size", "1") as central, Node(central.address) as node:
+            known = node.hello(first=settled + 1).settled
+            assert known >= settled
+            settled = known
+            node.measure(*given[settled + 1 : 12 * (kill + 1)])
+            settled = node.hear_settled(12 * kill + 5).settled
+            central.process.send_signal(signal.SIGKILL)
+    with Recording(tmp_path) as central, Node(central.address) as node:
+        assert node.hello(first=settled + 1).settled >= settled
+        node.measure(*given[settled + 1 :])
+        node.send(Ping())
+        node.hear_settled(59)
+        central.process.send_signal(signal.SIGINT)
+        told = central.event("recorded")
+        assert central.process.wait() == 0
+    assert told["unsealed"] == 0
+    assert not list(tmp_path.glob(f"*{SUFFIX}"))
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_well(number, tmp_path):
+    given = entries(3, first=0)
+    with Recording(tmp_path, "--every", "--name", "tour") as central, Node(central.address) as node:
+        node.hello(first=0)
+        node.measure(*given)
+        told = [central.event("stored") for _ in given]
+        central.process.send_signal(number)
+        sealed = central.event("sealed")
+        counts = central.event("recorded")
+        assert central.process.wait() == 0
+    assert [(each["sensor"], each["epoch"], each["sequence"]) for each in told] == [each[0] for each in wanted(given)]
+    assert sealed["measurements"] == counts["stored"] == 3
+    assert counts["recordings"] == [str(path) for path in tmp_path.glob("tour_*.h5")]
+    assert stored(tmp_path)[0] == wanted(given)
+
+
+def test_it_ends_after_its_time(tmp_path):
+    arguments = ["record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "new"), "--duration", "0.1"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert "info listening address=tcp://127.0.0.1:" in result.stderr
+    assert "0 measurements stored, 0 missing" in result.stderr
+
+
+def test_metrics_are_served_while_it_runs(tmp_path):
+    arguments = ["record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path), "--duration", "0.1", "-q"]
+    result = CliRunner().invoke(cli, [*arguments, "--metrics", "127.0.0.1:0"])
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""

@@ -1,0 +1,514 @@
+"""A sensor node over real sockets: what it was given arrives once and bit by bit, or is a gap with a reason."""
+
+import queue
+import random
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import Entry, Sensor
+from ertis_numba.network import messages
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.network.sensor_node import _link as link
+from ertis_numba.network.sensor_node import _runs as runs
+from ertis_numba.settings import Air, Recording
+from tests.journals import EPOCH, TINY, entries, python
+from tests.stand_in import StandIn
+
+KEY = "left", EPOCH
+SOON_S = 20.0
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """What takes seconds takes fractions of one."""
+    for module, name, value in (
+        (link, "_PING_S", 0.05),
+        (link, "_DEAD_S", 0.5),
+        (link, "_GREET_AGAIN_S", 0.1),
+        (link, "_REFUSED_S", 0.1),
+        (link, "_TURN_MS", 10),
+        (runs, "_PATIENCE_S", 0.05),
+        (runs, "_MOST_PATIENCE_S", 0.2),
+    ):
+        monkeypatch.setattr(module, name, value)
+
+
+IMPATIENT = pytest.mark.usefixtures("impatient")
+
+
+class Node(SensorNode):
+    """A sensor node of one sensor, whose notes and acks can be waited for."""
+
+    def __init__(self, address, sensors=("left",), **options):
+        self.notes, self.acks = queue.Queue(), queue.Queue()
+        super().__init__(address, on_note=self.notes.put, on_settled=self.acks.put, **options)
+        for sensor in sensors:
+            self.add_sensor(sensor, TINY, firmware="1.2.3", translation_m=(1, 2, 3))
+
+
+def until(condition):
+    """Wait until something is so."""
+    end_s = time.monotonic() + SOON_S
+    while not condition():
+        assert time.monotonic() < end_s
+        threading.Event().wait(0.005)
+
+
+def same(held, wanted):
+    """Whether a central node has what was given, with everything that belongs to it."""
+    message, words = held
+    entry, stamp, air = wanted, wanted.measurement.stamp, wanted.measurement.settings.air
+    return words == entry.measurement.words.tobytes() and message == messages.Data(
+        sensor=stamp.sensor,
+        epoch=stamp.epoch,
+        sequence=stamp.sequence,
+        sync_count=stamp.sync_count,
+        timestamp_ns=stamp.timestamp_ns,
+        uncertainty_ns=stamp.timestamp_uncertainty_ns,
+        monotonic_ns=entry.monotonic_ns,
+        temperature_c=air.temperature_c,
+        humidity_percent=air.humidity_percent,
+        pressure_pa=air.pressure_pa,
+        crc32=entry.crc32,
+    )
+
+
+def has_all(central, given, key=KEY):
+    held = central.held.get(key, {})
+    return [*held] == [entry.measurement.stamp.sequence for entry in given] and all(
+        same(*pair) for pair in zip(held.values(), given, strict=True)
+    )
+
+
+def test_measurements_arrive_with_all_that_belongs_to_them():
+    given = entries(50, first=0)
+    warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
+    given[3] = replace(given[3], measurement=replace(given[3].measurement, settings=warm))
+    with StandIn() as central, Node(central.address) as node:
+        assert node.append(given[:20]) == given[:20]
+        for entry in given[20:]:
+            node.append([entry])
+        assert node.flush(SOON_S)
+        hello, settings = central.hellos.get(timeout=SOON_S)
+        counts = node.counts["left"]
+    assert has_all(central, given)
+    assert (hello.next_sequence, hello.firmware, hello.translation_m) == (0, "1.2.3", (1.0, 2.0, 3.0))
+    assert settings.decode() == TINY.to_toml()
+    assert (counts.accepted, counts.stored, counts.unsettled, counts.unsettled_bytes) == (50, 50, 0, 0)
+    assert (central.wrong, central.resent, central.connections, node.reconnects) == ([], 0, 1, 0)
+    acks = [node.acks.get_nowait() for _ in range(node.acks.qsize())]
+    assert [ack.settled for ack in acks] == sorted({ack.settled for ack in acks})
+    assert (acks[-1].sensor, acks[-1].epoch, acks[-1].settled, acks[-1].status) == ("left", EPOCH, 49, "stored")
+
+
+def test_gaps_arrive_in_their_turn():
+    given = entries(6, first=3)
+    with StandIn() as central, Node(central.address) as node:
+        node.append(given[:2])
+        node.note_gap("left", 5, 5, "footer", epoch=EPOCH)
+        node.note_gap("left", 4, 6, "unplugged", epoch=EPOCH)  # of which 6 is news
+        node.append(given[5:])
+        node.note_gap("left", 0, 8, "late", epoch=EPOCH)  # which is none
+        assert node.flush(SOON_S)
+    assert [*central.held[KEY]] == [3, 4, 8]
+    assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
+
+
+def test_several_sensors_and_runs():
+    left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, epoch=9, seed=3)
+    with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
+        for pair in zip(left, right, strict=True):
+            node.append(pair)
+        node.append(later)
+        assert node.flush(SOON_S)
+    assert has_all(central, left)
+    assert has_all(central, right, ("right", EPOCH))
+    assert has_all(central, later, ("left", 9))
+    assert [hello.epoch for hello, _ in central.hellos.queue if hello.sensor == "left"] == [EPOCH, 9]
+
+
+def test_no_more_is_under_way_than_the_window_has_room_for():
+    with StandIn(window=4) as central, Node(central.address) as node:
+        central.ignored = 1.0
+        node.append(entries(20))
+        until(lambda: central.seen == {10, 11, 12, 13})
+        assert not node.flush(0.3)
+        assert central.seen == {10, 11, 12, 13}
+        central.ignored = 0.0
+        assert node.flush(SOON_S)
+
+
+def test_a_central_node_that_has_forgotten_this_one_is_greeted_at_once(monkeypatch):
+    """Without waiting for what is under way to be settled."""
+    monkeypatch.setattr(runs, "_PATIENCE_S", 1000.0)
+    given = entries(20)
+    with StandIn() as central, Node(central.address) as node:
+        node.append(given[:10])
+        assert node.flush(SOON_S)
+        central.forget_peers.set()
+        node.append(given[10:])
+        assert node.flush(SOON_S)
+        assert central.hellos.qsize() == 2
+    assert has_all(central, given)
+
+
+def test_runs_that_are_over_are_taken_leave_of():
+    given = [entries(2, epoch=epoch) for epoch in range(20)]
+    with StandIn() as central, Node(central.address) as node:
+        central.most_runs = 3
+        for several in given:
+            node.append(several)
+        assert node.flush(SOON_S)
+        assert not node.notes.qsize()
+    for epoch, several in enumerate(given):
+        assert has_all(central, several, ("left", epoch))
+
+
+@IMPATIENT
+@pytest.mark.parametrize("seed", range(3))
+def test_acks_may_be_lost_repeated_and_reordered(seed):
+    given = entries(120)
+    with StandIn(seed=seed) as central, Node(central.address) as node:
+        central.lost, central.repeated, central.late, central.ignored = 0.3, 0.3, 0.3, 0.05
+        for entry in given:
+            node.append([entry])
+        assert node.flush(SOON_S)
+        counts = node.counts["left"]
+    assert has_all(central, given)
+    assert central.wrong == []
+    assert counts.stored == 120
+
+
+@IMPATIENT
+def test_an_ack_of_what_was_not_sent_is_none():
+    given = entries(3)
+    with StandIn() as central, Node(central.address) as node:
+        central.refusal = lambda message: (
+            messages.Ack(sensor="left", epoch=EPOCH, settled=10**9, status="stored")
+            if isinstance(message, messages.Data) and not lied.is_set()
+            else None
+        )
+        lied = threading.Event()
+        node.append(given)
+        until(lambda: not central.hellos.empty())
+        assert not node.flush(0.2)
+        lied.set()
+        assert node.flush(SOON_S)
+    assert has_all(central, given)
+
+
+@IMPATIENT
+@pytest.mark.parametrize("forget", [False, True])
+def test_a_central_node_that_dies_and_comes_back(forget):
+    """Five times; with ``forget``, it acknowledges what it has in memory only, which is then gone."""
+    given = entries(100)
+    with StandIn(acks="accepted" if forget else "stored") as central, Node(central.address) as node:
+        for number, entry in enumerate(given):
+            node.append([entry])
+            if number % 20 == 10:
+                before = central.connections
+                until(lambda number=number: central.taken > number // 2)
+                central.stop(forget=forget)
+                central.start()
+                until(lambda before=before: central.connections > before)
+        assert node.flush(SOON_S)
+        counts = node.counts["left"]
+    assert has_all(central, given)
+    assert counts.stored + counts.taken == 100
+    assert (counts.taken == 100) == forget
+    assert central.wrong == []
+
+
+def test_a_full_memory_forgets_the_oldest():
+    given = entries(40, first=0)
+    central = StandIn()
+    with central:
+        address = central.address
+    with Node(address, ring_bytes=10 * TINY.recording.n_samples) as node:
+        for entry in given:
+            node.append([entry])
+            assert node.counts["left"].unsettled_bytes <= 10 * TINY.recording.n_samples
+        counts = node.counts["left"]
+        assert (counts.accepted, counts.overwritten, counts.unsettled) == (40, 30, 10)
+        assert not node.flush(0.01)
+        assert not node.flush(SOON_S, stop=lambda: True)
+        with central:
+            assert node.flush(SOON_S)
+    assert [*central.held[KEY]] == list(range(30, 40))
+    assert central.gaps[KEY] == [(0, 29, runs.MEMORY_FULL)]
+
+
+def test_memory_is_flat_while_nobody_takes_anything():
+    """Even if every other number is a gap of its own kind."""
+    small = TINY.replace(recording=Recording(n_samples=64))
+    (blank,) = entries(1, settings=small)
+    with StandIn() as central:
+        address = central.address
+    with SensorNode(address, ring_bytes=6400) as node:
+        node.add_sensor("left", small)
+        for number in range(0, 4000, 2):
+            stamp = replace(blank.measurement.stamp, sequence=number)
+            node.append([Entry(replace(blank.measurement, stamp=stamp), 0)])
+            node.note_gap("left", number + 1, number + 1, f"reason {number % 7}", epoch=EPOCH)
+        run = node._spool.runs[KEY]  # noqa: SLF001  nobody else can tell
+        assert len(run.items) < 300
+        assert run.items[0].first == 0
+        assert all(one.last + 1 == other.first for one, other in zip(run.items, list(run.items)[1:], strict=False))
+
+
+@IMPATIENT
+def test_memory_is_flat_while_one_sensor_is_not_let_in():
+    small = TINY.replace(recording=Recording(n_samples=64))
+    refused = messages.Refused(code="serial", reason="no", sensor="left", epoch=EPOCH)
+    with StandIn() as central, SensorNode(central.address) as node:
+        central.refusal = lambda message: refused if getattr(message, "sensor", "") == "left" else None
+        node.add_sensor("left", small)
+        node.add_sensor("right", small)
+        node.append(entries(1, settings=small))
+        for entry in entries(3000, sensor="right", settings=small):
+            node.append([entry])
+        until(lambda: central.settled.get(("right", EPOCH)) == 3009)
+        until(lambda: node.unsettled == 1)
+        node.append(entries(1, first=11, settings=small))
+        assert len(node._spool._order) < 1010  # noqa: SLF001  nobody else can tell
+
+
+@IMPATIENT
+def test_who_is_refused_is_told_once_and_tries_again_while_others_pass():
+    left, right = entries(5), entries(5, sensor="right")
+    with StandIn() as central, Node(central.address, ("left", "right")) as node:
+        asked = queue.Queue()
+
+        def refuse(message):
+            if isinstance(message, messages.Hello) and message.sensor == "left" and asked.qsize() < 3:
+                asked.put(message)
+                return messages.Refused(code="serial", reason="left is not yours", sensor="left", epoch=EPOCH)
+            return None
+
+        central.refusal = refuse
+        node.append([*left, *right])
+        until(lambda: has_all(central, right, ("right", EPOCH)))
+        assert node.flush(SOON_S)
+        notes = list(node.notes.queue)
+    assert has_all(central, left)
+    assert notes == ["the central node refuses measurements of sensor left: left is not yours"]
+
+
+@IMPATIENT
+def test_another_version_is_told():
+    with StandIn() as central, Node(central.address) as node:
+        central.version = 9
+        node.append(entries(1))
+        assert "a header has version 9 of the protocol, this node speaks 1" in node.notes.get(timeout=SOON_S)
+        central.version = messages.VERSION
+        assert node.flush(SOON_S)
+
+
+@IMPATIENT
+def test_a_fault_holds_measurements_back():
+    given = entries(30)
+    with StandIn() as central, Node(central.address) as node:
+        node.append(given[:1])
+        assert node.flush(SOON_S)
+        central.state, central.text = "fault", "no room"
+        until(lambda: node.central == "fault")
+        node.append(given[1:])
+        assert not node.flush(0.2)
+        assert node.notes.get(timeout=SOON_S) == "the central node cannot store: no room; measurements are kept"
+        assert central.seen == {10, 11}  # to see whether it stores again, one is enough
+        central.state = "storage"
+        assert node.flush(SOON_S)
+        assert node.notes.get(timeout=SOON_S) == "the central node stores again"
+        assert node.central == "storage"
+    assert has_all(central, given)
+
+
+@IMPATIENT
+def test_silence_is_answered_by_a_new_connection():
+    given = entries(10)
+    with StandIn() as central, Node(central.address) as node:
+        node.append(given[:5])
+        assert node.flush(SOON_S)
+        central.silent = True
+        assert "does not answer; measurements are kept meanwhile" in node.notes.get(timeout=SOON_S)
+        assert node.central == "away"
+        node.append(given[5:])
+        central.silent = False
+        assert "is there" in node.notes.get(timeout=SOON_S)
+        assert node.flush(SOON_S)
+        assert node.reconnects == 1
+    assert has_all(central, given)
+    assert central.connections > 1
+
+
+def test_what_is_thrown_away_is_counted_once():
+    given = entries(8, first=0)
+    with StandIn(acks="accepted") as central, Node(central.address) as node:
+        central.dropped = ((2, "superseded"), (3, "superseded"), (5, "failed twice"))
+        for entry in given:
+            node.append([entry])
+        assert node.flush(SOON_S)
+        counts = node.counts["left"]
+        told = [ack.dropped for ack in node.acks.queue if ack.dropped]
+    assert counts.dropped == {"superseded": 2, "failed twice": 1}
+    assert (counts.taken, counts.stored) == (8, 0)
+    assert told == [central.dropped]
+
+
+@IMPATIENT
+@pytest.mark.parametrize(
+    ("listed", "server", "message"),
+    [
+        (False, True, "does not know this key"),
+        (True, False, "--server-key"),
+        (True, True, None),
+    ],
+)
+def test_keys(tmp_path, listed, server, message):
+    mine, theirs, other = (KeyPair.new(name) for name in ("node", "central", "other"))
+    allow = tmp_path / "allow.toml"
+    who = mine if listed else other
+    permission = Permission(name="node", public=who.public, role="sensor", serials=("left",))
+    AllowList().allow(permission).save(allow)
+    keys = ClientKeys(mine, (theirs if server else other).public)
+    with StandIn(keys=ServerKeys(theirs, allow)) as central, Node(central.address, keys=keys) as node:
+        given = entries()
+        node.append(given)
+        if message is None:
+            assert node.flush(SOON_S)
+            assert has_all(central, given)
+        else:
+            until(lambda: any(message in note for note in list(node.notes.queue)))
+            assert central.taken == 0
+
+
+def test_numbers_hold_whatever_happens():  # noqa: C901  it is a list of what may
+    """A run against an obvious model: random losses, evictions, acks late and beyond."""
+    chance = random.Random(4)
+    for _ in range(30):
+        run = runs.Run(Sensor.of("left", TINY), EPOCH)
+        taken, number, lost = -1, 0, set()
+        for step in range(400):
+            match chance.randrange(8):
+                case 0 | 1:
+                    run.add_measurement(number, 10, entry=None)
+                    number += 1
+                case 2:
+                    run.add_gap(number, number + chance.randrange(3), chance.choice("ab"))
+                    number = run.following
+                case 3:
+                    oldest = run.forget_oldest()
+                    if oldest is not None:
+                        lost.add(oldest.first)
+                case 4 | 5:
+                    item = run.to_send(4)
+                    if item is not None:
+                        assert item.last > run.sent
+                        assert item.first <= run.sent + 1
+                        run.mark_sent(item.last, step)
+                        if item.first <= taken + 1 and chance.random() < 0.8:
+                            taken = max(taken, item.last)
+                case 6:
+                    run.settle(chance.randint(run.settled - 2, max(taken, run.settled)), step)
+                case 7:
+                    run.go_back(step)
+            assert run.settled <= taken
+            assert run.sent <= run.reached
+            expected = run.settled + 1
+            for item in run.items:
+                assert item.first == expected
+                expected = item.last + 1
+            assert not run.items or expected == run.following
+            assert run.settle(run.reached + 1, step) == []
+            assert sum(1 for _ in run.under_way()) <= 4 or run.items[0].reason
+
+
+BAD = {
+    "address": (lambda _: SensorNode("here"), "address 'here' cannot be used; give tcp://HOST:PORT"),
+    "no keys": (
+        lambda _: SensorNode("tcp://10.0.0.1:5601"),
+        "can be reached from other machines, and there are no keys",
+    ),
+    "ring": (
+        lambda _: SensorNode("tcp://127.0.0.1:1", ring_bytes=0),
+        "ring_bytes is 0; give a whole number of at least 1",
+    ),
+    "limit without spool": (
+        lambda _: SensorNode("tcp://127.0.0.1:1", spool_bytes=1),
+        "spool_bytes is given without a spool; give its folder, too",
+    ),
+    "unknown sensor": (
+        lambda node: node.append(entries(1, sensor="right")),
+        "sensor 'right' is not known to this sensor node; add it first",
+    ),
+    "gap of it": (
+        lambda node: node.note_gap("right", 0, 1, "x", epoch=1),
+        "sensor 'right' is not known to this sensor node; add it first",
+    ),
+    "gap backwards": (
+        lambda node: node.note_gap("left", 2, 1, "x", epoch=1),
+        "last missing sequence number is 1; give",
+    ),
+    "epoch": (lambda node: node.note_gap("left", 1, 2, "x", epoch=-1), "epoch is -1; give a whole number from 0"),
+    "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; give 64 at most"),
+    "longer than the memory": (
+        lambda node: node.add_sensor("b", TINY.replace(recording=Recording(n_samples=200_000))),
+        "a measurement of sensor b has 200000 bytes, and the memory has room for 100000; give ring_bytes",
+    ),
+    "settings": (
+        lambda node: node.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),
+        "a measurement has other recording settings than sensor left",
+    ),
+    "again": (lambda node: node.append(entries(1)), "measurement 10 of sensor left comes after 12; give them in order"),
+    "twice at once": (
+        lambda node: node.append([*entries(1, first=20), *entries(1, first=20)]),
+        "measurement 20 of sensor left comes after 20; give them in order",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_does_not_fit_is_refused(name):
+    act, message = BAD[name]
+    with Node("tcp://127.0.0.1:1", ring_bytes=100_000) as node:
+        node.append(entries())
+        with pytest.raises(ArgumentError, match=message):
+            act(node)
+        assert node.counts["left"].accepted == node.unsettled == 3
+
+
+def test_words_of_any_kind_are_sent_little_endian():
+    (given,) = entries(1, first=0)
+    strided = np.repeat(given.measurement.words, 2)[::2]
+    given.measurement = replace(given.measurement, words=strided)
+    with StandIn() as central, Node(central.address) as node:
+        node.append([given])
+        assert node.flush(SOON_S)
+    assert central.held[KEY][0][1] == strided.tobytes()
+
+
+def test_a_failing_listener_stops_nothing(monkeypatch):
+    monkeypatch.setattr(link, "_FAILED_S", 0.0)
+    notes, given = queue.Queue(), entries(3)
+
+    def fail(_settled):
+        raise OSError("the pipe is closed")
+
+    with StandIn() as central, SensorNode(central.address, on_note=notes.put, on_settled=fail) as node:
+        node.add_sensor("left", TINY)
+        node.append(given)
+        assert node.flush(SOON_S)
+        assert "has failed (OSError: the pipe is closed); it is made again" in notes.get(timeout=SOON_S)
+    assert has_all(central, given)
+
+
+def test_a_sensor_node_loads_nothing_heavy():
+    done = python("import ertis_numba.network.sensor_node, sys; print(*sys.modules)")
+    assert not {"h5py", "scipy", "numba", "ertis_numba.storage", "ertis_numba.pipeline"} & set(done.stdout.split())
+    assert "zmq" in done.stdout

@@ -1,0 +1,207 @@
+"""``ertis serve`` as its users have it: processes that are started, sent to, subscribed to, killed and ended."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.journal import Entry
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
+from ertis_numba.network.messages import Group
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.network.status import Status
+from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.storage import open_recording
+from tests.cases import SHORT, noise
+
+TIMEOUT_S = 60.0
+MEASUREMENT = noise(SHORT)
+LOOPBACK = ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0")
+
+
+class Served:
+    """A process of ``ertis serve``, its events, and what it said when it had ended."""
+
+    def __init__(self, process):
+        self.process = process
+        self.started = self.event("listening")
+        self.listen, self.publish = self.started["address"], self.started["publish"]
+
+    def event(self, name):
+        for line in self.process.stdout:
+            if (event := json.loads(line))["event"] == name:
+                return event
+        raise AssertionError(f"it ended without {name!r}: {self.process.stderr.read()}")
+
+    def end(self):
+        self.process.send_signal(signal.SIGINT)
+        served = self.event("served")
+        assert self.process.wait(TIMEOUT_S) == 0
+        return served
+
+
+@contextmanager
+def serving(*options):
+    command = [sys.executable, "-m", "ertis_cli", "serve", "--json", "--quiet", *options]
+    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            yield Served(process)
+        finally:
+            process.kill()
+
+
+class Sensors:
+    """Sensors of a node that measure together."""
+
+    def __init__(self, node, *names):
+        self.node, self.names, self.numbers = node, names, itertools.count()
+        for name in names:
+            node.add_sensor(name, SHORT, translation_m=(0.5, 0.0, 0.0))
+
+    def measure(self):
+        number, now_ns = next(self.numbers), time.time_ns()
+        stamps = [
+            Stamp(sensor=name, sequence=number, sync_count=number, epoch=11, timestamp_ns=now_ns) for name in self.names
+        ]
+        self.node.append([Entry(Measurement(MEASUREMENT.words, SHORT, stamp), time.monotonic_ns()) for stamp in stamps])
+
+
+def received(subscriber, kind):
+    """Return the next product of a kind."""
+    end_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < end_s:
+        product = subscriber.receive(1.0)
+        if isinstance(product, kind):
+            return product
+    raise AssertionError(f"no {kind.__name__} has come")
+
+
+def is_gone(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
+    with (
+        serving(*LOOPBACK, "--record", str(tmp_path), "--workers", "1", "--device", "cpu") as served,
+        SensorNode(served.listen) as node,
+        Subscriber(served.publish, products=("energyscape", "group", "status"), credit=64) as subscriber,
+    ):
+        received(subscriber, Status)
+        sensors = Sensors(node, "left", "right")
+        images, groups = [], []
+        for number in range(4):
+            sensors.measure()
+            while len(images) < 2 * (number + 1) or len(groups) <= number:
+                product = subscriber.receive(TIMEOUT_S)
+                assert product is not None
+                images += [product] * isinstance(product, Energyscape)
+                groups += [product] * isinstance(product, Group)
+        assert node.flush(TIMEOUT_S)
+        told = served.end()
+    with Pipeline(SHORT, device="cpu") as pipeline:
+        wanted = pipeline.process(MEASUREMENT)
+    assert all(np.array_equal(image.energy, wanted.energy) for image in images)
+    assert {(image.stamp.sensor, image.stamp.sequence) for image in images} == set(
+        itertools.product(("left", "right"), range(4))
+    )
+    assert [(group.sensors, group.flags) for group in groups] == [(("left", "right"), ())] * 4
+    for name in ("left", "right"):
+        sensor = told["sensors"][name]
+        assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
+        (recording,) = told["recordings"]
+        with open_recording(recording, sensor=name) as stored:
+            assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
+
+
+def test_a_killed_worker_costs_no_measurement_and_nothing_outlives_the_central_node():
+    with (
+        serving(*LOOPBACK, "--workers", "1", "--device", "numpy") as served,
+        SensorNode(served.listen) as node,
+        Subscriber(served.publish, products=("energyscape", "status"), credit=64) as subscriber,
+    ):
+        status = received(subscriber, Status)
+        sensors = Sensors(node, "front")
+        sensors.measure()
+        received(subscriber, Energyscape)
+        (worker,) = status.processing.workers
+        os.kill(worker.pid, signal.SIGKILL)
+        sensors.measure()
+        image = received(subscriber, Energyscape)
+        assert image.stamp.sequence == 1
+        assert node.flush(TIMEOUT_S)
+        while (status := received(subscriber, Status)).sensors["front"].published < 2:
+            pass
+        front = status.sensors["front"]
+        assert (front.received, front.dropped, front.in_flight) == (2, {}, 0)
+        assert status.processing.respawned == 1
+        pids = [status.processing.publisher_pid, *(each.pid for each in status.processing.workers)]
+        served.process.kill()
+        served.process.wait(TIMEOUT_S)
+        end_s = time.monotonic() + TIMEOUT_S
+        while not all(map(is_gone, pids)):
+            assert time.monotonic() < end_s, pids
+            os.sched_yield()
+
+
+def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
+    pairs = {name: KeyPair.new(name) for name in ("central", "viewer", "front")}
+    for pair in pairs.values():
+        pair.save(tmp_path / "keys")
+    allow = tmp_path / "keys" / "allow.toml"
+    listed = AllowList(
+        keys=(
+            Permission(name="viewer", public=pairs["viewer"].public, role="application"),
+            Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
+        )
+    )
+    listed.save(allow)
+    keys = {name: ClientKeys(pair, pairs["central"].public) for name, pair in pairs.items()}
+    options = ("--key", str(tmp_path / "keys" / "central.secret.toml"), "--allow", str(allow))
+    notes = []
+    with (
+        serving(*LOOPBACK, *options, "--workers", "1", "--device", "numpy") as served,
+        SensorNode(served.listen, keys=keys["front"]) as node,
+        Subscriber(served.publish, products=("energyscape", "status"), keys=keys["viewer"]) as subscriber,
+        Subscriber(served.publish, keys=keys["front"], on_note=notes.append) as another,
+    ):
+        received(subscriber, Status)
+        Sensors(node, "front").measure()
+        assert received(subscriber, Energyscape).stamp.sensor == "front"
+        while not notes:
+            another.receive(0.1)
+        assert another.counts.received == 0
+    assert any("listed as sensor" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--publish", "tcp://0.0.0.0:0"), "there are no keys"),
+        (("--quarantine", "missing"), "quarantine missing is no folder"),
+        (("--deadline", "0"), "deadline is 0; give a number above 0"),
+        (("--range", "5:1"), "processing.range_m runs from 5 to 1"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_line(options, told):
+    command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *options]
+    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert told in line

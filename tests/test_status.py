@@ -1,0 +1,212 @@
+"""How a central node is: asked of a real one, as tables and as JSON."""
+
+import contextlib
+import io
+import json
+import queue
+import tempfile
+import threading
+from pathlib import Path
+
+import msgspec
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+from ertis_cli.status import _drawn
+
+from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.network.asking import Asking
+from ertis_numba.network.central_node import Archive, CentralNode
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.status import (
+    ArchiveStatus,
+    Percentiles,
+    ProcessingStatus,
+    SensorStatus,
+    Status,
+    SubscriberStatus,
+    WorkerStatus,
+)
+
+CENTRAL, ROBOT, VIEWER = (KeyPair.new(name) for name in ("central", "robot", "viewer"))
+PATIENCE_S = 10.0
+BUSY = Status(
+    version="1",
+    pid=7,
+    host="here",
+    address="tcp://127.0.0.1:5601",
+    state="fault",
+    fault="the disk is full",
+    uptime_s=3_723.4,
+    peers=1,
+    refused={"unknown key": 3},
+    sensors={
+        "front": SensorStatus(
+            connected=True,
+            rate_hz=19.97,
+            received=41,
+            stored=40,
+            published=37,
+            queue=2,
+            missing={"the spool was full": 5},
+            dropped={"superseded": 4},
+            image_latency=Percentiles(p50_ms=12.25, p99_ms=40.0),
+        ),
+        "left": SensorStatus(),
+    },
+    archive=ArchiveStatus(folder="/data", recording="a.h5", room_bytes=3_000_000_000, sealing_failed=1),
+    processing=ProcessingStatus(
+        address="tcp://127.0.0.1:5602",
+        choice="one each: 2.0 ms against 3.0 ms",
+        workers=[WorkerStatus(pid=8, state="busy")],
+        subscribers=[SubscriberStatus(name="viewer", products=("energyscape",), sent=30, dropped=7)],
+        groups={"complete": 9, "clock": 1},
+    ),
+)
+
+
+@contextlib.contextmanager
+def central_node(keys=None):
+    """A real one, in a thread of its own; its address."""
+    addresses, end = queue.Queue(), threading.Event()
+
+    def run():
+        try:
+            with tempfile.TemporaryDirectory() as folder, _open(folder, keys) as node:
+                addresses.put(node.address)
+                node.run(end)
+        except BaseException as error:
+            addresses.put(error)
+            raise
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        address = addresses.get(timeout=PATIENCE_S)
+        assert isinstance(address, str), address
+        yield address
+    finally:
+        end.set()
+        thread.join(PATIENCE_S)
+
+
+def _open(folder, keys):
+    return CentralNode("tcp://127.0.0.1:0", keys=keys, archive=Archive(Path(folder)))
+
+
+@pytest.fixture
+def keys(tmp_path):
+    listed = AllowList(
+        keys=(
+            Permission(name="robot", public=ROBOT.public, role="sensor", serials=("front",)),
+            Permission(name="viewer", public=VIEWER.public, role="application"),
+        )
+    )
+    listed.save(tmp_path / "allow.toml")
+    return ServerKeys(CENTRAL, tmp_path / "allow.toml")
+
+
+def test_a_central_node_says_how_it_is_again_and_again():
+    with central_node() as address, Asking(address) as node:
+        first, second = node.ask(PATIENCE_S), node.ask(PATIENCE_S)
+    assert first.address == second.address == address
+    assert (first.state, first.keys, first.sensors) == ("storage", False, {})
+    assert second.uptime_s >= first.uptime_s > 0
+
+
+def test_an_application_may_ask_and_a_sensor_may_not(keys):
+    with central_node(keys) as address:
+        with Asking(address, keys=ClientKeys(VIEWER, CENTRAL.public)) as node:
+            status = node.ask(PATIENCE_S)
+        with (
+            Asking(address, keys=ClientKeys(ROBOT, CENTRAL.public)) as node,
+            pytest.raises(RefusedError, match="may not ask for the status"),
+        ):
+            node.ask(PATIENCE_S)
+    assert status.keys is True
+    assert not any(status.refused.values())
+
+
+def test_who_is_not_let_in_is_told_why_at_once(keys):
+    with central_node(keys) as address:
+        with (
+            Asking(address, keys=ClientKeys(KeyPair.new("x"), CENTRAL.public)) as node,
+            pytest.raises(RefusedError, match="does not know this key; have it listed"),
+        ):
+            node.ask(PATIENCE_S)
+        with (
+            Asking(address, keys=ClientKeys(VIEWER, ROBOT.public)) as node,
+            pytest.raises(RefusedError, match="another key than --server-key says"),
+        ):
+            node.ask(0.5)
+        with Asking(address) as node, pytest.raises(RefusedError, match="give --key and --server-key"):
+            node.ask(PATIENCE_S)
+
+
+def test_where_nobody_answers_the_remedy_is_told():
+    with Asking("tcp://127.0.0.1:1") as node, pytest.raises(NetworkError, match=r"has not answered for 0\.1 s; start"):
+        node.ask(0.1)
+    with pytest.raises(NetworkError, match="use it in a with statement"):
+        node.ask(0.1)
+
+
+def test_another_machine_is_not_asked_without_keys():
+    with pytest.raises(ArgumentError, match="there are no keys"):
+        Asking("tcp://192.0.2.1:5601")
+
+
+def test_the_command_prints_a_table_once_where_nobody_watches():
+    with central_node() as address:
+        result = CliRunner().invoke(cli, ["status", address], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"{address} on ")
+    assert "storage" in result.stdout
+
+
+def test_the_command_prints_one_json_object(keys, tmp_path):
+    secret, _ = VIEWER.save(tmp_path / "keys")
+    with central_node(keys) as address:
+        result = CliRunner().invoke(
+            cli,
+            ["status", address, "--json", "--key", str(secret), "--server-key", CENTRAL.public],
+            catch_exceptions=False,
+        )
+    assert result.exit_code == 0
+    told = msgspec.convert(json.loads(result.stdout), Status)
+    assert (told.address, told.state, told.keys) == (address, "storage", True)
+
+
+def test_a_command_that_gets_no_answer_fails_in_a_line():
+    result = CliRunner().invoke(cli, ["status", "tcp://127.0.0.1:1", "--patience", "0.1"])
+    assert result.exit_code == 1
+    assert len(result.stderr.splitlines()) == 1
+
+
+def _printed(status):
+    from rich.console import Console  # noqa: PLC0415
+
+    stream = io.StringIO()
+    Console(file=stream, width=200).print(_drawn(status))
+    return stream.getvalue()
+
+
+def test_a_table_says_all_that_somebody_should_look_at():
+    text = _printed(BUSY)
+    for part in (
+        "up 1:02:03",
+        "fault: the disk is full",
+        "refused: 3 unknown key",
+        "5 the spool was full",
+        "4 superseded",
+        "12.2/40.0",
+        "left (away)",
+        "1 not sealed",
+        "room for 3.0 GB",
+        "workers: 1, 1 busy",
+        "cores: one each: 2.0 ms against 3.0 ms",
+        "groups: 9 complete, 1 clock",
+        "viewer: energyscape of all sensors, 30 sent, 7 dropped",
+    ):
+        assert part in text, part
+    row = next(line.split() for line in text.splitlines() if line.lstrip().startswith("front"))
+    assert row[1:6] == ["20.0", "41", "40", "37", "2"]

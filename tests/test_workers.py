@@ -1,0 +1,206 @@
+"""Worker processes that are killed, that hang, and that raise."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import Journal
+from ertis_numba.network.processing import Options
+from ertis_numba.network.processing.choice import Choice, Mode
+from ertis_numba.network.processing.notes import Forget
+from tests.cases import SHORT
+from tests.driven import ANY, MEASUREMENT, driven, hello
+
+TIMEOUT_S = 30.0
+
+
+def stop_and_offer(loop):
+    """Have a worker that will never be done with its measurement; return its process."""
+    loop.until(lambda: loop.workers("idle"))
+    (worker,) = loop.workers("idle")
+    os.kill(worker.pid, signal.SIGSTOP)
+    loop.offer()
+    loop.until(lambda: loop.workers("busy"))
+    return worker.pid
+
+
+def is_gone(pid):
+    """Whether a process has ended, though nobody may have asked how."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        pid = stop_and_offer(loop)
+        os.kill(pid, signal.SIGKILL)
+        loop.settle()
+        counts, status = loop.processing.counts("front"), loop.processing.status()
+    assert (counts.received, counts.published, counts.dropped) == (1, 1, {})
+    assert (status.respawned, status.retried, status.quarantined) == (1, 1, 0)
+    assert status.workers[0].pid != pid
+    ((_, about),) = [line for line in loop.lines if line[0] == "retried"]
+    assert (about["sensor"], about["epoch"], about["sequence"]) == ("front", 7, 0)
+
+
+def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        for _ in range(3):
+            loop.until(lambda: loop.workers("idle"))
+            loop.offer()
+            loop.settle()
+            os.kill(loop.workers("idle")[0].pid, signal.SIGKILL)
+            respawned = loop.processing.status().respawned
+            loop.until(lambda before=respawned: loop.processing.status().respawned > before)
+        counts = loop.processing.counts("front")
+    assert (counts.received, counts.published) == (3, 3)
+
+
+def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path):
+    with driven(deadline_s=0.2, workers=2, quarantine=tmp_path) as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: len(loop.workers("idle")) == 2)
+        for worker in loop.workers("idle"):
+            os.kill(worker.pid, signal.SIGSTOP)
+        loop.offer()
+        loop.settle()
+        counts, status = loop.processing.counts("front"), loop.processing.status()
+        assert (counts.published, counts.dropped) == (0, {"failed twice": 1})
+        assert (status.respawned, status.retried, status.quarantined) == (2, 1, 1)
+        loop.offer()  # the sensor goes on
+        loop.settle()
+        assert counts.published == 1
+    (path,) = tmp_path.glob("quarantine_*.h5.journal")
+    with Journal.open(path) as journal:
+        (entry,) = journal.entries()
+    assert np.array_equal(entry.measurement.words, MEASUREMENT.words)
+    assert entry.measurement.stamp.sequence == 0
+
+
+def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.offer(words=MEASUREMENT.words[:-1])
+        loop.offer()
+        loop.settle()
+        counts, status = loop.processing.counts("front"), loop.processing.status()
+    assert (counts.published, counts.dropped) == (1, {"it cannot be processed": 1})
+    assert (status.respawned, status.retried) == (0, 0)
+
+
+def test_a_worker_that_raises_is_asked_twice_and_lives():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: loop.workers("idle"))
+        runner = loop.processing._runner  # noqa: SLF001  to have a worker make a mistake
+        runner._workers[0].child.pipe.send(Forget(kind=1))  # noqa: SLF001  it has no pipeline: KeyError
+        loop.offer()
+        loop.settle()
+        counts, status = loop.processing.counts("front"), loop.processing.status()
+    assert counts.dropped == {"failed twice": 1}
+    assert (status.respawned, status.retried) == (0, 1)
+    assert [fields["text"] for event, fields in loop.lines if event == "failed_twice"] == ["KeyError: 1"]
+
+
+def test_settings_that_no_pipeline_can_use_are_dropped_by_reason_and_other_sensors_go_on():
+    unusable = SHORT.replace(processing=SHORT.processing.replace(range_m=(9.0, 9.5)))  # beyond the record
+    with driven() as loop:
+        loop.processing.know(hello("bad", unusable), unusable)
+        loop.processing.know(hello("good"), SHORT)
+        for _ in range(2):
+            loop.offer("bad")
+            loop.offer("good")
+        loop.settle()
+        loop.offer("bad")
+        assert loop.processing.counts("bad").dropped == {"its settings cannot be used": 3}
+        assert loop.processing.counts("good").published == 2
+
+
+PARENT = """
+import sys
+sys.path[:0] = {path!r}
+from tests.driven import driven, hello, SHORT
+with driven(workers=2) as loop:
+    loop.processing.know(hello(), SHORT)
+    loop.until(lambda: len(loop.workers("idle")) == 2)
+    status = loop.processing.status()
+    print(*(worker.pid for worker in status.workers), status.publisher_pid, flush=True)
+    while True:
+        loop.offer()
+        loop.step()
+"""
+
+
+def test_nothing_is_left_when_the_central_node_is_killed():
+    program = PARENT.format(path=[str(Path.cwd())])
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        pids = [int(pid) for pid in parent.stdout.readline().split()]
+        assert len(pids) == 3
+        maps = [Path(f"/proc/{pid}/maps").read_text() for pid in (parent.pid, *pids)]
+        os.kill(pids[0], signal.SIGSTOP)  # even one that hangs is gone when it goes on
+        parent.kill()
+    os.kill(pids[0], signal.SIGCONT)
+    end_s = time.monotonic() + TIMEOUT_S
+    while not all(map(is_gone, pids)):
+        assert time.monotonic() < end_s, pids
+        os.sched_yield()
+    # What they shared has no name in /dev/shm, by which it could be left there.
+    assert "/memfd:ertis" in maps[0]
+    assert not any("/dev/shm" in text for text in maps)
+
+
+def test_what_is_asked_for_is_checked(tmp_path):
+    with pytest.raises(ArgumentError, match=r"quarantine .* is no folder"):
+        Options(publish=ANY, quarantine=tmp_path / "missing")
+    with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
+        Options(dtype="float64")
+    with pytest.raises(ArgumentError, match=r"processing\.range_m"):
+        Options(processing={"range_m": (2.0, 1.0)})
+
+
+class TestChoice:
+    def test_all_cores_for_each_while_there_is_time(self):
+        choice = Choice(2, 2)
+        choice.seed(0.010, 0.016)
+        assert not choice.look(0.0, 50.0)
+        assert choice.mode == Mode(1, 2)
+        assert "50%" in choice.why
+
+    def test_several_at_once_where_that_gets_more_done(self):
+        choice = Choice(2, 2)
+        choice.seed(0.010, 0.016)
+        assert choice.look(0.0, 90.0)
+        assert choice.mode == Mode(2, 1)
+        assert not choice.look(1.0, 10.0)  # it is too early to look again
+        assert choice.look(4.0, 10.0)
+        assert choice.mode == Mode(1, 2)
+
+    def test_all_cores_for_each_where_several_at_once_get_less_done(self):
+        choice = Choice(2, 2)
+        choice.seed(0.010, 0.030)
+        assert not choice.look(0.0, 200.0)
+        assert choice.mode == Mode(1, 2)
+
+    def test_times_of_jobs_count_more_than_those_before(self):
+        choice = Choice(2, 2)
+        choice.seed(0.010, 0.016)
+        for _ in range(8):
+            choice.took(Mode(1, 2), 0.020)
+        assert choice.look(0.0, 45.0)
+
+    def test_one_worker_has_no_choice(self):
+        choice = Choice(1, 4)
+        choice.seed(0.010, 0.010)
+        assert not choice.look(0.0, 1000.0)
+        assert choice.mode == Mode(1, 4)
