@@ -59,6 +59,8 @@ class Loop:
         if time.monotonic() - self._tick_s > 0.05:
             self._tick_s = time.monotonic()
             processing.tick(self._tick_s)
+        for application in Application.running:
+            application.keep()
         self.check()
 
     def counts(self):
@@ -116,8 +118,11 @@ class Lines(Log):
 class Application:
     """A DEALER that subscribes as it is told to, message by message."""
 
+    running = set()  # noqa: RUF012  of all of them
+
     def __init__(self, address, keys=None):
         self._context = zmq.Context()
+        self._said, self._said_s = None, 0.0
         self.socket = sockets.client(self._context, address, keys=keys)
         self.consumed = 0
         self.descriptions = {}
@@ -125,10 +130,17 @@ class Application:
         self.others = []
 
     def subscribe(self, *products, **values):
-        self.socket.send(encode(Subscribe(products=products, consumed=self.consumed, **values)))
+        self.send(Subscribe(products=products, consumed=self.consumed, **values))
 
     def send(self, message):
         self.socket.send(encode(message))
+        self._said = message if isinstance(message, Subscribe) else None
+        self._said_s = time.monotonic()
+
+    def keep(self):
+        """Say again what was said last, as a subscriber does, which is forgotten otherwise."""
+        if self._said is not None and time.monotonic() - self._said_s > 0.5:
+            self.send(self._said)
 
     def read(self):
         while self.socket.poll(0):
@@ -146,7 +158,9 @@ class Application:
         return [type(message).__name__ for message, _ in self.got]
 
     def __enter__(self):
+        self.running.add(self)
         return self
 
     def __exit__(self, *_):
+        self.running.remove(self)
         self._context.destroy(linger=0)

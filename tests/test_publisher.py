@@ -191,10 +191,9 @@ class TestKeys:
             sensor.subscribe("energyscape")
             loop.until(lambda: sensor.read() or sensor.others)
             loop.until(lambda: {"role", "unknown key"} <= loop.processing.refused.keys())
-            assert loop.processing.refused["role"] == 1
+            assert loop.processing.refused["role"] >= 1
             stranger.read()
-        (refused,) = sensor.others
-        assert refused.code == "role"
+        assert {refused.code for refused in sensor.others} == {"role"}
         assert stranger.others == stranger.got == []
 
 

@@ -13,6 +13,7 @@ from ertis_bench import (
     network_faults_keys,
     network_faults_kills,
     network_faults_links,
+    network_faults_load,
     network_faults_peers,
     network_faults_processing,
 )
@@ -145,13 +146,11 @@ PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
     ),
     "overload": (
         "{overload_s:g} s of twice as much as can be done",
-        lambda extent, folder, seed: network_faults_processing.overload(
-            folder, seed=seed, duration_s=extent.overload_s
-        ),
+        lambda extent, folder, seed: network_faults_load.overload(folder, seed=seed, duration_s=extent.overload_s),
     ),
     "subscribers": (
         "{slow_s:g} s with slow and dead applications",
-        lambda extent, folder, seed: network_faults_processing.subscribers(folder, seed=seed, duration_s=extent.slow_s),
+        lambda extent, folder, seed: network_faults_load.subscribers(folder, seed=seed, duration_s=extent.slow_s),
     ),
     "groups": (
         "{n_pulses} pulses, lost, double, and with a wrong clock",

@@ -26,7 +26,7 @@ from ertis_numba.network.subscriber import Subscriber
 __all__ = ["keys"]
 
 _TRIED_S: Final = 2.5  # a wrong key has been refused some times by then
-_REMOVED_S: Final = 3.0
+_REMOVED_S: Final = 2.0
 _INTERVAL_S: Final = 0.02
 Found = dict[str, Any]
 
@@ -184,6 +184,6 @@ def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Tr
 
 def _speaks_without_keys(address: str) -> int:
     """Return 1 if an address shakes hands with a peer of no keys at all."""
-    with contextlib.suppress(OSError), Peer(address, timeout_s=2.0):
+    with contextlib.suppress(OSError), Peer(address, timeout_s=1.0):
         return 1
     return 0

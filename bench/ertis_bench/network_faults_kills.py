@@ -17,7 +17,7 @@ from ertis_numba.errors import DataError
 __all__ = ["Record", "centrals", "judged", "nodes", "sealings", "tracebacks"]
 
 _GONE_S: Final = 30.0  # for what a killed process has started
-_ROTATE_MB: Final = 4
+_ROTATE_MB: Final = 16
 _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
 

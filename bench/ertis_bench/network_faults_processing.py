@@ -1,162 +1,30 @@
-"""What goes wrong where images are made: workers that die, more work than can be done, applications that are slow."""
+"""What goes wrong where images are made: workers that die, pulses that are lost, clocks that are wrong."""
 
 import os
 import random
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ertis_bench.network_faults_kills import judged, tracebacks
-from ertis_bench.network_oracle import Sent, read_diaries
-from ertis_bench.network_processes import Process, central, survivors, until
-from ertis_bench.network_receiver import STEP, Look, Received, read_received
+from ertis_bench.network_oracle import read_diaries
+from ertis_bench.network_processes import survivors, until
+from ertis_bench.network_receiver import Look, read_received
 from ertis_bench.network_sender import SMALL, Job
-from ertis_numba.frames import Measurement
-from ertis_numba.network.keys import ClientKeys
+from ertis_bench.network_serving import Serve, accounts, expected_of, some_words
 from ertis_numba.network.messages import Group
-from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Subscriber
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Settings
 
-__all__ = [
-    "Serve",
-    "accounts",
-    "expected_of",
-    "groups",
-    "overload",
-    "percentile",
-    "some_words",
-    "subscribers",
-    "workers",
-]
+__all__ = ["groups", "workers"]
 
-_KINDS: Final = 5  # different measurements
 _DIRECTIONS: Final = "2d:9"
 _WHILE_STARTING: Final = 0.1  # share of the workers that are killed before they can do anything
-_PAPER: Final = ("--method", "paper", "--directions", "1850")
-"""What takes long enough that a sender can ask for twice as much."""
 
 Found = dict[str, Any]
-
-
-def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
-    """Write the words of some measurements of noise into a file."""
-    shape = (_KINDS, settings.recording.n_samples)
-    np.save(path, np.random.default_rng(seed).integers(0, 2**32, shape, dtype=np.uint32))
-    return path
-
-
-def expected_of(settings: Settings, words: NDArray[np.uint32], path: Path) -> Path:
-    """Write some values of the image of each measurement into a file, computed here and now."""
-    pipeline = Pipeline(settings)
-    images = [pipeline.process(Measurement(each, settings)).energy for each in words]
-    n_values = images[0].size // STEP - 1
-    values = np.stack([image.reshape(-1)[number % STEP :: STEP][:n_values] for number, image in enumerate(images)])
-    np.savez(path, values=values, shape=images[0].shape)
-    return path
-
-
-def percentile(times_ms: Sequence[float], share: float) -> float:
-    """Return a percentile, 0 of nothing."""
-    ordered = sorted(times_ms)
-    return round(ordered[round(share * (len(ordered) - 1))], 2) if ordered else 0.0
-
-
-@dataclass(slots=True)
-class Serve:
-    """``ertis serve``, and what it says of itself meanwhile; use it in a ``with`` statement of `running`.
-
-    Attributes
-    ----------
-    node : Process
-    listen, publish : str
-    mark : str
-    unbalanced : int
-        How often a status came in which what was received is not what was published, dropped and is under way.
-    latest : Status or None
-    """
-
-    node: Process
-    listen: str
-    publish: str
-    mark: str
-    watcher: "Subscriber[Status]"
-    unbalanced: int = 0
-    latest: Status | None = None
-    pids: set[int] = field(default_factory=set)
-
-    @classmethod
-    @contextmanager
-    def running(cls, folder: Path, *options: str, keys: ClientKeys | None = None) -> "Iterator[Serve]":
-        """Start it and yield it."""
-        mark = f"serve{os.getpid()}{time.monotonic_ns()}"
-        with central("serve", folder, "--publish", "tcp://127.0.0.1:*", *options, mark=mark) as node:
-            listening = node.wait_for("listening")
-            with Subscriber(listening["publish"], products=("status",), keys=keys) as watcher:
-                yield cls(node, listening["address"], listening["publish"], mark, watcher)
-
-    def look(self, *, timeout_s: float = 5.0) -> Status | None:
-        """Return the next status, None if none comes."""
-        status = self.watcher.receive(timeout_s)
-        if status is not None:
-            self.latest = status
-            self.unbalanced += any(
-                each.received != each.published + sum(each.dropped.values()) + each.in_flight
-                for each in status.sensors.values()
-            )
-        return status
-
-    def settle(self, n_sent: int, *, timeout_s: float = 30.0) -> bool:
-        """Wait until all that was sent has become something, and return whether it has."""
-        end_s = time.monotonic() + timeout_s
-        while time.monotonic() < end_s:
-            status = self.look()
-            sensors = [] if status is None else list(status.sensors.values())
-            if sum(each.received for each in sensors) >= n_sent and not any(each.in_flight for each in sensors):
-                return True
-        return False
-
-
-def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
-    """Add up what became of all measurements.
-
-    Returns
-    -------
-    dict
-        ``received``, ``published`` and ``dropped`` as the central node says; ``images`` that an application has, and
-        those that were ``skipped`` for it. Then what ought to be 0: ``unbalanced``, see `Serve`; ``uncounted``,
-        measurements that the central node does not count; ``untold``, images that neither came nor were told to be
-        skipped; and images that came ``twice``, ``disordered`` or ``wrong``, or of what was never sent (``foreign``).
-    """
-    sensors = [] if serve.latest is None else list(serve.latest.sensors.values())
-    dropped: dict[str, int] = {}
-    for each in sensors:
-        for reason, count in each.dropped.items():
-            dropped[reason] = dropped.get(reason, 0) + count
-    published, n_received = sum(each.published for each in sensors), sum(each.received for each in sensors)
-    return {
-        "sent": len(sent.kept),
-        "received": n_received,
-        "published": published,
-        "dropped": dropped,
-        "images": len(received.numbers),
-        "skipped": received.dropped,
-        "unbalanced": serve.unbalanced + (n_received != published + sum(dropped.values())),
-        "uncounted": abs(len(sent.kept) - n_received),
-        "untold": abs(published - len(received.numbers) - received.dropped) + received.untold,
-        "twice": received.twice,
-        "disordered": received.disordered,
-        "wrong": received.wrong,
-        "foreign": len(received.times_ms.keys() - sent.offered.keys()),
-    }
 
 
 def workers(folder: Path, *, seed: int, count: int) -> Found:
@@ -210,103 +78,6 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         | {"wrong": found["wrong"] + stored["wrong"], "twice": found["twice"] + stored["twice"]}
         | {"slowest ack, ms": round(max(sent.ack_times_ms(), default=0.0), 1)}
     )
-
-
-def overload(folder: Path, *, seed: int, duration_s: float) -> Found:
-    """Send twice as much as can be processed, after finding out how much that is."""
-    words = some_words(SMALL, folder / "words.npy", seed=seed)
-    job = Job(address="", diary="", sensors=("a", "b", "c", "d"), seed=seed, words=str(words))
-    rate_hz = _published(folder / "calibration", job.replace(rate_hz=100.0), duration_s=5.0)["images per s"]
-    found = _published(folder / "overload", job.replace(rate_hz=2.0 * rate_hz / 4), duration_s=duration_s)
-    return {"capacity per s": rate_hz} | found
-
-
-def _published(folder: Path, job: Job, *, duration_s: float) -> Found:
-    """Send for a while, and add up what became of it."""
-    folder.mkdir()
-    diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
-    with ExitStack() as stack:
-        serve = stack.enter_context(Serve.running(folder, *_PAPER, "--range", "0.3:1.0"))
-        receiver = stack.enter_context(Look(address=serve.publish, diary=str(images), credit=8).start())
-        receiver.wait_for("subscribed")
-        with job.replace(address=serve.listen, diary=str(warm), rate_hz=1.0, count=2).start() as first:
-            first.wait_for("sent")  # pipelines are made before it counts
-            until(lambda: len(read_received(images).numbers) > 0)
-        sender = stack.enter_context(job.replace(address=serve.listen, diary=str(diary)).start())
-        sender.wait_for("begun")
-        before, begun_s = len(read_received(images).numbers), time.monotonic()
-        memory_bytes = 0
-        while time.monotonic() < begun_s + duration_s:
-            serve.look()
-            memory_bytes = max(memory_bytes, serve.node.memory_bytes)
-        per_s = (len(read_received(images).numbers) - before) / (time.monotonic() - begun_s)
-        sender.signal(signal.SIGTERM)
-        sender.wait_for("sent")
-        sent = read_diaries([warm, diary])
-        settled = serve.settle(len(sent.kept))
-        time.sleep(0.5)
-        receiver.signal(signal.SIGTERM)
-        receiver.wait()
-        received = read_received(images)
-        found = accounts(serve, sent, received)
-        serve.node.stop()
-    measured = read_diaries([diary]).offered
-    times_ms = [time_ms for key, time_ms in received.times_ms.items() if key in measured]
-    return {"settled": settled, "images per s": round(per_s, 1)} | found | {
-        "p50, ms": percentile(times_ms, 0.5),
-        "p99, ms": percentile(times_ms, 0.99),
-        "slowest, ms": percentile(times_ms, 1.0),
-        "memory, MB": round(memory_bytes / 1e6),
-        "tracebacks": tracebacks(folder),
-    }  # fmt: skip
-
-
-def subscribers(folder: Path, *, seed: int, duration_s: float) -> Found:
-    """See whether an application notices that others are slow, or stand still.
-
-    Each quarter of the time without them is followed by one with them, as a machine is never the same for long.
-    """
-    words = some_words(SMALL, folder / "words.npy", seed=seed)
-    times_ms: dict[bool, list[float]] = {False: [], True: []}
-    with ExitStack() as stack:
-        serve = stack.enter_context(Serve.running(folder, "--directions", "90", "--range", "0.3:1.0"))
-        look = Look(address=serve.publish, diary=str(folder / "images.ndjson"))
-        receiver = stack.enter_context(look.start())
-        receiver.wait_for("subscribed")
-        job = Job(address=serve.listen, diary=str(folder / "sender.ndjson"), sensors=("left", "right"), rate_hz=20.0)
-        sender = stack.enter_context(job.replace(words=str(words), seed=seed).start())
-        until(lambda: bool(read_received(folder / "images.ndjson").numbers))
-        time.sleep(1.0)
-        slow: list[Process] = []
-        for turn in range(8):
-            if turn % 2:
-                for name, waits_s in (("slow", 0.5), ("dead", 0.0)):
-                    other = look.replace(diary=str(folder / f"{name}-{turn}.ndjson"), waits_s=waits_s).start()
-                    slow.append(stack.enter_context(other))
-                    other.wait_for("subscribed")
-                time.sleep(0.5)
-                slow[-1].signal(signal.SIGSTOP)
-            before = len(read_received(folder / "images.ndjson").times_ms)
-            time.sleep(duration_s / 8)
-            times_ms[bool(turn % 2)] += list(read_received(folder / "images.ndjson").times_ms.values())[before:]
-            for other in slow:
-                other.kill()
-            slow.clear()
-            time.sleep(0.3)
-        sender.signal(signal.SIGTERM)
-        sender.wait_for("sent")
-        sent = read_diaries([folder / "sender.ndjson"])
-        settled = serve.settle(len(sent.kept))
-        time.sleep(0.5)
-        receiver.signal(signal.SIGTERM)
-        receiver.wait()
-        found = accounts(serve, sent, read_received(folder / "images.ndjson"))
-        serve.node.stop()
-    alone, beside = (percentile(times_ms[each], 0.99) for each in (False, True))
-    return {"settled": settled, "p99 alone, ms": alone, "p99 beside, ms": beside} | found | {
-        "grew, %": round(100 * (beside / alone - 1), 1) if alone else 0.0,
-        "tracebacks": tracebacks(folder),
-    }  # fmt: skip
 
 
 def groups(folder: Path, *, seed: int, count: int) -> Found:

@@ -37,7 +37,7 @@ class Look:
     products : tuple of str
     keys : (path of a secret, public key of the central node), optional
     expected : str, optional
-        File of what images of some measurements should be, in turn, by `network_faults_processing.expected_of`.
+        File of what images of some measurements should be, in turn, by `network_serving.expected_of`.
     waits_s : float
         How long it does something else after each product.
     credit : int

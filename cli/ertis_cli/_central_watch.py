@@ -23,7 +23,7 @@ _EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
 
 
 class CentralWatch:
-    """Events as lines of JSON on stdout and of a log on stderr; on a terminal also a line that is drawn again and again.
+    """Events as lines of JSON on stdout and of a log on stderr; on a terminal also a line that is drawn anew.
 
     Parameters
     ----------

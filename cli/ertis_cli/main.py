@@ -23,7 +23,7 @@ COMMANDS = {
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
-    "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes."),
+    "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes at ADDRESS."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
     "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),

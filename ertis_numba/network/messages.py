@@ -49,11 +49,13 @@ Product: TypeAlias = Literal["energyscape", "points", "raw", "group", "status"]
 PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
 """What applications can ask for."""
 
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*$")]
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*\Z")]
 Line = Annotated[str, Meta(max_length=512)]
 Reason = Annotated[str, Meta(min_length=1, max_length=64)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Settled = Annotated[int, Meta(ge=-1, le=2**63 - 1)]
+_MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
+Number = Annotated[int, Meta(ge=0, le=_MOST_SEQUENCE)]
+Settled = Annotated[int, Meta(ge=-1, le=_MOST_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]
@@ -84,7 +86,7 @@ class Hello(Message, frozen=True, kw_only=True):
 
     sensor: Name
     epoch: Count
-    next_sequence: Count
+    next_sequence: Number
     settings_crc32: Uint32
     firmware: Annotated[str, Meta(max_length=64)] = ""
     translation_m: Position = (0.0, 0.0, 0.0)
@@ -133,7 +135,7 @@ class Data(Message, frozen=True, kw_only=True):
 
     sensor: Name
     epoch: Count
-    sequence: Count
+    sequence: Number
     sync_count: Int64
     timestamp_ns: Int64
     uncertainty_ns: Uint32
@@ -149,8 +151,8 @@ class Gap(Message, frozen=True, kw_only=True):
 
     sensor: Name
     epoch: Count
-    first: Count
-    last: Count
+    first: Number
+    last: Number
     reason: Reason
 
 
@@ -172,7 +174,7 @@ class Ack(Message, frozen=True, kw_only=True):
     epoch: Count
     settled: Settled
     status: Literal["stored", "accepted"]
-    dropped: Annotated[tuple[tuple[Count, Reason], ...], Meta(max_length=32)] = ()
+    dropped: Annotated[tuple[tuple[Number, Reason], ...], Meta(max_length=32)] = ()
 
 
 class Ping(Message, frozen=True, kw_only=True):
@@ -258,7 +260,7 @@ class _OfMeasurement(Message, frozen=True, kw_only=True):
     description: Count
     sensor: Name
     epoch: Count
-    sequence: Count
+    sequence: Number
     sync_count: Int64
     timestamp_ns: Int64
     uncertainty_ns: Uint32
@@ -336,7 +338,7 @@ class Group(Message, frozen=True, kw_only=True):
     number: Count
     dropped: Count
     group: Int64
-    members: Annotated[tuple[tuple[Name, Count, Count], ...], Meta(max_length=32)]
+    members: Annotated[tuple[tuple[Name, Count, Number], ...], Meta(max_length=32)]
     missing: Annotated[tuple[Name, ...], Meta(max_length=32)]
     spread_ns: Count
     flags: tuple[Literal["incomplete", "clock", "pulse"], ...] = ()

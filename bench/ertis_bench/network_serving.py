@@ -1,0 +1,140 @@
+"""A central node that makes images: what it says of itself, and whether that adds up to what has come."""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.network_oracle import Sent
+from ertis_bench.network_processes import Process, central
+from ertis_bench.network_receiver import STEP, Received
+from ertis_numba.frames import Measurement
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.status import Status
+from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+
+__all__ = ["Serve", "accounts", "expected_of", "percentile", "some_words"]
+
+_KINDS: Final = 5  # different measurements
+
+Found = dict[str, Any]
+
+
+def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
+    """Write the words of some measurements of noise into a file."""
+    shape = (_KINDS, settings.recording.n_samples)
+    np.save(path, np.random.default_rng(seed).integers(0, 2**32, shape, dtype=np.uint32))
+    return path
+
+
+def expected_of(settings: Settings, words: NDArray[np.uint32], path: Path) -> Path:
+    """Write some values of the image of each measurement into a file, computed here and now."""
+    pipeline = Pipeline(settings)
+    images = [pipeline.process(Measurement(each, settings)).energy for each in words]
+    n_values = images[0].size // STEP - 1
+    values = np.stack([image.reshape(-1)[number % STEP :: STEP][:n_values] for number, image in enumerate(images)])
+    np.savez(path, values=values, shape=images[0].shape)
+    return path
+
+
+def percentile(times_ms: Sequence[float], share: float) -> float:
+    """Return a percentile, 0 of nothing."""
+    ordered = sorted(times_ms)
+    return round(ordered[round(share * (len(ordered) - 1))], 2) if ordered else 0.0
+
+
+@dataclass(slots=True)
+class Serve:
+    """``ertis serve``, and what it says of itself meanwhile; use it in a ``with`` statement of `running`.
+
+    Attributes
+    ----------
+    node : Process
+    listen, publish : str
+    mark : str
+    unbalanced : int
+        How often a status came in which what was received is not what was published, dropped and is under way.
+    latest : Status or None
+    """
+
+    node: Process
+    listen: str
+    publish: str
+    mark: str
+    watcher: "Subscriber[Status]"
+    unbalanced: int = 0
+    latest: Status | None = None
+    pids: set[int] = field(default_factory=set)
+
+    @classmethod
+    @contextmanager
+    def running(cls, folder: Path, *options: str, keys: ClientKeys | None = None) -> "Iterator[Serve]":
+        """Start it and yield it."""
+        mark = f"serve{os.getpid()}{time.monotonic_ns()}"
+        with central("serve", folder, "--publish", "tcp://127.0.0.1:*", *options, mark=mark) as node:
+            listening = node.wait_for("listening")
+            with Subscriber(listening["publish"], products=("status",), keys=keys) as watcher:
+                yield cls(node, listening["address"], listening["publish"], mark, watcher)
+
+    def look(self, *, timeout_s: float = 5.0) -> Status | None:
+        """Return the next status, None if none comes."""
+        status = self.watcher.receive(timeout_s)
+        if status is not None:
+            self.latest = status
+            self.unbalanced += any(
+                each.received != each.published + sum(each.dropped.values()) + each.in_flight
+                for each in status.sensors.values()
+            )
+        return status
+
+    def settle(self, n_sent: int, *, timeout_s: float = 30.0) -> bool:
+        """Wait until all that was sent has become something, and return whether it has."""
+        end_s = time.monotonic() + timeout_s
+        while time.monotonic() < end_s:
+            status = self.look()
+            sensors = [] if status is None else list(status.sensors.values())
+            if sum(each.received for each in sensors) >= n_sent and not any(each.in_flight for each in sensors):
+                return True
+        return False
+
+
+def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
+    """Add up what became of all measurements.
+
+    Returns
+    -------
+    dict
+        ``received``, ``published`` and ``dropped`` as the central node says; ``images`` that an application has, and
+        those that were ``skipped`` for it. Then what ought to be 0: ``unbalanced``, see `Serve`; ``uncounted``,
+        measurements that the central node does not count; ``untold``, images that neither came nor were told to be
+        skipped; and images that came ``twice``, ``disordered`` or ``wrong``, or of what was never sent (``foreign``).
+    """
+    sensors = [] if serve.latest is None else list(serve.latest.sensors.values())
+    dropped: dict[str, int] = {}
+    for each in sensors:
+        for reason, count in each.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+    published, n_received = sum(each.published for each in sensors), sum(each.received for each in sensors)
+    return {
+        "sent": len(sent.kept),
+        "received": n_received,
+        "published": published,
+        "dropped": dropped,
+        "images": len(received.numbers),
+        "skipped": received.dropped,
+        "unbalanced": serve.unbalanced + (n_received != published + sum(dropped.values())),
+        "uncounted": abs(len(sent.kept) - n_received),
+        "untold": abs(published - len(received.numbers) - received.dropped) + received.untold,
+        "twice": received.twice,
+        "disordered": received.disordered,
+        "wrong": received.wrong,
+        "foreign": len(received.times_ms.keys() - sent.offered.keys()),
+    }
