@@ -30,6 +30,7 @@ KINDS = [
 ]
 NAMES = st.from_regex(r"\A[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,63}\Z")
 COUNTS, INT64, UINT32 = (st.integers(*limits) for limits in ((0, 2**63 - 1), (-(2**63), 2**63 - 1), (0, 2**32 - 1)))
+NUMBERS = st.integers(0, 2**48)
 FINITE = st.floats(allow_nan=False)
 REASONS = st.text(st.characters(codec="utf-8"), min_size=1, max_size=64)
 WHOLE = Data(
@@ -58,7 +59,7 @@ def test_each_message_of_the_table_has_its_own_kind():
         Data,
         sensor=NAMES,
         epoch=COUNTS,
-        sequence=COUNTS,
+        sequence=NUMBERS,
         sync_count=INT64,
         timestamp_ns=INT64,
         uncertainty_ns=UINT32,
@@ -72,7 +73,7 @@ def test_each_message_of_the_table_has_its_own_kind():
         Hello,
         sensor=NAMES,
         epoch=COUNTS,
-        next_sequence=COUNTS,
+        next_sequence=NUMBERS,
         settings_crc32=UINT32,
         translation_m=st.tuples(FINITE, FINITE, FINITE),
     )
@@ -80,9 +81,9 @@ def test_each_message_of_the_table_has_its_own_kind():
         Ack,
         sensor=NAMES,
         epoch=COUNTS,
-        settled=st.integers(-1, 2**63 - 1),
+        settled=st.integers(-1, 2**48),
         status=st.sampled_from(["stored", "accepted"]),
-        dropped=st.lists(st.tuples(COUNTS, REASONS), max_size=8).map(tuple),
+        dropped=st.lists(st.tuples(NUMBERS, REASONS), max_size=8).map(tuple),
     )
     | st.builds(
         Subscribe,
@@ -148,6 +149,7 @@ def test_a_message_that_is_not_expected_is_refused():
         ("sensor", 7),
         ("epoch", -1),
         ("epoch", 2**63),
+        ("sequence", 2**48 + 1),
         ("sequence", -1),
         ("sequence", 1.5),
         ("sequence", True),

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ertis_numba.errors import NetworkError
+from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.messages import Image, Points
 from ertis_numba.network.processing import Options, Processing
@@ -196,3 +196,12 @@ def test_points_are_made_only_where_somebody_wants_them():
         assert loop.processing.counts("right").published == 1
     assert [type(message) for message, _ in application.got] == [Points]
     assert not any(isinstance(message, Image) for message, _ in application.got)
+
+
+def test_threads_of_one_measurement_change_its_image_by_nothing():
+    with Pipeline(SHORT, device="cpu") as pipeline:
+        wanted = pipeline.process(MEASUREMENT)
+        assert np.array_equal(pipeline.process(MEASUREMENT, threads=1).energy, wanted.energy)
+        with pytest.raises(ArgumentError, match="threads is 0"):
+            pipeline.process(MEASUREMENT, threads=0)
+        assert np.array_equal(pipeline.process(MEASUREMENT).energy, wanted.energy)

@@ -4,10 +4,9 @@ import time
 from types import TracebackType
 from typing import Final, Self
 
-import msgspec
 import zmq
 
-from ertis_numba.errors import DataError, NetworkError, RefusedError
+from ertis_numba.errors import NetworkError, RefusedError
 from ertis_numba.network import addresses, messages, sockets
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import AskStatus, Refused, Report
@@ -118,7 +117,4 @@ def _read(frames: list[bytes]) -> Status | None:
         raise RefusedError(message.reason)
     if not isinstance(message, Report):
         return None
-    try:
-        return msgspec.msgpack.decode(b"".join(frames[1:]), type=Status)
-    except msgspec.MsgspecError as error:
-        raise DataError(f"the status cannot be read ({error}); use the same release of ertis-numba on both") from error
+    return Status.decode(b"".join(frames[1:]))

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,7 +134,7 @@ class ProductReader:
         if isinstance(header, Group):
             return header
         if isinstance(header, Report):
-            return _status(payload)
+            return Status.decode(b"".join(payload))
         described = self._of(header.description)
         stamp = Stamp(
             sensor=header.sensor,
@@ -191,13 +190,6 @@ def _measurement(header: Raw, payload: Payload, described: _Described, stamp: St
         pressure_pa=header.pressure_pa,
     )
     return Measurement(words, settings if air == settings.air else settings.replace(air=air), stamp)
-
-
-def _status(payload: Payload) -> Status:
-    try:
-        return msgspec.msgpack.decode(b"".join(payload), type=Status)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(f"a status cannot be read ({' '.join(str(error).split())[:200]})") from error
 
 
 def _array(payload: Payload, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:

@@ -1,9 +1,11 @@
 """How a central node is: what `ertis status` shows, applications subscribe to, and metrics are made of."""
 
 from collections import deque
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
+
+from ertis_numba.errors import DataError
 
 __all__ = [
     "ArchiveStatus",
@@ -15,6 +17,9 @@ __all__ = [
     "SubscriberStatus",
     "WorkerStatus",
 ]
+
+
+_MOST: Final = 2**63 - 1
 
 
 class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -156,3 +161,33 @@ class Status(msgspec.Struct, kw_only=True):
     sensors: dict[str, SensorStatus] = {}
     archive: ArchiveStatus | None = None
     processing: ProcessingStatus | None = None
+
+    def encode(self) -> bytes:
+        """Return MessagePack; counts that somebody has driven beyond 64 bits are told as the highest there is."""
+        try:
+            return msgspec.msgpack.encode(self)
+        except OverflowError:
+            return msgspec.msgpack.encode(_clamped(msgspec.to_builtins(self)))
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """Return what was encoded.
+
+        Raises
+        ------
+        DataError
+            It is no status.
+        """
+        try:
+            return msgspec.msgpack.decode(data, type=cls)
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            told = " ".join(str(error).split())
+            raise DataError(f"a status cannot be read ({told}); use the same release of ertis-numba on both") from error
+
+
+def _clamped(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _clamped(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clamped(item) for item in value]
+    return min(value, _MOST) if isinstance(value, int) else value

@@ -11,7 +11,6 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Any, Final, Literal, Protocol, Self
 
-import msgspec
 import zmq
 
 from ertis_numba import checks
@@ -338,7 +337,7 @@ class CentralNode:
             case Bye():
                 self._drop(sender)
             case AskStatus():
-                self._send(sender, Report(), msgspec.msgpack.encode(self.status()))
+                self._send(sender, Report(), self.status().encode())
 
     def _drop(self, peer_id: bytes) -> None:
         self._badges.pop(peer_id, None)

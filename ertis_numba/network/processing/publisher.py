@@ -4,8 +4,6 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from ertis_numba.errors import NetworkError
 from ertis_numba.network.log import Log
 from ertis_numba.network.messages import Description, Group
@@ -139,7 +137,7 @@ class Publisher:
         """Tell how the central node is, if what was told before has been taken."""
         if self._child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
             self._reports_sent += 1
-            self._child.pipe.send(notes.Report(status=msgspec.msgpack.encode(status)))
+            self._child.pipe.send(notes.Report(status=status.encode()))
 
     def fds(self) -> Iterable[int]:
         """Return what is to be polled now."""

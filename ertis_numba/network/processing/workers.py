@@ -33,8 +33,8 @@ __all__ = ["Workers"]
 _MODULE: Final = "ertis_numba.network.processing._worker"
 _SLOTS: Final = 2  # of each worker: one is processed while the publisher reads the other
 _LOADING_S: Final = 60.0
-_BACK_OFF_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # before a worker that dies again and again is started again
-_TRIES: Final = 2  # workers that may die over getting ready for a kind
+_BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # before a worker that dies again and again is started again
+_TRIES: Final = 3  # workers that may die over getting ready for a kind for which none has ever been
 _CLOSED_S: Final = 2.0
 
 
@@ -337,7 +337,7 @@ class Workers:
         kind, job, slot = worker.preparing, worker.job, worker.slot
         worker.preparing = worker.job = worker.slot = None
         self._log.warning("worker_died", pid=pid, text="another takes its place")
-        if kind is not None and kind.number in self._kinds:
+        if kind is not None and kind.number in self._kinds and kind.number not in self._prepared:
             self._tries[kind.number] = self._tries.get(kind.number, 0) + 1
             if self._tries[kind.number] >= _TRIES:
                 del self._kinds[kind.number]
