@@ -9,24 +9,28 @@ from dataclasses import replace
 
 import pytest
 from ertis_bench import (
+    machine,
     network_faults,
     network_faults_keys,
     network_faults_kills,
     network_faults_links,
     network_faults_peers,
     network_faults_processing,
+    network_serving,
     network_tables,
     network_zmtp,
     reliability,
 )
 from ertis_bench.network_diary import Diary, Key, Row
-from ertis_bench.network_oracle import compare, read_diaries, read_folder
+from ertis_bench.network_oracle import Sent, compare, read_diaries, read_folder
 from ertis_bench.network_processes import central
-from ertis_bench.network_receiver import read_received
+from ertis_bench.network_receiver import Received, read_received
 from ertis_bench.network_sender import SMALL, Job, words_of
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.network.messages import Group
+from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.storage import RecordingWriter, open_recording
 from tests.files import noise
 
@@ -62,33 +66,35 @@ if "record" in sys.argv:
 """
 
 
-def wrong_in(found):
+def wrong_in(part, found):
+    """What ought to be 0 and is not; that it can be told is tried as well."""
+    assert all(network_tables.row(part, found))
     return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
 
 
 def test_killed_central_nodes(tmp_path):
     found = network_faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"])
-    assert wrong_in(found) == {}
+    assert wrong_in("centrals", found) == {}
     assert (found["orphans"], found["unsettled"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
 
 
 def test_killed_sensor_nodes(tmp_path):
     found = network_faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
-    assert wrong_in(found) == {}
+    assert wrong_in("nodes", found) == {}
     assert (found["in_spool"], found["orphans"]) == (0, 0)
     assert found["promised"] > 5 * N_KILLS["nodes"]
 
 
 def test_killed_sealings(tmp_path):
     found = network_faults_kills.sealings(tmp_path, seed=SEED, count=2)
-    assert wrong_in(found) == {}
+    assert wrong_in("sealings", found) == {}
     assert found["kills"] == 2
 
 
 def test_killed_workers(tmp_path):
     found = network_faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
-    assert wrong_in(found) == {}
+    assert wrong_in("workers", found) == {}
     assert {name: found[name] for name in ("unbalanced", "uncounted", "untold", "disordered", "foreign")} == {
         "unbalanced": 0, "uncounted": 0, "untold": 0, "disordered": 0, "foreign": 0,
     }  # fmt: skip
@@ -106,7 +112,7 @@ def test_a_full_disk(tmp_path):
         if mounted is None:
             pytest.skip("only root may mount a small disk")
         found = network_faults_links.disk_full(tmp_path, mounted, seed=SEED)
-    assert wrong_in(found) == {}
+    assert wrong_in("disk_full", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
     assert "free" in found["said"]
@@ -114,14 +120,14 @@ def test_a_full_disk(tmp_path):
 
 def test_a_disk_that_fails(tmp_path):
     found = network_faults_links.disk_fails(tmp_path, seed=SEED)
-    assert wrong_in(found) == {}
+    assert wrong_in("disk_fails", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
 
 
 def test_lost_acks_and_dead_cables(tmp_path):
     found = network_faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
-    assert wrong_in(found) == {}
+    assert wrong_in("meddled", found) == {}
     assert found["flushed"]
     assert {"ack lose", "ack repeat", "ack delay"} <= found["meddled"].keys()
 
@@ -133,13 +139,13 @@ def test_keys(tmp_path):
     assert found["removed, s"] < 1.0
     assert found["unsettled when removed"] > 0
     assert {"unknown key", "no key", "role", "serial", "removed key"} <= found["refused"].keys()
-    assert wrong_in(found) == {}
+    assert wrong_in("keys", found) == {}
     assert found["notes"]
 
 
 def test_malformed_messages(tmp_path):
     found = network_faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
-    assert wrong_in(found) == {}
+    assert wrong_in("fuzzed", found) == {}
     assert (found["inputs"], found["restarts"], found["exit code"]) == (10_000, 0, 0)
     assert found["answers"] > 100
     assert found["flushed"]
@@ -263,6 +269,42 @@ def test_images_are_counted(tmp_path):
     found = read_received(path)
     assert (found.twice, found.disordered, found.wrong, found.dropped, found.untold) == (1, 0, 1, 1, 1)
     assert found.times_ms == {Key("a", 1, 0): 2.0, Key("a", 1, 3): 4.0}
+
+
+def test_accounts_that_do_not_add_up_are_told():
+    sensors = {"a": SensorStatus(received=9, published=5, dropped={"superseded": 3}, in_flight=0)}
+    status = Status(version="", pid=1, host="", address="", state="processing", sensors=sensors)
+    serve = network_serving.Serve(None, "", "", "", None, latest=status)
+    told = Sent(kept={Key("a", 1, number) for number in range(10)}, offered={Key("a", 1, 0): Row(0, 0, 0)})
+    received = Received(times_ms={Key("a", 1, 0): 1.0, Key("b", 1, 0): 1.0}, numbers=[0, 1, 4], dropped=1, wrong=1)
+    found = network_serving.accounts(serve, told, received)
+    assert (found["unbalanced"], found["uncounted"], found["foreign"], found["wrong"]) == (1, 1, 1, 1)
+    assert found["untold"] == 1 + 1  # five were published, three came, one was told; numbers 2 and 3 are not there
+
+
+def test_mixed_groups_are_found():
+    pulse_of = {(sensor, number): number + (sensor == "b" and number > 2) for sensor in "ab" for number in range(6)}
+    came = [
+        Group(number=number, dropped=0, group=number, members=members, missing=(), spread_ns=0, flags=flags)
+        for number, (members, flags) in enumerate(
+            (
+                ((("a", 1, 0), ("b", 2, 0)), ()),
+                ((("a", 1, 3), ("b", 2, 3)), ()),  # of the fourth and the fifth pulse
+                ((("a", 1, 4), ("b", 2, 3)), ("clock",)),
+                ((("a", 1, 3),), ("incomplete", "pulse")),
+            )
+        )
+    ]
+    at = {"lost": 2, "double": 3, "clock": 4}
+    found = network_faults_processing.grouped(came, pulse_of, at, n_sensors=2, count=6)
+    assert (found["complete"], found["mixed"], found["clock flags after"], found["flagged pulses"]) == (2, 1, 1, [3])
+    assert all(network_tables.row("groups", found))
+
+
+def test_a_part_that_could_not_be_tried_is_told():
+    assert network_tables.row("hosts", None)[2] == "not tried: only root may"
+    report = {"machine": machine.describe(), "seed": 3, "long": False, "only": ["hosts"], "hosts": None}
+    assert "By `ertis bench network-faults --only hosts --seed 3`." in network_tables.network_faults(report)
 
 
 def test_frames_survive_any_cut():

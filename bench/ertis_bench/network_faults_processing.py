@@ -19,7 +19,7 @@ from ertis_bench.network_serving import Serve, accounts, expected_of, some_words
 from ertis_numba.network.messages import Group
 from ertis_numba.network.subscriber import Subscriber
 
-__all__ = ["groups", "workers"]
+__all__ = ["grouped", "groups", "workers"]
 
 _DIRECTIONS: Final = "2d:9"
 _WHILE_STARTING: Final = 0.1  # share of the workers that are killed before they can do anything
@@ -116,10 +116,10 @@ def groups(folder: Path, *, seed: int, count: int) -> Found:
         for pulse in range(count)
         if pulse != each.lost_pulse
     }
-    return _grouped(came, pulse_of, at, n_sensors=len(jobs), count=count) | {"tracebacks": tracebacks(folder)}
+    return grouped(came, pulse_of, at, n_sensors=len(jobs), count=count) | {"tracebacks": tracebacks(folder)}
 
 
-def _grouped(
+def grouped(
     came: list[Group], pulse_of: dict[tuple[str, int], int], at: dict[str, int], *, n_sensors: int, count: int
 ) -> Found:
     """Compare groups with the pulses that measurements were made at."""

@@ -6,7 +6,7 @@ from typing import Any, Final
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 
-__all__ = ["ROWS", "network", "network_faults"]
+__all__ = ["ROWS", "network", "network_faults", "row"]
 
 _STORED: Final = "{stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong, {silent} unexplained"
 _NOT_HERE: Final = "not tried: only root may"
@@ -122,20 +122,21 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
 
 def network_faults(report: dict[str, Any]) -> str:
     """Return what was tried and what became of it, with the seed that tries it again."""
-    rows = [_row(texts, report[name]) for name, texts in ROWS.items() if name in report]
+    rows = [row(name, report[name]) for name in ROWS if name in report]
     options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
     made = " ".join(["ertis bench network-faults", *options, f"--seed {report['seed']}"])
     return f"{table(('fault', 'wanted', 'found'), rows, numbers=False)}\n\nBy `{made}`. {sentence(report['machine'])}"
 
 
-def _row(texts: tuple[str, str, str], found: Mapping[str, Any] | None) -> tuple[str, str, str]:
-    tried, wanted, became = texts
+def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
+    """Return what was tried, wanted and found in one of the parts; None where it could not be tried."""
+    tried, wanted, became = ROWS[name]
     if found is None:
         return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
     values = dict(found)
     values["faults"] = sum(found.get("meddled", {}).values())
-    for name in ("dropped", "refused", "let in"):
-        values[f"{name} all"] = _all(found.get(name))
+    for field in ("dropped", "refused", "let in"):
+        values[f"{field} all"] = _all(found.get(field))
     return tried.format(**values), wanted, became.format(**values)
 
 
