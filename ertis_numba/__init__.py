@@ -41,9 +41,12 @@ if TYPE_CHECKING:
         SonarGoneError,
     )
     from ertis_numba.figures import plot
-    from ertis_numba.frames import Energyscape, Measurement, Peak, Reflector, Stamp
+    from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import open_raw
+    from ertis_numba.network.keys import ClientKeys, KeyPair
+    from ertis_numba.network.sensor_node import SensorNode
+    from ertis_numba.network.subscriber import Subscriber
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
     from ertis_numba.simulation.render import Simulator, render
@@ -57,6 +60,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ArgumentError",
+    "ClientKeys",
     "DamagedError",
     "DataError",
     "DeviceError",
@@ -65,13 +69,16 @@ __all__ = [
     "ErtisError",
     "FormatVersionError",
     "InUseError",
+    "KeyPair",
     "Measurement",
     "NetworkError",
     "Peak",
     "Pipeline",
+    "PointCloud",
     "Reflector",
     "RefusedError",
     "Scene",
+    "SensorNode",
     "Settings",
     "SettingsError",
     "Setup",
@@ -80,6 +87,7 @@ __all__ = [
     "SonarError",
     "SonarGoneError",
     "Stamp",
+    "Subscriber",
     "compare",
     "find_peaks",
     "health",
@@ -113,9 +121,12 @@ _HOMES = {
         "SonarGoneError",
     ),
     "figures": ("plot",),
-    "frames": ("Energyscape", "Measurement", "Peak", "Reflector", "Stamp"),
+    "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("open_raw",),
+    "network.keys": ("ClientKeys", "KeyPair"),
+    "network.sensor_node": ("SensorNode",),
+    "network.subscriber": ("Subscriber",),
     "pipeline": ("Pipeline",),
     "settings": ("Settings",),
     "simulation.render": ("Simulator", "render"),

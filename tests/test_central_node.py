@@ -3,6 +3,7 @@
 import random
 from collections import Counter
 from types import SimpleNamespace
+from typing import ClassVar
 
 import msgspec
 import pytest
@@ -301,6 +302,8 @@ def test_a_key_that_is_removed_is_not_heard_any_more(tmp_path):
 
 class Images:
     """Stands for what makes images."""
+
+    refused: ClassVar = {}
 
     def __init__(self):
         self.known, self.offered = [], []

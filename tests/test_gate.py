@@ -272,7 +272,9 @@ def test_nobody_is_in_a_list_that_cannot_be_read(door, spoil):
 
 
 @pytest.mark.parametrize(
-    "text", [None, "keys = 7", f'[[keys]]\nname = "robot"\npublic = "{ROBOT.public}"\nrole = "sensor"\n']
+    "text",
+    [None, "keys = 7", f'[[keys]]\nname = "robot"\npublic = "{ROBOT.public}"\nrole = "sensor"\n'],
+    ids=["missing", "no_list", "no_serials"],
 )
 def test_a_list_that_cannot_be_used_at_the_start_is_told(tmp_path, text):
     path = tmp_path / "allow.toml"

@@ -158,6 +158,7 @@ def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatc
         (f'name = "../robot"\npublic = "{PAIR.public}"\nsecret = "{PAIR.secret}"\n', "cannot be that of a key"),
         ("name = ", "robot.secret.toml"),
     ],
+    ids=["empty", "no_keys", "not_its_own", "path", "no_toml"],
 )
 def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, told):
     path = tmp_path / "robot.secret.toml"
@@ -179,7 +180,11 @@ def test_a_name_that_is_no_name_of_a_file_is_refused(name):
         KeyPair.new(name)
 
 
-@pytest.mark.parametrize("key", ["", "short", "~" * 40, "#" * 40, PAIR.public[:-1], PAIR.public + "0"])
+@pytest.mark.parametrize(
+    "key",
+    ["", "short", "~" * 40, "#" * 40, PAIR.public[:-1], PAIR.public + "0"],
+    ids=["none", "word", "no_z85", "too_much", "39", "41"],
+)
 def test_a_key_that_is_none_is_refused(key):
     with pytest.raises(ArgumentError, match="is none; give the 40 characters"):
         ClientKeys(PAIR, key)

@@ -120,15 +120,15 @@ def serve(
         on_stored=watch.stored if as_json and every else None,
     )
     stop = threading.Event()
-    with stopped_by_signals() as signals, node, ExitStack() as stack:
+    with stopped_by_signals() as signals, ExitStack() as stack:
+        signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
+        stack.enter_context(node)
         if metrics is not None:
             from ertis_numba.network.metrics import Metrics
 
             stack.enter_context(Metrics(metrics, lambda: node.latest))
-        signals.obey(stop.set)
         with watch.shows(lambda: node.latest):
             node.run(stop, duration)
-        stack.close()
     _report(node.status(), watch.recordings, quiet=quiet, as_json=as_json)
 
 

@@ -5,7 +5,7 @@ import socket as names
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from types import TracebackType
@@ -64,6 +64,10 @@ class ImageCounts(Protocol):
 
 class Images(Viewer, Protocol):
     """What makes images, as `ertis_numba.network.processing.Processing` does."""
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Applications that were refused, by reason."""
 
     def start(self) -> None:
         """Begin."""
@@ -423,7 +427,7 @@ class CentralNode:
             memory_bytes=_memory_bytes(),
             peers=len(self._intake.peers),
             keys=self._keys is not None,
-            refused=dict(self._refused),
+            refused=dict(self._refused + Counter({} if self._processing is None else self._processing.refused)),
             sensors={name: track.status() for name, track in self._intake.tracks.items()},
         )
         if self._archive is not None:

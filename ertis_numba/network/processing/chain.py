@@ -1,7 +1,6 @@
 """What a worker, of this machine or of a cluster, does with a measurement."""
 
 import statistics
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -44,8 +43,7 @@ class Chain:
         layout = microphones(self.pipeline.settings.array)
         self._dtype = np.dtype(f"<u{layout.word_bits // 8}")
         self._words_shape = (self.pipeline.settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
-        self._extractor: PointExtractor | None = None
-        self._turn = threading.Lock()
+        self._extractor = PointExtractor(self.pipeline.settings)
 
     def image(
         self, words: "bytes | memoryview", out: NDArray[np.float32] | None = None, *, threads: int | None = None
@@ -64,9 +62,6 @@ class Chain:
 
     def points(self, image: Energyscape, most: int) -> NDArray[np.float32]:
         """Return the points of an image, ``(point, 4)``: x, y, z in m and the energy; the strongest come first."""
-        with self._turn:  # its tables are made when somebody wants points for the first time
-            if self._extractor is None:
-                self._extractor = PointExtractor(self.pipeline.settings)
         cloud = self._extractor(image)
         rows: NDArray[np.float32] = np.column_stack([cloud.position_m, cloud.energy]).astype("<f4")[:most]
         return rows
