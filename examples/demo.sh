@@ -35,7 +35,9 @@ set -x
 ertis devices
 ertis capture --port front --port left --port back --port right --trigger sync -n 50 --to "$central" --mounting examples/platform.toml
 ertis status "$central"
-{ end; set -x; } 2>/dev/null
+{ set +x; } 2>/dev/null
+end
+set -x
 
 ertis verify demo/recordings/*.h5
 ertis process demo/recordings/*.h5 --sensor front --output demo/image.h5 --directions 2d:181 --force

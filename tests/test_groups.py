@@ -20,9 +20,9 @@ class Platform:
         self.shift = {}  # of its count
         self.runs = dict(runs)  # sensor: epoch
 
-    def know(self):
+    def know(self, before_ns=2 * 10**9):
         for sensor in self.runs:
-            self.groups.know(sensor, 10**12)
+            self.groups.know(sensor, 10**12 - before_ns)
 
     def pulse(self, number, *, without=(), late=0):
         at_ns = 10**12 + number * INTERVAL_NS
@@ -52,6 +52,18 @@ def four():
     made = Platform(*((name, 1) for name in "abcd"))
     made.know()
     return made
+
+
+def test_no_group_is_whole_while_sensors_still_come():
+    platform = Platform(("a", 1))
+    platform.know(0)
+    platform.pulse(0)
+    platform.runs["b"] = 1
+    platform.know(0)
+    platform.pulse(0, without=("a",))
+    assert not platform.closed
+    platform.wait(25)
+    assert platform.told() == [(0, ("a", "b"), ())]
 
 
 def test_a_group_is_closed_when_all_have_come(four):
@@ -149,7 +161,7 @@ def test_a_measurement_that_comes_too_late_is_counted(four):
     four.wait(20)
     four.runs = {"d": 1}
     four.pulse(0)
-    assert four.groups.closed == {"incomplete": 1, "late": 1}
+    assert four.groups.closed == {"incomplete": 1, "measurement too late": 1}
 
 
 def test_runs_that_come_and_go_are_forgotten(four):

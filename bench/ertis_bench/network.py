@@ -242,14 +242,13 @@ def _settings(directions: str) -> Settings:
 
 
 def _overload(folder: Path, duration_s: float, seed: int) -> Found:
-    """Send twice as much as was published when there was more than enough."""
+    """Send twice as much as images were made of when there was more than enough."""
     (folder / "calibration").mkdir()
     (folder / "overload").mkdir()
     goal = "received = published + dropped; latency bounded"
     options: dict[str, Any] = {"directions": "3000", "n_sensors": 4, "goal": goal, "part": "overload 2×", "credit": 8}
     most = processing(folder / "calibration", 8.0, seed, rate_hz=40.0, **options)
-    times = most["images"] / max(1, most["sent"])
-    rate_hz = round(2 * times * 40.0, 1)
+    rate_hz = round(2 * 40.0 * most["published"] / max(1, most["sent"]), 1)
     return processing(folder / "overload", duration_s, seed, rate_hz=rate_hz, **options)
 
 

@@ -47,7 +47,7 @@ class Groups:
     Attributes
     ----------
     closed : Counter of str
-        Groups by ``complete``, or their flags; ``late`` are measurements of groups that were closed already.
+        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of groups that were closed already.
     """
 
     def __init__(self) -> None:
@@ -59,11 +59,14 @@ class Groups:
         self._groups: dict[int, _Group] = {}
         self._recent: deque[int] = deque(maxlen=_RECENT)
         self._realigned = 0
+        self._joined_ns: int | None = None  # when the latest sensor that was not known came
         self._ahead_ns: int | None = None  # of the clock of all, to the one of this node
         self.closed: Counter[str] = Counter()
 
     def know(self, sensor: str, now_ns: int) -> None:
         """Wait for a sensor from now on."""
+        if sensor not in self._seen_ns:
+            self._joined_ns = now_ns
         self._seen_ns[sensor] = now_ns
 
     def add(self, data: Data, arrived_ns: int) -> list[Group]:
@@ -100,7 +103,7 @@ class Groups:
         self._realigned = self._pulses.realigned
         for (data, arrived_ns), number in found:
             if number in self._recent or (self._recent and number < min(self._recent)):
-                self.closed["late"] += 1
+                self.closed["measurement too late"] += 1
                 continue
             group = self._groups.setdefault(number, _Group(arrived_ns))
             if realigned or data.sensor in group.members:
@@ -111,10 +114,12 @@ class Groups:
         """Close groups in order: one closes when it is complete, too old, or followed by too many."""
         patience_ns = max(_LEAST_S * 1e9, _INTERVALS * self._pulses.interval_ns)
         sensors = {name for name, seen_ns in self._seen_ns.items() if now_ns - seen_ns < _AWAY * patience_ns}
+        # Sensors come one after the other at first: until then, nobody knows who is to be waited for.
+        all_here = self._joined_ns is not None and now_ns - self._joined_ns > _LEAST_S * 1e9
         ready = [
             number
             for number, group in self._groups.items()
-            if sensors <= group.members.keys() or now_ns - group.opened_ns > patience_ns
+            if (all_here and sensors <= group.members.keys()) or now_ns - group.opened_ns > patience_ns
         ]
         while len(self._groups) - len(ready) > _OPEN:
             ready.append(min(self._groups.keys() - set(ready)))

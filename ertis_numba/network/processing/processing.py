@@ -20,7 +20,7 @@ from ertis_numba.network.processing.groups import Groups
 from ertis_numba.network.processing.options import Options
 from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.processing.quarantine import Quarantine
-from ertis_numba.network.processing.queues import Counts, Queues
+from ertis_numba.network.processing.queues import SUPERSEDED, Counts, Queues
 from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, Runner, bytes_of
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.workers import Workers
@@ -32,6 +32,7 @@ __all__ = ["Processing"]
 _RATE_S: Final = 3.0  # over which the load is told
 _TRIES: Final = 2
 _ENDED: Final = "the central node ended"
+_GETTING_READY: Final = "the workers were getting ready"
 _FAILED_TWICE: Final = "failed twice"
 _PUBLISHER_DIED: Final = "the publisher died"
 _REFUSED: Final = "it cannot be processed"
@@ -129,7 +130,8 @@ class Processing:
             counts.drop(_UNUSABLE)
             return
         self._n_jobs += 1
-        self._queues.add(Job(self._n_jobs, data, words, kind, arrived_ns))
+        reason = SUPERSEDED if self._sensors.is_ready(kind) else _GETTING_READY
+        self._queues.add(Job(self._n_jobs, data, words, kind, arrived_ns), reason)
         self._dispatch()
 
     def fds(self) -> Iterable[int]:

@@ -8,7 +8,7 @@ from typing import Final
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.status import Latencies, Percentiles
 
-__all__ = ["Counts", "Queues"]
+__all__ = ["SUPERSEDED", "Counts", "Queues"]
 
 _QUEUE: Final = 2  # measurements of a sensor that wait; the oldest gives way to a new one
 SUPERSEDED: Final = "superseded"
@@ -63,8 +63,8 @@ class Queues:
         """Return the counts of a sensor, which begin with 0."""
         return self.counts.setdefault(sensor, Counts())
 
-    def add(self, job: Job) -> None:
-        """Let a measurement wait; the oldest of its sensor is dropped if there are too many."""
+    def add(self, job: Job, reason: str = SUPERSEDED) -> None:
+        """Let a measurement wait; the oldest of its sensor is dropped, for a reason, if there are too many."""
         sensor = job.data.sensor
         counts = self.counts_of(sensor)
         counts.received += 1
@@ -72,7 +72,7 @@ class Queues:
         waiting = self._waiting.setdefault(sensor, deque())
         if len(waiting) == _QUEUE:
             waiting.popleft()
-            counts.drop(SUPERSEDED)
+            counts.drop(reason)
         waiting.append(job)
         counts.queue = len(waiting)
 

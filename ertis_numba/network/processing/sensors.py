@@ -94,6 +94,10 @@ class Sensors:
         kind = self._known[data.sensor].kind
         return None if kind is None or kind.number in self._unusable else kind
 
+    def is_ready(self, kind: Kind) -> bool:
+        """Whether a worker has been ready for a kind."""
+        return kind.number in self._prepared
+
     def became_ready(self, prepared: Prepared) -> None:
         """Take what a pipeline has told of itself."""
         self._prepared[prepared.kind] = prepared
