@@ -47,7 +47,8 @@ class Groups:
     Attributes
     ----------
     closed : Counter of str
-        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of groups that were closed already.
+        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of groups that were
+        closed already.
     """
 
     def __init__(self) -> None:
