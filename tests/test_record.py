@@ -1,6 +1,8 @@
 """``ertis record``: whatever ends it, what it has told is there once."""
 
+import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -8,6 +10,7 @@ import time
 
 import pytest
 from click.testing import CliRunner
+from ertis_cli._lines import Lines
 from ertis_cli.main import cli
 
 from ertis_numba.journal import SUFFIX
@@ -102,3 +105,22 @@ def test_metrics_are_served_while_it_runs(tmp_path):
     result = CliRunner().invoke(cli, [*arguments, "--metrics", "127.0.0.1:0"])
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
+
+
+def test_who_does_not_read_its_events_holds_nothing_up():
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w", encoding="utf-8") as stream:
+        lines = Lines(stream, most=1000)
+        begun_s = time.monotonic()
+        for number in range(100_000):
+            lines.write(f"line {number}\n")
+        assert time.monotonic() - begun_s < 5.0
+        assert 0 < lines.lost < 100_000
+        os.set_blocking(reader, False)
+        got = b""
+        while b"line 999\n" not in got:  # now somebody reads
+            with contextlib.suppress(BlockingIOError):
+                got += os.read(reader, 65_536)
+        assert got.startswith(b"line 0\nline 1\n")
+        lines.close()
+    os.close(reader)

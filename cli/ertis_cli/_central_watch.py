@@ -1,13 +1,12 @@
 """What is told while a central node runs."""
 
+import json
 import sys
 import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from ertis_cli import options
+from ertis_cli._lines import Lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +37,8 @@ class CentralWatch:
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
 
-        show(level="CRITICAL" if quiet else "INFO")
+        self._out, self._err = Lines(sys.stdout), Lines(sys.stderr)  # the loop must not wait for who reads them
+        show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
         self._quiet, self._as_json = quiet, as_json
         self._line = sys.stderr.isatty() and not quiet
@@ -51,17 +51,20 @@ class CentralWatch:
         if event["event"] == "sealed" and event["recording"] is not None:
             self.recordings.append(event["recording"])
         if self._as_json:
-            options.print_json(event)
+            self._print(event)
         if self._quiet:
             return
         if self._line:
-            click.echo("\r\x1b[K", err=True, nl=False)
+            self._err.write("\r\x1b[K")
         fields = {name: value for name, value in event.items() if name != "event" and value != ""}
         (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
 
     def stored(self, sensor: str, epoch: int, sequence: int, crc32: int) -> None:
         """Tell of a measurement that is durable."""
-        options.print_json({"event": "stored", "sensor": sensor, "epoch": epoch, "sequence": sequence, "crc32": crc32})
+        self._print({"event": "stored", "sensor": sensor, "epoch": epoch, "sequence": sequence, "crc32": crc32})
+
+    def _print(self, event: dict[str, Any]) -> None:
+        self._out.write(f"{json.dumps(event, allow_nan=False)}\n")
 
     def shows(self, status: "Callable[[], Status]") -> "Self":
         """Draw a line of what is going on, on a terminal, until the ``with`` block ends."""
@@ -80,11 +83,18 @@ class CentralWatch:
         if self._thread is not None:
             self._ended.set()
             self._thread.join()
-            click.echo("\r\x1b[K", err=True, nl=False)
+            self._err.write("\r\x1b[K")
+
+    def close(self) -> None:
+        """Bring out what is still to be told."""
+        if self._out.lost:
+            self._print({"event": "untold", "count": self._out.lost})
+        self._out.close()
+        self._err.close()
 
     def _draw(self, status: "Callable[[], Status]") -> None:
         while not self._ended.wait(_REFRESH_S):
-            click.echo(f"\r\x1b[K{_progress(status())}", err=True, nl=False)
+            self._err.write(f"\r\x1b[K{_progress(status())}")
 
 
 def _progress(status: "Status") -> str:

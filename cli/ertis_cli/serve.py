@@ -121,6 +121,7 @@ def serve(
     )
     stop = threading.Event()
     with stopped_by_signals() as signals, ExitStack() as stack:
+        stack.callback(watch.close)
         signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
         stack.enter_context(node)
         if metrics is not None:

@@ -5,13 +5,23 @@ import logging
 import re
 import sys
 from datetime import UTC, datetime
-from typing import IO, Any, Final
+from typing import Any, Final, Protocol
 
 __all__ = ["Log", "Logfmt", "NDJson", "logger", "show"]
 
 _ROOT: Final = "ertis.network"
 _FIELDS: Final = "ertis_fields"
 _BARE: Final = re.compile(r"[^\s\"=\\]+")
+
+
+class Writable(Protocol):
+    """Where lines go."""
+
+    def write(self, text: str, /) -> object:
+        """Take text."""
+
+    def flush(self) -> object:
+        """Bring out what was taken."""
 
 
 class Log:
@@ -55,7 +65,7 @@ def logger(name: str) -> Log:
     return Log(name)
 
 
-def show(*, as_json: bool = False, level: str = "INFO", stream: IO[str] | None = None) -> None:
+def show(*, as_json: bool = False, level: str = "INFO", stream: Writable | None = None) -> None:
     """Write events as lines to ``stream``, stderr by default; what was shown before is not any more."""
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(NDJson() if as_json else Logfmt())
