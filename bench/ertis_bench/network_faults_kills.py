@@ -18,6 +18,10 @@ __all__ = ["Record", "centrals", "judged", "nodes", "sealings", "tracebacks"]
 
 _GONE_S: Final = 30.0  # for what a killed process has started
 _ROTATE_MB: Final = 16
+_LINES_TO_LISTEN: Final = 2_500  # of code that a central node runs until it listens, about
+_LINES_TO_BEGIN: Final = 1_000  # and a sensor node until it sends
+_LINES_OF_A_LIFE: Final = 12_000  # in a second of either, about
+_LIFE_S: Final = 1.0  # of a process that has not come so far
 _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
 
@@ -45,11 +49,10 @@ class Record:
         self.archive.mkdir(exist_ok=True)
         self.address, self.mark = free_address(), secrets.token_hex(8)
 
-    def start(self) -> Process:
-        """Start it; it need not listen yet."""
-        return central(
-            "record", self.folder, "-o", str(self.archive), *self._options, listen=self.address, mark=self.mark
-        )
+    def start(self, *, most_lines: int | None = None) -> Process:
+        """Start it, to be killed after some lines of its code; it need not listen yet."""
+        options = ("-o", str(self.archive), *self._options)
+        return central("record", self.folder, *options, listen=self.address, mark=self.mark, most_lines=most_lines)
 
     def finish(self, senders: list[Process], *, timeout_s: float = 120.0) -> Found:
         """Start it once more, let senders end, which brings all that they still have, and let it seal.
@@ -101,25 +104,40 @@ def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path]
 
 
 def centrals(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill a central node at random moments while two sensors send to it, also while it starts, rotates and seals."""
+    """Kill a central node while two sensors send to it, also while it starts, rotates and seals.
+
+    Half of the kills come at a random moment, the others before a random line of code.
+    """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     record = Record(folder, "--rotate-size", str(_ROTATE_MB))
-    diary = folder / "sender.ndjson"
+    diary, by_line = folder / "sender.ndjson", 0
     job = Job(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=40.0, seed=seed)
     with job.replace(ring_bytes=_RING_BYTES, patience_s=60.0).start() as sender:
         sender.wait_for("begun")
         for _ in range(count):
-            with record.start() as node:
-                if rng.random() < 0.8:  # others are killed while they start
-                    node.wait_for("listening")
-                time.sleep(rng.uniform(0.0, 0.5))
+            most_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
+            with record.start(most_lines=most_lines) as node:
+                if most_lines is not None:
+                    by_line += node.ends_within(_LIFE_S)
+                else:
+                    if rng.random() < 0.8:  # others are killed while they start
+                        node.wait_for("listening")
+                    time.sleep(rng.uniform(0.0, 0.5))
                 node.kill()
         ended = record.finish([sender])
-    return {"kills": count} | ended | judged(folder, record.archive, [diary])
+    return {"kills": count, "before a line": by_line} | ended | judged(folder, record.archive, [diary])
+
+
+def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:
+    """Return after how many lines to kill a process: a third of the times, while it starts."""
+    return rng.randrange(n_first) if rng.random() < 1 / 3 else n_first + rng.randrange(n_more)
 
 
 def nodes(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill sensor nodes at random moments, of which one keeps a spool on disk; that one is to lose nothing at all."""
+    """Kill sensor nodes, of which one keeps a spool on disk; that one is to lose nothing at all.
+
+    Half of the kills come at a random moment, the others before a random line of code.
+    """
     rng = random.Random(seed)  # noqa: S311  as above
     record = Record(folder, "--rotate-size", str(_ROTATE_MB))
     diaries = {name: folder / f"{name}.ndjson" for name in ("spool", "memory")}
@@ -129,22 +147,31 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
     }
     jobs["spool"] = jobs["spool"].replace(spool=str(folder / "spool"))
     (folder / "spool").mkdir()
+    by_line = 0
     with record.start() as node:
         node.wait_for("listening")
         for _ in range((count + 1) // 2):
             with ExitStack() as stack:
-                senders = [stack.enter_context(job.start()) for job in jobs.values()]
-                for sender in senders:
-                    sender.wait_for("begun")
+                lines = _some_lines(rng, _LINES_TO_BEGIN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
+                senders = [stack.enter_context(job.replace(most_lines=lines).start()) for job in jobs.values()]
                 for sender in rng.sample(senders, 2):
-                    time.sleep(rng.uniform(0.0, 0.3))
+                    if lines is not None:
+                        by_line += sender.ends_within(_LIFE_S)
+                    else:
+                        sender.wait_for("begun")
+                        time.sleep(rng.uniform(0.0, 0.3))
                     sender.kill()
         node.stop()
     with jobs["spool"].replace(count=1).start() as sender:
         sender.wait_for("done")
         ended = record.finish([sender])
     found = judged(folder, record.archive, list(diaries.values()), kept=[diaries["spool"]])
-    return {"kills": 2 * ((count + 1) // 2)} | ended | found | {"in_spool": len(list((folder / "spool").iterdir()))}
+    return (
+        {"kills": 2 * ((count + 1) // 2), "before a line": by_line}
+        | ended
+        | found
+        | {"in_spool": len(list((folder / "spool").iterdir()))}
+    )
 
 
 def sealings(folder: Path, *, seed: int, count: int) -> Found:

@@ -55,7 +55,7 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
         status = state_of(listening["address"])
         processing = status["processing"]
         found["restarts"] = processing["respawned"] + processing["publisher_respawned"]
-        found["state"], found["refused"] = status["state"], sum(status["refused"].values())
+        found["state"], found["turned away"] = status["state"], sum(status["refused"].values())
         sender.signal(signal.SIGTERM)
         found["flushed"] = sender.wait_for("sent")["flushed"]
         found["exit code"] = node.stop()

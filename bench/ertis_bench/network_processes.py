@@ -105,6 +105,14 @@ class Process:
         said = self._said.read_text(errors="replace").strip().splitlines()
         return f"it {'runs' if code is None else f'ended with {code}'}, saying {said[-1] if said else 'nothing'!r}"
 
+    def ends_within(self, time_s: float) -> bool:
+        """Wait for some time, and return whether it has ended."""
+        try:
+            self._process.wait(time_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def kill(self) -> None:
         """Kill it, as by kill -9: whatever it has started is not touched."""
         self._process.kill()
@@ -171,7 +179,14 @@ class Process:
             self._process.stdout.close()
 
 
-def central(command: str, folder: Path, *options: str, listen: str = "tcp://127.0.0.1:*", mark: str = "") -> Process:
+def central(
+    command: str,
+    folder: Path,
+    *options: str,
+    listen: str = "tcp://127.0.0.1:*",
+    mark: str = "",
+    most_lines: int | None = None,
+) -> Process:
     """Start ``ertis record`` or ``ertis serve``, which says on ``central.txt`` in a folder what is wrong.
 
     Parameters
@@ -182,8 +197,11 @@ def central(command: str, folder: Path, *options: str, listen: str = "tcp://127.
     *options : str
     listen : str
     mark : str
+    most_lines : int, optional
+        Of its code, after which it is killed.
     """
-    line = [*ERTIS, command, "--listen", listen, *options, "--json", "--quiet"]
+    ertis = ERTIS if most_lines is None else (sys.executable, "-m", "ertis_bench.network_trap", str(most_lines))
+    line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return Process(line, said=folder / "central.txt", mark=mark)
 
 

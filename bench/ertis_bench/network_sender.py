@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ertis_bench.network_diary import Diary, Key, Row
 from ertis_bench.network_processes import Process
+from ertis_bench.network_trap import set_trap
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
 from ertis_numba.network.keys import ClientKeys, KeyPair
@@ -69,6 +70,8 @@ class Job:
         they count twice, so that a number is left out.
     clock_step : (number, seconds), optional
         From which pulse on the clock is wrong, and by how much.
+    most_lines : int, optional
+        Of code of nodes and journals, after which it is killed.
     start_s : float, optional
         When to begin, by `time.monotonic`.
     """
@@ -91,6 +94,7 @@ class Job:
     lost_pulse: int | None = None
     double_pulse: int | None = None
     clock_step: tuple[int, float] | None = None
+    most_lines: int | None = None
     start_s: float | None = None
 
     def replace(self, **changes: Any) -> Self:
@@ -219,6 +223,8 @@ def main(job: Job) -> None:
     keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
     sender = _Sender(job, SMALL if job.small else SETTINGS, Diary(Path(job.diary)))
     signal.signal(signal.SIGTERM, partial(_stop, sender))
+    if job.most_lines is not None:
+        set_trap(job.most_lines)
     with SensorNode(
         job.address,
         keys=keys,

@@ -23,12 +23,14 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
     "centrals": (
         "kill -9 of the central node, mid-stream",
         "0 acked lost, 0 twice",
-        "{kills:,} kills: {acked:,} acked, " + _STORED + ", {left_over} files left over",
+        "{kills:,} kills, {before a line:,} of them before a random line of code: {acked:,} acked, "
+        + _STORED
+        + ", {left_over} files left over",
     ),
     "nodes": (
         "kill -9 of sensor nodes, mid-stream",
         "0 acked lost, 0 twice; with a spool, 0 kept lost",
-        "{kills:,} kills: {promised:,} promised, " + _STORED,
+        "{kills:,} kills, {before a line:,} of them before a random line of code: {promised:,} promised, " + _STORED,
     ),
     "captures": (
         "kill -9 of `ertis capture --to --spool` and of the central node",
@@ -55,7 +57,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
     ),
     "disk_fails": (
         "disk that fails, and is mended",
-        "the same",
+        "no ack, state FAULT, resumes; 0 lost",
         "{acked in fault} acked meanwhile, state {state}; then " + _STORED,
     ),
     "away": (
@@ -66,7 +68,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
     ),
     "stopped": (
         "central node stands still for {away_s:g} s",
-        "the same",
+        "0 lost, 0 twice, memory flat",
         _STORED + "; back in {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times as much as it "
         "holds: {missing too long:,} told to be missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
     ),

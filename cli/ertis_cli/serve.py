@@ -39,7 +39,13 @@ _FOLDER = click.Path(path_type=Path)
     help="Error that images may have, as in -40, or draft, standard, fine, exact; the sensor's own by default.",
 )
 @options.device
-@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32", show_default=True)
+@click.option(
+    "--dtype",
+    type=click.Choice(["float32", "float16"]),
+    default="float32",
+    show_default=True,
+    help="Of the images that are sent; float16 halves them.",
+)
 @click.option(
     "--deadline", type=float, default=2.0, show_default=True, metavar="S", help="A worker that takes longer is killed."
 )

@@ -1,0 +1,50 @@
+"""A node that kills itself before a line of its own code: ``python -m ertis_bench.network_trap LINES COMMAND …``.
+
+Most of a node's time goes by inside few calls, so that a kill at a random moment hardly ever comes between two lines.
+"""
+
+import os
+import runpy
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import ertis_numba
+
+__all__ = ["set_trap"]
+
+_PACKAGE: Final = Path(ertis_numba.__file__).parent
+_OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "atomic.py"))
+
+
+def set_trap(most_lines: int) -> None:
+    """Kill this process when so many lines of nodes and journals have run, in this thread and those to come."""
+    count = 0
+
+    def line(_frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
+        nonlocal count
+        count += event == "line"
+        if count > most_lines:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return line
+
+    def call(frame: FrameType, _event: str, _argument: object) -> Callable[..., Any] | None:
+        return line if frame.f_code.co_filename.startswith(_OURS) else None
+
+    threading.settrace(call)
+    sys.settrace(call)
+
+
+def _main() -> None:
+    most_lines = int(sys.argv[1])
+    sys.argv[:2] = ["ertis"]
+    set_trap(most_lines)
+    runpy.run_module("ertis_cli", run_name="__main__")
+
+
+if __name__ == "__main__":
+    _main()
