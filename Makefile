@@ -58,9 +58,11 @@ bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench factorisation --update docs/accuracy.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 	$(BIN)/ertis bench simulation --update bench/README.md
+	$(BIN)/ertis bench network --duration 300 --update docs/network.md
 
-soak: $(VENV)/ready  ## an hour of faults, kills and full disks; SEED=N for the same ones again
+soak: $(VENV)/ready  ## hours of faults, kills and full disks; SEED=N for the same ones again
 	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/reliability.md
+	$(BIN)/ertis bench network-faults --long $(if $(SEED),--seed $(SEED)) --update docs/network.md
 
 gpu: $(VENV)/ready  ## test and measure this machine's NVIDIA GPU, in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'

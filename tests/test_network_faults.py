@@ -8,24 +8,23 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from ertis_bench import (
-    machine,
-    network_faults,
-    network_faults_keys,
-    network_faults_kills,
-    network_faults_links,
-    network_faults_peers,
-    network_faults_processing,
-    network_serving,
-    network_tables,
-    network_zmtp,
-    reliability,
+from ertis_bench import machine, reliability
+from ertis_bench.network import (
+    faults,
+    faults_keys,
+    faults_kills,
+    faults_links,
+    faults_peers,
+    faults_processing,
+    serving,
+    tables,
+    zmtp,
 )
-from ertis_bench.network_diary import Diary, Key, Row
-from ertis_bench.network_oracle import Sent, compare, read_diaries, read_folder
-from ertis_bench.network_processes import central
-from ertis_bench.network_receiver import Received, read_received
-from ertis_bench.network_sender import SMALL, Job, words_of
+from ertis_bench.network.diary import Diary, Key, Row
+from ertis_bench.network.oracle import Sent, compare, read_diaries, read_folder
+from ertis_bench.network.processes import central
+from ertis_bench.network.receiver import Received, read_received
+from ertis_bench.network.sender import SMALL, Job, words_of
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
@@ -68,32 +67,32 @@ if "record" in sys.argv:
 
 def wrong_in(part, found):
     """What ought to be 0 and is not; that it can be told is tried as well."""
-    assert all(network_tables.row(part, found))
+    assert all(tables.row(part, found))
     return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
 
 
 def test_killed_central_nodes(tmp_path):
-    found = network_faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"])
+    found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"])
     assert wrong_in("centrals", found) == {}
     assert (found["orphans"], found["unsettled"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
 
 
 def test_killed_sensor_nodes(tmp_path):
-    found = network_faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
+    found = faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
     assert wrong_in("nodes", found) == {}
     assert (found["in_spool"], found["orphans"]) == (0, 0)
     assert found["promised"] > 5 * N_KILLS["nodes"]
 
 
 def test_killed_sealings(tmp_path):
-    found = network_faults_kills.sealings(tmp_path, seed=SEED, count=2)
+    found = faults_kills.sealings(tmp_path, seed=SEED, count=2)
     assert wrong_in("sealings", found) == {}
     assert found["kills"] == 2
 
 
 def test_killed_workers(tmp_path):
-    found = network_faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
+    found = faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
     assert wrong_in("workers", found) == {}
     assert {name: found[name] for name in ("unbalanced", "uncounted", "untold", "disordered", "foreign")} == {
         "unbalanced": 0, "uncounted": 0, "untold": 0, "disordered": 0, "foreign": 0,
@@ -111,7 +110,7 @@ def test_a_full_disk(tmp_path):
     with reliability.small_disk(disk) as mounted:
         if mounted is None:
             pytest.skip("only root may mount a small disk")
-        found = network_faults_links.disk_full(tmp_path, mounted, seed=SEED)
+        found = faults_links.disk_full(tmp_path, mounted, seed=SEED)
     assert wrong_in("disk_full", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
@@ -119,21 +118,21 @@ def test_a_full_disk(tmp_path):
 
 
 def test_a_disk_that_fails(tmp_path):
-    found = network_faults_links.disk_fails(tmp_path, seed=SEED)
+    found = faults_links.disk_fails(tmp_path, seed=SEED)
     assert wrong_in("disk_fails", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
 
 
 def test_lost_acks_and_dead_cables(tmp_path):
-    found = network_faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
+    found = faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
     assert wrong_in("meddled", found) == {}
     assert found["flushed"]
     assert {"ack lose", "ack repeat", "ack delay"} <= found["meddled"].keys()
 
 
 def test_keys(tmp_path):
-    found = network_faults_keys.keys(tmp_path, seed=SEED)
+    found = faults_keys.keys(tmp_path, seed=SEED)
     assert found["let in"] == ["the listed application", "the listed sensor"]
     assert found["raw"] == 0
     assert found["removed, s"] < 1.0
@@ -144,7 +143,7 @@ def test_keys(tmp_path):
 
 
 def test_malformed_messages(tmp_path):
-    found = network_faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
+    found = faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
     assert wrong_in("fuzzed", found) == {}
     assert (found["inputs"], found["restarts"], found["exit code"]) == (10_000, 0, 0)
     assert found["answers"] > 100
@@ -156,16 +155,16 @@ def test_a_node_that_loses_and_spoils_is_found_out(tmp_path, monkeypatch):
     (tmp_path / "spoiling").mkdir()
     (tmp_path / "spoiling" / "sitecustomize.py").write_text(SPOILING)
     monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
-    record = network_faults_kills.Record(tmp_path)
+    record = faults_kills.Record(tmp_path)
     diary = tmp_path / "sender.ndjson"
     with Job(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
         sender.wait_for("begun")
         record.finish([sender])
-    found = network_faults_kills.judged(tmp_path, record.archive, [diary])
+    found = faults_kills.judged(tmp_path, record.archive, [diary])
     assert (found["lost"], found["wrong"], found["silent"]) == (1, 1, 1)
     (recording,) = record.archive.glob("*.h5")
     shutil.copy(recording, record.archive / "again.h5")
-    assert network_faults_kills.judged(tmp_path, record.archive, [diary])["twice"] == 7
+    assert faults_kills.judged(tmp_path, record.archive, [diary])["twice"] == 7
 
 
 @pytest.fixture(scope="module")
@@ -274,10 +273,10 @@ def test_images_are_counted(tmp_path):
 def test_accounts_that_do_not_add_up_are_told():
     sensors = {"a": SensorStatus(received=9, published=5, dropped={"superseded": 3}, in_flight=0)}
     status = Status(version="", pid=1, host="", address="", state="processing", sensors=sensors)
-    serve = network_serving.Serve(None, "", "", "", None, latest=status)
+    serve = serving.Serve(None, "", "", "", None, latest=status)
     told = Sent(kept={Key("a", 1, number) for number in range(10)}, offered={Key("a", 1, 0): Row(0, 0, 0)})
     received = Received(times_ms={Key("a", 1, 0): 1.0, Key("b", 1, 0): 1.0}, numbers=[0, 1, 4], dropped=1, wrong=1)
-    found = network_serving.accounts(serve, told, received)
+    found = serving.accounts(serve, told, received)
     assert (found["unbalanced"], found["uncounted"], found["foreign"], found["wrong"]) == (1, 1, 1, 1)
     assert found["untold"] == 1 + 1  # five were published, three came, one was told; numbers 2 and 3 are not there
 
@@ -296,29 +295,29 @@ def test_mixed_groups_are_found():
         )
     ]
     at = {"lost": 2, "double": 3, "clock": 4}
-    found = network_faults_processing.grouped(came, pulse_of, at, n_sensors=2, count=6)
+    found = faults_processing.grouped(came, pulse_of, at, n_sensors=2, count=6)
     assert (found["complete"], found["mixed"], found["clock flags after"], found["flagged pulses"]) == (2, 1, 1, [3])
-    assert all(network_tables.row("groups", found))
+    assert all(tables.row("groups", found))
 
 
 def test_a_part_that_could_not_be_tried_is_told():
-    assert network_tables.row("hosts", None)[2] == "not tried: only root may"
+    assert tables.row("hosts", None)[2] == "not tried: only root may"
     report = {"machine": machine.describe(), "seed": 3, "long": False, "only": ["hosts"], "hosts": None}
-    assert "By `ertis bench network-faults --only hosts --seed 3`." in network_tables.network_faults(report)
+    assert "By `ertis bench network-faults --only hosts --seed 3`." in tables.faults(report)
 
 
 def test_frames_survive_any_cut():
-    frames = [network_zmtp.Frame(1, bytes(300)), network_zmtp.Frame(0, b"x"), network_zmtp.Frame(4, b"\x04PING")]
+    frames = [zmtp.Frame(1, bytes(300)), zmtp.Frame(0, b"x"), zmtp.Frame(4, b"\x04PING")]
     data = b"".join(frame.encode() for frame in frames)
     for size in (1, 2, 7, 300, len(data)):
-        reader = network_zmtp.Frames()
+        reader = zmtp.Frames()
         came = [frame for start in range(0, len(data), size) for frame in reader.feed(data[start : start + size])]
         assert [frame.body for frame in came] == [frame.body for frame in frames]
         assert [(frame.more, frame.is_command) for frame in came] == [(True, False), (False, False), (False, True)]
 
 
 def test_parts_and_their_texts_agree():
-    assert set(network_faults.PARTS) == set(network_tables.ROWS)
+    assert set(faults.PARTS) == set(tables.ROWS)
 
 
 def test_a_node_that_does_not_start_is_told(tmp_path):

@@ -10,7 +10,7 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
-from ertis_bench.network_tables import network, network_faults
+from ertis_bench.network.tables import network, network_faults
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.reliability_tables import reliability

@@ -159,7 +159,7 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
 @options.as_json
 def network(*, only: tuple[str, ...], **given: Any) -> None:
     """Store and make images of what sensor nodes send, with keys; every word and image is checked."""
-    from ertis_bench import network as benchmark
+    from ertis_bench.network import figures as benchmark
 
     from ertis_numba import checks
 
@@ -178,7 +178,7 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 @options.as_json
 def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
     """Try what goes wrong in a network: kill -9, bad disks and cables, wrong keys, overload; nothing is timed."""
-    from ertis_bench import network_faults as benchmark
+    from ertis_bench.network import faults as benchmark
 
     from ertis_numba import checks
 

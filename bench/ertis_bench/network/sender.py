@@ -1,4 +1,4 @@
-"""A sensor node that measures nothing, but keeps a diary: ``python -m ertis_bench.network_sender JOB``.
+"""A sensor node that measures nothing, but keeps a diary: ``python -m ertis_bench.network.sender JOB``.
 
 It hands measurements to a `SensorNode` as a capture does, and writes in its diary what it hands over, what was taken,
 and what it is told to be settled.
@@ -20,9 +20,9 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network_diary import Diary, Key, Row
-from ertis_bench.network_processes import Process
-from ertis_bench.network_trap import set_trap
+from ertis_bench.network.diary import Diary, Key, Row
+from ertis_bench.network.processes import Process
+from ertis_bench.network.trap import set_trap
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
 from ertis_numba.network.keys import ClientKeys, KeyPair
@@ -108,7 +108,7 @@ class Job:
 
     def command(self) -> list[str]:
         """Return what runs it."""
-        return [sys.executable, "-m", "ertis_bench.network_sender", json.dumps(asdict(self))]
+        return [sys.executable, "-m", "ertis_bench.network.sender", json.dumps(asdict(self))]
 
     def start(self, *, mark: str = "") -> Process:
         """Start it; what it says on stderr stands beside its diary."""

@@ -1,4 +1,4 @@
-"""An application that looks at every image, and keeps a diary: ``python -m ertis_bench.network_receiver JOB``."""
+"""An application that looks at every image, and keeps a diary: ``python -m ertis_bench.network.receiver JOB``."""
 
 import json
 import os
@@ -12,8 +12,8 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network_diary import Key
-from ertis_bench.network_processes import Process
+from ertis_bench.network.diary import Key
+from ertis_bench.network.processes import Process
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Product
@@ -37,7 +37,7 @@ class Look:
     products : tuple of str
     keys : (path of a secret, public key of the central node), optional
     expected : str, optional
-        File of what images of some measurements should be, in turn, by `network_serving.expected_of`.
+        File of what images of some measurements should be, in turn, by `serving.expected_of`.
     waits_s : float
         How long it does something else after each product.
     credit : int
@@ -57,7 +57,7 @@ class Look:
 
     def start(self, *, mark: str = "") -> Process:
         """Start it; what it says on stderr stands beside its diary."""
-        command = [sys.executable, "-m", "ertis_bench.network_receiver", json.dumps(asdict(self))]
+        command = [sys.executable, "-m", "ertis_bench.network.receiver", json.dumps(asdict(self))]
         return Process(command, said=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from ertis_bench.network_diary import Key, Row
+from ertis_bench.network.diary import Key, Row
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import Gap, open_recording, sensor_names

@@ -10,12 +10,12 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench import machine
-from ertis_bench.network_faults_kills import judged
-from ertis_bench.network_oracle import read_diaries
-from ertis_bench.network_processes import Process, central, survivors, until
-from ertis_bench.network_receiver import Look, read_received
-from ertis_bench.network_sender import SETTINGS, Job
-from ertis_bench.network_serving import Serve, accounts, expected_of, percentile, some_words
+from ertis_bench.network.faults_kills import judged
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import Process, central, survivors, until
+from ertis_bench.network.receiver import Look, read_received
+from ertis_bench.network.sender import SETTINGS, Job
+from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
 from ertis_numba.errors import DataError
 from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
 from ertis_numba.settings import Settings

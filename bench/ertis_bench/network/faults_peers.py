@@ -12,13 +12,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network_faults_kills import Record, judged
-from ertis_bench.network_faults_links import state_of
-from ertis_bench.network_fuzz import inputs
-from ertis_bench.network_oracle import read_diaries
-from ertis_bench.network_processes import Process, central, until
-from ertis_bench.network_sender import Job
-from ertis_bench.network_zmtp import GREETING, Peer, greeting, host_and_port, message, ready
+from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.faults_links import state_of
+from ertis_bench.network.fuzz import inputs
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import Process, central, until
+from ertis_bench.network.sender import Job
+from ertis_bench.network.zmtp import GREETING, Peer, greeting, host_and_port, message, ready
 
 __all__ = ["fuzzed", "hostile"]
 

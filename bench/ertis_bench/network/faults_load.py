@@ -6,12 +6,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network_faults_kills import tracebacks
-from ertis_bench.network_oracle import read_diaries
-from ertis_bench.network_processes import Process, until
-from ertis_bench.network_receiver import Look, read_received
-from ertis_bench.network_sender import SMALL, Job
-from ertis_bench.network_serving import Serve, accounts, percentile, some_words
+from ertis_bench.network.faults_kills import tracebacks
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import Process, until
+from ertis_bench.network.receiver import Look, read_received
+from ertis_bench.network.sender import SMALL, Job
+from ertis_bench.network.serving import Serve, accounts, percentile, some_words
 
 __all__ = ["overload", "subscribers"]
 

@@ -1,4 +1,4 @@
-"""The reports of `network_faults` and `network` as Markdown."""
+"""The reports of `faults` and `figures` as Markdown."""
 
 from collections.abc import Mapping
 from typing import Any, Final

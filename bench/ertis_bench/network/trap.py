@@ -1,4 +1,4 @@
-"""A node that kills itself before a line of its own code: ``python -m ertis_bench.network_trap LINES COMMAND …``.
+"""A node that kills itself before a line of its own code: ``python -m ertis_bench.network.trap LINES COMMAND …``.
 
 Most of a node's time goes by inside few calls, so that a kill at a random moment hardly ever comes between two lines.
 """

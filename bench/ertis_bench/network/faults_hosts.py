@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.captures import emulated, sent_by_emulators
-from ertis_bench.network_cable import Weather, cable
-from ertis_bench.network_faults_kills import Record, judged, tracebacks
-from ertis_bench.network_oracle import read_diaries, read_folder
-from ertis_bench.network_processes import ERTIS, Process, survivors, until
-from ertis_bench.network_sender import Job
+from ertis_bench.network.cable import Weather, cable
+from ertis_bench.network.faults_kills import Record, judged, tracebacks
+from ertis_bench.network.oracle import read_diaries, read_folder
+from ertis_bench.network.processes import ERTIS, Process, survivors, until
+from ertis_bench.network.sender import Job
 from ertis_bench.reliability import ONE_SENSOR
 from ertis_numba.network.keys import AllowList, KeyPair, Permission
 

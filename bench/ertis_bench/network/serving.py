@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network_oracle import Sent
-from ertis_bench.network_processes import Process, central
-from ertis_bench.network_receiver import STEP, Received
+from ertis_bench.network.oracle import Sent
+from ertis_bench.network.processes import Process, central
+from ertis_bench.network.receiver import STEP, Received
 from ertis_numba.frames import Measurement
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status import Status

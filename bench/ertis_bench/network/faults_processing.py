@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network_faults_kills import judged, tracebacks
-from ertis_bench.network_oracle import read_diaries
-from ertis_bench.network_processes import survivors, until
-from ertis_bench.network_receiver import Look, read_received
-from ertis_bench.network_sender import SMALL, Job
-from ertis_bench.network_serving import Serve, accounts, expected_of, some_words
+from ertis_bench.network.faults_kills import judged, tracebacks
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import survivors, until
+from ertis_bench.network.receiver import Look, read_received
+from ertis_bench.network.sender import SMALL, Job
+from ertis_bench.network.serving import Serve, accounts, expected_of, some_words
 from ertis_numba.network.messages import Group
 from ertis_numba.network.subscriber import Subscriber
 

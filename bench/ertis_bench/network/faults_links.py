@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network_faults_kills import Record, judged
-from ertis_bench.network_meddler import ACKS, Meddler
-from ertis_bench.network_oracle import read_diaries
-from ertis_bench.network_processes import Process, ask, until
-from ertis_bench.network_sender import Job
+from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.meddler import ACKS, Meddler
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import Process, ask, until
+from ertis_bench.network.sender import Job
 from ertis_numba.errors import DataError
 
 __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network_oracle import Sent, compare, read_diaries, read_folder
-from ertis_bench.network_processes import Process, central, free_address, survivors, until
-from ertis_bench.network_sender import Job
+from ertis_bench.network.oracle import Sent, compare, read_diaries, read_folder
+from ertis_bench.network.processes import Process, central, free_address, survivors, until
+from ertis_bench.network.sender import Job
 from ertis_numba.errors import DataError
 
 __all__ = ["Record", "centrals", "judged", "nodes", "sealings", "tracebacks"]

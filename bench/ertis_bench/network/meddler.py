@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from ertis_bench.network_zmtp import GREETING, Frame, Frames, host_and_port
+from ertis_bench.network.zmtp import GREETING, Frame, Frames, host_and_port
 
 __all__ = ["ACKS", "Meddler", "Odds"]
 

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network_diary import Diary, Key, Row
-from ertis_bench.network_faults_kills import judged
-from ertis_bench.network_faults_links import state_of
-from ertis_bench.network_processes import central, until
-from ertis_bench.network_sender import SMALL
-from ertis_bench.network_zmtp import Peer
+from ertis_bench.network.diary import Diary, Key, Row
+from ertis_bench.network.faults_kills import judged
+from ertis_bench.network.faults_links import state_of
+from ertis_bench.network.processes import central, until
+from ertis_bench.network.sender import SMALL
+from ertis_bench.network.zmtp import Peer
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry

@@ -200,7 +200,7 @@ def central(
     most_lines : int, optional
         Of its code, after which it is killed.
     """
-    ertis = ERTIS if most_lines is None else (sys.executable, "-m", "ertis_bench.network_trap", str(most_lines))
+    ertis = ERTIS if most_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(most_lines))
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return Process(line, said=folder / "central.txt", mark=mark)
 

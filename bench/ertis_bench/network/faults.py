@@ -7,15 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import (
-    machine,
-    network_faults_hosts,
-    network_faults_keys,
-    network_faults_kills,
-    network_faults_links,
-    network_faults_load,
-    network_faults_peers,
-    network_faults_processing,
+from ertis_bench import machine
+from ertis_bench.network import (
+    faults_hosts,
+    faults_keys,
+    faults_kills,
+    faults_links,
+    faults_load,
+    faults_peers,
+    faults_processing,
 )
 from ertis_bench.reliability import small_disk
 
@@ -90,71 +90,71 @@ def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
     disk = folder / "disk"
     disk.mkdir()
     with small_disk(disk) as mounted:
-        return None if mounted is None else network_faults_links.disk_full(folder, mounted, seed=seed)
+        return None if mounted is None else faults_links.disk_full(folder, mounted, seed=seed)
 
 
 PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
     "centrals": (
         "{n_kills} central nodes killed",
-        lambda extent, folder, seed: network_faults_kills.centrals(folder, seed=seed, count=extent.n_kills),
+        lambda extent, folder, seed: faults_kills.centrals(folder, seed=seed, count=extent.n_kills),
     ),
     "nodes": (
         "{n_kills} sensor nodes killed",
-        lambda extent, folder, seed: network_faults_kills.nodes(folder, seed=seed, count=extent.n_kills),
+        lambda extent, folder, seed: faults_kills.nodes(folder, seed=seed, count=extent.n_kills),
     ),
     "captures": (
         "{n_captures} captures and central nodes killed",
-        lambda extent, folder, seed: network_faults_hosts.captures(folder, seed=seed, count=extent.n_captures),
+        lambda extent, folder, seed: faults_hosts.captures(folder, seed=seed, count=extent.n_captures),
     ),
     "sealings": (
         "{n_seal_kills} sealings killed",
-        lambda extent, folder, seed: network_faults_kills.sealings(folder, seed=seed, count=extent.n_seal_kills),
+        lambda extent, folder, seed: faults_kills.sealings(folder, seed=seed, count=extent.n_seal_kills),
     ),
     "workers": (
         "{n_worker_kills} workers killed",
-        lambda extent, folder, seed: network_faults_processing.workers(folder, seed=seed, count=extent.n_worker_kills),
+        lambda extent, folder, seed: faults_processing.workers(folder, seed=seed, count=extent.n_worker_kills),
     ),
     "disk_full": ("a small disk", _disk_full),
     "disk_fails": (
         "a disk that fails",
-        lambda _, folder, seed: network_faults_links.disk_fails(folder, seed=seed),
+        lambda _, folder, seed: faults_links.disk_fails(folder, seed=seed),
     ),
     "away": (
         "{away_s:g} s without the central node",
-        lambda extent, folder, seed: network_faults_links.away(folder, seed=seed, away_s=extent.away_s, how="killed"),
+        lambda extent, folder, seed: faults_links.away(folder, seed=seed, away_s=extent.away_s, how="killed"),
     ),
     "stopped": (
         "{away_s:g} s in which it stands still",
-        lambda extent, folder, seed: network_faults_links.away(folder, seed=seed, away_s=extent.away_s, how="stopped"),
+        lambda extent, folder, seed: faults_links.away(folder, seed=seed, away_s=extent.away_s, how="stopped"),
     ),
     "meddled": (
         "{meddled_s:g} s of lost, repeated and late acks",
-        lambda extent, folder, seed: network_faults_links.meddled(folder, seed=seed, duration_s=extent.meddled_s),
+        lambda extent, folder, seed: faults_links.meddled(folder, seed=seed, duration_s=extent.meddled_s),
     ),
     "hosts": (
         "{cable_s:g} s over a bad cable between two hosts",
-        lambda extent, folder, seed: network_faults_hosts.hosts(folder, seed=seed, duration_s=extent.cable_s),
+        lambda extent, folder, seed: faults_hosts.hosts(folder, seed=seed, duration_s=extent.cable_s),
     ),
     "hostile": (
         "{n_hostile} hostile connections",
-        lambda extent, folder, seed: network_faults_peers.hostile(folder, seed=seed, count=extent.n_hostile),
+        lambda extent, folder, seed: faults_peers.hostile(folder, seed=seed, count=extent.n_hostile),
     ),
-    "keys": ("all wrong keys", lambda _, folder, seed: network_faults_keys.keys(folder, seed=seed)),
+    "keys": ("all wrong keys", lambda _, folder, seed: faults_keys.keys(folder, seed=seed)),
     "fuzzed": (
         "{n_fuzzed} malformed messages",
-        lambda extent, folder, seed: network_faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
+        lambda extent, folder, seed: faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
     ),
     "overload": (
         "{overload_s:g} s of twice as much as can be done",
-        lambda extent, folder, seed: network_faults_load.overload(folder, seed=seed, duration_s=extent.overload_s),
+        lambda extent, folder, seed: faults_load.overload(folder, seed=seed, duration_s=extent.overload_s),
     ),
     "subscribers": (
         "{slow_s:g} s with slow and dead applications",
-        lambda extent, folder, seed: network_faults_load.subscribers(folder, seed=seed, duration_s=extent.slow_s),
+        lambda extent, folder, seed: faults_load.subscribers(folder, seed=seed, duration_s=extent.slow_s),
     ),
     "groups": (
         "{n_pulses} pulses, lost, double, and with a wrong clock",
-        lambda extent, folder, seed: network_faults_processing.groups(folder, seed=seed, count=extent.n_pulses),
+        lambda extent, folder, seed: faults_processing.groups(folder, seed=seed, count=extent.n_pulses),
     ),
 }
 """What is tried: what to say of it, and how."""

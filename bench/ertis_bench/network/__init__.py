@@ -1,0 +1,1 @@
+"""What the network does to measurements: figures, faults, and the oracle that judges them."""
