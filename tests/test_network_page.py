@@ -1,0 +1,119 @@
+"""What the README and docs/network.md say of the network runs, word by word but for ports and hosts."""
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ertis_numba.storage import open_recording, sensor_names
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "network.md").read_text("utf-8")
+READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder to be in, keys and emulated sensors of its own, and two ports that nobody listens at."""
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
+    monkeypatch.setenv("ERTIS_KEYS_DIR", str(tmp_path / "keys"))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench")))
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def ports():
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(2)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        found = [str(each.getsockname()[1]) for each in sockets]
+    return dict(zip(("5601", "5602"), found, strict=True))
+
+
+class Shell:
+    """Runs lines of a page; those that end with ``&`` until the test ends."""
+
+    def __init__(self, ports):
+        self.ports = ports
+        self.running = []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in reversed(self.running):
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=30)
+
+    def run(self, line):
+        for before, port in self.ports.items():
+            line = line.replace(before, port)
+        name, *arguments = line.removesuffix("&").split()
+        if name == "serve" and "--listen" not in arguments:
+            arguments += ["--listen", f"tcp://127.0.0.1:{self.ports['5601']}"]
+            arguments += ["--publish", f"tcp://127.0.0.1:{self.ports['5602']}"]
+        command = [sys.executable, "-m", "ertis_cli", name, *arguments]
+        if not line.endswith("&"):
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            assert done.returncode == 0, (line, done.stderr)
+            return done.stdout
+        as_json = [] if name == "emulate" else ["--json"]
+        process = subprocess.Popen([*command, *as_json], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self.running.append(process)
+        while READY[name] not in (told := process.stdout.readline()):
+            assert told, line
+        return told
+
+
+def lines_of(page, prompt):
+    return re.findall(rf"^{prompt}\$\s+ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    "block",
+    [next(block for block in page.split("```") if "ertis serve" in block) for page in (README, PAGE)],
+    ids=["readme", "page"],
+)
+def test_one_machine(place, ports, block):
+    lines = lines_of(block, "")
+    assert [line.split()[0] for line in lines] == ["emulate", "serve", "capture", "listen", "status"]
+    with Shell(ports) as shell:
+        *_, heard, status = [shell.run(line) for line in lines]
+    assert len([line for line in heard.splitlines() if re.match(r"(front|left) ", line)]) == 10
+    assert "front" in status
+    assert "published at" in status
+    recordings = list((place / "RECORDINGS").glob("*.h5"))
+    assert {name for path in recordings for name in sensor_names(path)} == {"front", "left"}
+
+
+def test_several_machines(place, ports):
+    lines = lines_of(PAGE, "(?:central|sensor)")
+    assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
+    with Shell(ports) as shell:
+        shell.run("emulate examples/platform.toml &")
+        for line in lines:
+            local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
+            told = shell.run(re.sub(r"(\w+\.public\.toml)", rf"{place}/keys/\1", local))
+    assert "0 lost" in told or not told
+
+
+def test_one_machine_stores(place, ports):
+    with Shell(ports) as shell:
+        address = f"tcp://127.0.0.1:{ports['5601']}"
+        shell.run("emulate examples/platform.toml &")
+        READY["record"] = '"listening"'
+        shell.run(f"record --listen {address} -o RECORDINGS &")
+        shell.run(f"capture --port front -n 3 --to {address}")
+    (path,) = (place / "RECORDINGS").glob("*.h5")
+    with open_recording(path) as recording:
+        assert len(recording) == 3
