@@ -92,7 +92,7 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
     events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
     plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
-    stored_ns = sorted(line["time_ns"] for line in lines if line["event"] == "stored")
+    stored_ns = sorted(line["timestamp_ns"] for line in lines if line["event"] == "stored")
     after_s = [(min(t for t in stored_ns if t > plugged) - plugged) / 1e9 for plugged in plugged_ns]
     return {
         "unplugged": count,

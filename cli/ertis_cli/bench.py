@@ -144,7 +144,11 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
 
 @bench.command()
 @click.option(
-    "--duration", "duration_s", type=float, default=60.0, show_default=True, metavar="S", help="Of each part."
+    "--duration",
+    "duration_s",
+    type=float,
+    metavar="S",
+    help="Of each part; five minutes of storage and one of all else by default.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, metavar="S", help="Of the words.")
 @click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. storage, processing, …")
@@ -165,7 +169,8 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
     for part in only:
         checks.choice("--only", part, benchmark.PARTS)
-    checks.positive("--duration", given["duration_s"])
+    if given["duration_s"] is not None:
+        checks.positive("--duration", given["duration_s"])
     _run("network", benchmark, only=only, **given)
 
 

@@ -23,6 +23,8 @@ from ertis_numba.settings import Settings
 __all__ = ["PARTS", "processing", "run", "storage"]
 
 _WARM_UP_S: Final = 3.0
+_STORAGE_S: Final = 300.0
+_OTHERS_S: Final = 60.0
 _SENDERS: Final = 2  # processes that are sensor nodes: each has its share of the sensors
 _BYTES: Final = 4 * SETTINGS.recording.n_samples
 Found = dict[str, Any]
@@ -32,7 +34,7 @@ Keys = tuple[str, str]
 def run(
     *,
     say: Callable[[str], None],
-    duration_s: float = 60.0,
+    duration_s: float | None = None,
     seed: int = 1,
     only: Sequence[str] = (),
     folder: Path | None = None,
@@ -42,8 +44,8 @@ def run(
     Parameters
     ----------
     say : callable
-    duration_s : float
-        Of each.
+    duration_s : float, optional
+        Of each; five minutes of storage and one of all else by default.
     seed : int
     only : sequence of str
     folder : Path, optional
@@ -55,8 +57,9 @@ def run(
             continue
         say(about)
         with tempfile.TemporaryDirectory(prefix="ertis-", dir=folder) as place:
-            rows.append(part(Path(place), duration_s, seed))
-    return {"machine": machine.describe(), "duration_s": duration_s, "seed": seed, "only": list(only), "rows": rows}
+            lasts_s = duration_s or (_STORAGE_S if name == "storage" else _OTHERS_S)
+            rows.append(part(Path(place), lasts_s, seed) | {"duration_s": lasts_s})
+    return {"machine": machine.describe(), "seed": seed, "only": list(only), "rows": rows}
 
 
 def _keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
