@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import open_raw
-    from ertis_numba.network.keys import ClientKeys, KeyPair
+    from ertis_numba.journal import Entry
+    from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
     from ertis_numba.network.sensor_node import SensorNode
     from ertis_numba.network.subscriber import Subscriber
     from ertis_numba.pipeline import Pipeline
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "AllowList",
     "ArgumentError",
     "ClientKeys",
     "DamagedError",
@@ -66,6 +68,7 @@ __all__ = [
     "DeviceError",
     "Emulator",
     "Energyscape",
+    "Entry",
     "ErtisError",
     "FormatVersionError",
     "InUseError",
@@ -73,12 +76,14 @@ __all__ = [
     "Measurement",
     "NetworkError",
     "Peak",
+    "Permission",
     "Pipeline",
     "PointCloud",
     "Reflector",
     "RefusedError",
     "Scene",
     "SensorNode",
+    "ServerKeys",
     "Settings",
     "SettingsError",
     "Setup",
@@ -124,7 +129,8 @@ _HOMES = {
     "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("open_raw",),
-    "network.keys": ("ClientKeys", "KeyPair"),
+    "journal": ("Entry",),
+    "network.keys": ("AllowList", "ClientKeys", "KeyPair", "Permission", "ServerKeys"),
     "network.sensor_node": ("SensorNode",),
     "network.subscriber": ("Subscriber",),
     "pipeline": ("Pipeline",),

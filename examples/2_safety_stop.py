@@ -1,7 +1,9 @@
 """Say how fast a vehicle may drive by what is nearest in its way: go, slow or stop.
 
 It stops at once, and goes on only when its way has been clear for some images, and by more than what stops it: an echo
-that comes and goes does not make it jerk. No image from one of its sensors for half a second is a reason to stop, too::
+that comes and goes does not make it jerk. No image from one of its sensors for half a second is a reason to stop, too,
+and so is a clock that is half a second away from this machine's. What echoes more than 20 dB weaker than the strongest
+reflector of an image is no point of its cloud: beside a wall, a thin pole is not seen::
 
     ertis serve &
     ertis capture --port front --to tcp://127.0.0.1:5601 &
@@ -61,8 +63,8 @@ def main(address: str, *sensors: str) -> None:
     with ertis.Subscriber(address, sensors=sensors, products=["points"]) as subscriber:
         while not subscriber.closed:
             cloud = subscriber.receive(timeout_s=0.1)
-            # An image that took long to come says nothing about now.
-            if cloud is not None and time.time_ns() - cloud.stamp.timestamp_ns < 1e9 * SILENCE_S:
+            # An image that took long to come, or comes from a clock that is ahead, says nothing about now.
+            if cloud is not None and abs(time.time_ns() - cloud.stamp.timestamp_ns) < 1e9 * SILENCE_S:
                 ways[cloud.stamp.sensor].see(nearest_in_way_m(cloud), time.monotonic())
             for way in ways.values():
                 way.wait(time.monotonic())

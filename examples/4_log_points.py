@@ -17,7 +17,7 @@ import numpy as np
 import ertis_numba as ertis
 from ertis_numba.atomic import replacing
 
-COLUMNS = ("time_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "energy")
+COLUMNS = ("timestamp_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "energy")
 
 
 class Log:

@@ -86,6 +86,7 @@ def running(folder=None, **options):
         central.events = events
         stop = threading.Event()
         thread = threading.Thread(target=central.run, args=(stop,))
+        central.end = stop.set
         thread.start()
         try:
             yield central

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal._tables import insertion
 from ertis_numba.settings import Recording
 from tests.files import line, noise
 
@@ -38,10 +39,24 @@ def create(folder, given=None, *, name="rec.h5", settings=TINY):
     return journal
 
 
-def crashed(folder, given=None, **options):
-    """The path of a journal as a process leaves it that is killed: its log is not yet in the main file."""
+def crashed(folder, given=None, *, moment="log", **options):
+    """The path of a journal as a process leaves it that is killed.
+
+    With a ``log`` that is not yet in the main file; or, where commits do without, ``between`` two, or in mid
+    ``commit``.
+    """
     (folder / "running").mkdir()
     with create(folder / "running", given, **options) as journal:
+        execute = journal._database.execute  # noqa: SLF001  nobody else can ask
+        if moment != "log":
+            journal._database.write_once()  # noqa: SLF001  without 4 MB to commit
+        if moment == "commit":
+            execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
+            execute("BEGIN")
+            execute("UPDATE measurements SET crc32 = 0")
+            execute("INSERT INTO gaps SELECT NULL, 1, 1, 1, 1, 'x', 0 FROM measurements, sensors")
+            for number in range(60):
+                execute(insertion("measurements"), (1, EPOCH, 100 + number, *[0] * 9, bytes(4096)))
         for path in (folder / "running").iterdir():
             shutil.copy(path, folder)
     shutil.rmtree(folder / "running")

@@ -8,9 +8,19 @@ import zlib
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, InUseError
-from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor
+from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor, seal_apart
 from ertis_numba.network.central_node import Archive
-from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Item, Resumed, Run, SealedOne, Stored
+from ertis_numba.network.central_node._items import (
+    Failed,
+    Fault,
+    Forgotten,
+    Item,
+    Resumed,
+    Run,
+    SealedOne,
+    Stored,
+    Twin,
+)
 from tests.central import stored, wanted
 from tests.journals import EPOCH, TINY, create, entries
 
@@ -102,6 +112,73 @@ def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
         opened.until_stored(1)
     assert [event.reason for event in opened.events if isinstance(event, Forgotten)] != [""]
     assert stored(tmp_path)[0] == wanted(others)
+
+
+def test_what_follows_an_item_that_no_journal_can_hold_is_sent_back(tmp_path):
+    given = from_zero(3)
+    given[1:2] = from_zero(1, 1, settings=TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
+    others = from_zero(2, sensor="right")
+    with Opened(tmp_path) as opened:
+        right = Sensor.of("right", TINY)
+        opened.archive._store(  # noqa: SLF001  all of them in one batch
+            opened.archive._shelf,  # noqa: SLF001
+            [*map(item_of, given), *(item_of(other, right) for other in others)],
+        )
+        assert opened.archive.settled(RUN) == 0
+    back = [(event.item.first, bool(event.reason)) for event in opened.events if isinstance(event, Forgotten)]
+    assert back == [(1, True), (2, False)]
+    assert stored(tmp_path)[0] == wanted([given[0], *others])
+
+
+def test_a_number_that_comes_again_is_found_without_looking_at_all(tmp_path, monkeypatch):
+    given, (other,) = from_zero(3), from_zero(1, 1, seed=2)
+    again = [item_of(from_zero(3)[1]), item_of(other), item_of(from_zero(1, 9)[0])]
+    for item in again:
+        item.again = True
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(2)
+        index = Journal.index
+        looked = []
+        monkeypatch.setattr(Journal, "index", lambda *which: (looked.append(which), index(*which))[1])
+        opened.give(again[0], again[2])
+        opened.until(Twin, lambda event: event.item is again[2])
+        assert looked == []
+        opened.give(again[1])
+        opened.until(Twin, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, False, True]
+
+
+def test_gaps_share_a_transaction(tmp_path, monkeypatch):
+    notes, commits = Journal.note_gaps, []
+    monkeypatch.setattr(Journal, "note_gaps", lambda journal, gaps: (commits.append(len(gaps)), notes(journal, gaps)))
+    with Opened(tmp_path) as opened:
+        opened.archive._store(  # noqa: SLF001
+            opened.archive._shelf,  # noqa: SLF001
+            [*(gap_of(number, number) for number in range(20)), *map(item_of, from_zero(1, 20)), gap_of(21, 21)],
+        )
+    assert commits == [20, 1]
+    assert stored(tmp_path) == (
+        wanted(from_zero(1, 20)),
+        [("left", EPOCH, number, number, "lost") for number in (*range(20), 21)],
+    )
+
+
+def test_two_places_of_a_sensor_are_two_recordings_even_in_a_batch(tmp_path):
+    moved = Sensor.of("left", TINY, translation_m=(1.0, 0.0, 0.0))
+    first, second = from_zero(2)
+    with Opened(tmp_path) as opened:
+        opened.archive._store(opened.archive._shelf, [item_of(first), item_of(second, moved)])  # noqa: SLF001
+    assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
+
+
+def test_a_thread_that_ends_is_noticed(tmp_path, monkeypatch):
+    with Opened(tmp_path) as opened:
+        assert opened.archive.stuck == ""
+        monkeypatch.setattr(Archive, "_store", lambda *_: False)
+        opened.give(item_of(from_zero(1)[0]))
+        opened.archive._thread.join(WAIT_S)  # noqa: SLF001
+        assert "has ended by a mistake" in opened.archive.stuck
 
 
 def test_full_recordings_are_sealed_while_it_goes_on(tmp_path):
@@ -261,6 +338,22 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
         in_the_way.unlink()
         opened.until(SealedOne)
     assert opened.archive.status().sealing == 0
+
+
+def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
+    def seals(journal, **options):
+        seal_apart(journal, **options)
+        raise InUseError("somebody else has it")
+
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_apart", seals)
+    with Opened(tmp_path, seal=True) as opened:
+        pass
+    assert not [event for event in opened.events if isinstance(event, Failed)]
+    assert (opened.archive.status().sealing, opened.archive.status().sealing_failed) == (0, 0)
+    assert stored(tmp_path)[0] == wanted(from_zero(1))
 
 
 @pytest.mark.parametrize(

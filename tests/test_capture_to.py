@@ -76,8 +76,8 @@ def checks(central):
     }
 
 
-def kept(events):
-    return {(each["sensor"], each["epoch"], each["sequence"]): each["crc32"] for each in events if "crc32" in each}
+def kept(events, name="crc32"):
+    return {(each["sensor"], each["epoch"], each["sequence"]): each[name] for each in events if name in each}
 
 
 @pytest.mark.usefixtures("sensors")
@@ -98,6 +98,10 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
         hellos = {hello.sensor: hello for hello, _ in central.hellos.queue}
     assert code == 0, err
     assert kept(events) == checks(central)
+    times = {(name, epoch, number): message.timestamp_ns for (name, epoch), held in central.held.items()
+             for number, (message, _) in held.items()}  # fmt: skip
+    assert times == kept(events, "timestamp_ns")
+    assert all(each["uncertainty_ns"] > 0 for each in events if each["event"] == "kept")
     (epoch,) = {epoch for _, epoch, _ in kept(events)}
     given = {"one": words, "two": words[::-1]}
     assert checks(central) == {
@@ -150,6 +154,34 @@ def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
     assert kept(first) | kept(second) == checks(central)
     assert len(checks(central)) == 5
     assert not list((tmp_path / "spool").iterdir())
+
+
+@pytest.mark.usefixtures("sensors")
+@pytest.mark.parametrize(
+    ("given", "lost", "remedy"),
+    [
+        (["--ring"], "overwritten", "give --spool DIR, which keeps them"),
+        (["--spool", "spool", "--spool-size"], "refused", "give the spool more (--spool-size)"),
+    ],
+)
+def test_no_more_is_kept_than_there_is_room_for(tmp_path, words, given, lost, remedy):
+    size_mb = 2.5 * words[0].nbytes / 1e6
+    code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", *given, size_mb, "-n", 3, "--patience", "0.1")
+    assert code == 1
+    assert (events[-1][lost], events[-1]["unsettled"]) == (1, 2)
+    assert remedy in err.splitlines()[-1]
+
+
+@pytest.mark.usefixtures("sensors")
+def test_what_the_central_node_drops_is_told(tmp_path):
+    with StandIn(acks="accepted") as central:
+        central.dropped = ((0, "superseded"), (2, "failed twice"))
+        code, events, err = run(tmp_path, "--to", central.address, "-n", 3)
+    assert code == 0, err
+    told = [each["dropped"] for each in events if each["event"] == "settled" and each["dropped"]]
+    assert told == [[[0, "superseded"], [2, "failed twice"]]]
+    assert events[-1]["central"] == {"stored": 0, "accepted": 3, "dropped": {"superseded": 1, "failed twice": 1}}
+    assert "1 measurement dropped by the central node, superseded" in err
 
 
 @pytest.mark.usefixtures("sensors")
@@ -213,7 +245,9 @@ def test_keys(tmp_path):
     ("arguments", "message", "code"),
     [
         (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output both say where measurements go; give one", 2),
-        (["--spool", "spool"], "--spool, --key and --server-key are about a central node; give --to, too", 2),
+        (["--spool", "spool"], "--ring, --key and --server-key are about a central node; give --to, too", 2),
+        (["--ring", "1"], "--ring, --key and --server-key are about a central node; give --to, too", 2),
+        (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; give its", 2),
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, and there are no keys", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),

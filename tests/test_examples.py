@@ -17,7 +17,10 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.scene import Scene
+from ertis_numba.storage import write_recording
+from tests.files import noise
 from tests.publishing import Publisher, cloud, image
+from tests.stand_in import StandIn
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 WAIT_S = 10.0
@@ -138,6 +141,7 @@ def test_says_when_it_changes_its_mind(safety_stop, monkeypatch):
         publisher.pump(lambda: len(publisher.peers) == 1)
         until(["stop"])  # nothing was seen yet
         see(4.0, late_s=2.0)  # too old
+        see(4.0, late_s=-2.0)  # not yet
         see(4.0)
         until(["stop", "slow"])
         see(4.0)
@@ -225,7 +229,7 @@ def test_log_as_csv_in_the_frame_of_the_platform(log_points, tmp_path, capsys):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["sensor"], row["sequence"]) for row in rows] == [("front", "1"), ("front", "1"), ("left", "3")]
-    assert rows[0]["time_ns"] == str(items[0].stamp.timestamp_ns)
+    assert rows[0]["timestamp_ns"] == str(items[0].stamp.timestamp_ns)
     # Turned by half a turn about z, then moved by 1, 2, 3.
     places = [[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in rows]
     np.testing.assert_allclose(places, [[0, 2, 3], [1, 0, 3], [0, 2, 3]], atol=1e-6)
@@ -246,3 +250,18 @@ def test_log_as_npz(log_points, tmp_path, capsys):
 def test_an_empty_log_is_a_table_without_rows(log_points, tmp_path):
     log_points.Log().save(tmp_path / "none.csv")
     assert (tmp_path / "none.csv").read_text() == ",".join(log_points.COLUMNS) + "\n"
+
+
+# What one's own program has measured
+
+
+def test_what_is_sent_by_ones_own_program_is_stored(tmp_path, capsys):
+    given = noise()
+    write_recording(tmp_path / "given.h5", given)
+    with StandIn() as central:
+        example("send_your_own").main(central.address, str(tmp_path / "given.h5"))
+    assert capsys.readouterr().out == "3 stored\n"
+    ((key, held),) = central.held.items()
+    assert key[0] == "mine"
+    assert [words for _, words in held.values()] == [each.words.tobytes() for each in given]
+    assert [*held] == [0, 1, 2]

@@ -191,13 +191,13 @@ def test_a_routing_id_that_a_peer_has_chosen_is_refused(door):
 def test_a_message_that_came_past_the_gate_is_nobodys(door):
     past = sockets.server(door.context, LOOPBACK, keys=None)
     client = sockets.client(door.outside, sockets.bound(past), keys=None)
+    door.monitors[client] = sockets.Monitor(client)
     assert client.poll(1e3 * PATIENCE_S, zmq.POLLOUT)
     client.send(b"hello")
     assert past.poll(1e3 * PATIENCE_S)
     assert door.gate.who(past.recv_multipart(copy=False)) is None
     assert door.gate.refused["no key"] == 1
     assert door.gate.who([]) is None
-    client.close()
     past.close()
 
 
@@ -269,6 +269,20 @@ def test_nobody_is_in_a_list_that_cannot_be_read(door, spoil):
     assert door.until(lambda: door.changed == 2)
     assert not door.gate.note
     assert door.admits(ROBOT).name == "robot"
+
+
+def test_a_list_that_somebody_is_writing_is_looked_at_twice(door):
+    client = door.knock(DESK)
+    assert door.until(lambda: door.came)
+    door.list.write_text("keys = [")
+    looked_s = door.gate._next_look_s  # noqa: SLF001  so that this is no matter of time
+    assert door.until(lambda: door.gate._next_look_s > looked_s)  # noqa: SLF001
+    _replace(door, LISTED.remove("viewer"))
+    assert door.until(lambda: door.changed == 1)
+    door.say(client, b"more")
+    assert door.until(lambda: len(door.came) == 2)
+    assert (door.came[-1][1].name, door.gate.note) == ("desk", "")
+    assert not +door.gate.refused
 
 
 @pytest.mark.parametrize(
@@ -402,6 +416,20 @@ def test_a_server_on_all_addresses_is_told_as_one_that_can_be_connected_to(tmp_p
         sockets.server(context, "tcp://*:0", keys=ServerKeys(CENTRAL, tmp_path / "allow.toml")) as server,
     ):
         assert sockets.bound(server).startswith("tcp://127.0.0.1:")
+
+
+def test_a_refusal_that_comes_at_once_is_told(tmp_path):
+    """Between connecting and watching, everything may have happened already."""
+    with (
+        Door(tmp_path) as door,
+        zmq.Context() as context,
+        sockets.client(context, door.address, keys=ClientKeys(STRANGER, CENTRAL.public)) as client,
+    ):
+        assert door.until(lambda: door.gate.refused["unknown key"])
+        door.until(lambda: False, MOMENT_S)
+        monitor = sockets.Monitor(client)
+        assert [line[:40] for line in monitor.read()] == ["the central node does not know this key;"]
+        monitor.close()
 
 
 # Hostile connections

@@ -1,7 +1,9 @@
 """Which measurements belong together, whatever happens to pulses, clocks and networks."""
 
+import msgspec
 import pytest
 
+from ertis_numba.network.messages import decode, encode
 from ertis_numba.network.processing.groups import Groups
 from tests.driven import data
 
@@ -171,3 +173,73 @@ def test_runs_that_come_and_go_are_forgotten(four):
             four.pulse(3 * epoch + number)
     four.wait(250)  # who comes after all others have gone is compared by the interval, after a while
     assert four.told()[-1] == (233, ("a", "b", "c", "d"), ())
+
+
+def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
+    """A computer without a battery starts in the past; what it sends is as new as what the others send."""
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    for number in range(10):
+        platform.pulse(number, without=("b",))
+    platform.ahead["b"] = -HOUR_NS
+    for number in range(10, 60):
+        platform.pulse(number)
+    platform.wait(90)
+    assert platform.told()[-1] == (59, ("a", "b"), ("clock",))
+    assert sum(group.sensors == ("a", "b") for group in platform.closed) >= 25
+
+
+def test_a_node_that_catches_up_keeps_its_own_times():
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    for number in range(40):
+        platform.pulse(number, without=("b",))
+    for number in range(40):  # b sends what it has kept, ten times as fast
+        at_ns = 10**12 + number * INTERVAL_NS
+        old = data("b", number, epoch=2, sync_count=number, timestamp_ns=10**18 + at_ns, monotonic_ns=at_ns)
+        platform.groups.add(old, 10**12 + (400 + number) * INTERVAL_NS // 10)
+    assert platform.groups.closed["measurement too late"] > 20
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda number: {"timestamp_ns": -(2**63) if number % 2 else 10**18},
+        lambda number: {"sync_count": -(2**63) if number % 2 else 2**63 - 1},
+        lambda number: {"sync_count": number + 10**6 * (number > 100)},
+        lambda number: {"sync_count": 3 * number * number},
+        lambda number: {"monotonic_ns": (-1) ** number * 2**62},
+        lambda number: {"monotonic_ns": 3600 * 10**9 * number, "timestamp_ns": 3600 * 10**9 * number},
+    ],
+    ids=["timestamp", "count", "far", "away", "clock", "fast"],
+)
+def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
+    platform = Platform(("a", 1), ("b", 2))
+    platform.know()
+    values = {"timestamp_ns": 10**18, "monotonic_ns": 0, "sync_count": 0}
+    for number in range(600):
+        at_ns = 10**12 + number * INTERVAL_NS
+        values |= {"sync_count": number, "timestamp_ns": 10**18 + at_ns, "monotonic_ns": at_ns}
+        evil = data("evil", number, epoch=9, **(values | wrong(number)))
+        platform.closed += platform.groups.add(evil, at_ns + LATENCY_NS)
+        platform.pulse(number)
+        platform.wait(number + 0.5) if number % 4 == 0 else None
+    platform.wait(640)
+    for group in platform.closed:
+        assert msgspec.structs.asdict(decode(encode(group))) == msgspec.structs.asdict(group)
+    both = [group for group in platform.closed if {"a", "b"} <= set(group.sensors)]
+    assert len(both) >= 580
+
+
+def test_runs_that_come_after_a_sensor_that_says_anything_find_each_other():
+    platform = Platform(("evil", 9))
+    platform.know()
+    for number in range(300):
+        platform.shift["evil"] = number * 10**6
+        platform.pulse(number)
+    platform.runs = {"a": 1, "b": 2}
+    platform.know()
+    for number in range(300, 400):
+        platform.pulse(number)
+    platform.wait(440)
+    assert sum({"a", "b"} <= set(group.sensors) for group in platform.closed) >= 90

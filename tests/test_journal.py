@@ -15,12 +15,14 @@ from ertis_bench import kills
 from ertis_numba.errors import ArgumentError, DataError, InUseError
 from ertis_numba.frames import Measurement
 from ertis_numba.journal import TABLES, VERSION, Gap, Journal
-from ertis_numba.journal._database import LOG_BYTES
+from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 from ertis_numba.settings import Air, Array, Recording, Settings
 from ertis_numba.storage import open_recording
 from ertis_numba.storage.sealing import seal
 from tests.files import line
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python, same
+
+COUNTS = Path("/proc/self/io")
 
 
 def both():
@@ -254,6 +256,40 @@ def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
         assert not (tmp_path / "rec.h5.journal-shm").exists()
 
 
+def test_long_commits_do_without_the_log(tmp_path):
+    log, begin = (tmp_path / f"rec.h5.journal{end}" for end in ("-wal", "-journal"))
+    given = entries(24, settings=Settings())
+    wanted = {"synchronous": 2, "journal_mode": "delete", "locking_mode": "exclusive"}
+    with create(tmp_path, given[:2], settings=Settings()) as journal:
+        assert log.exists()
+        for number in (2, 10, 18):
+            journal.append(given[number : number + 8])
+            assert not log.exists()
+            assert begin.read_bytes()[:28] == bytes(28)  # what SQLite takes for nothing to be rolled back
+            assert begin.stat().st_size < 10 * PAGE_BYTES
+        assert {name: journal._database.execute(f"PRAGMA {name}")[0][0] for name in wanted} == wanted  # noqa: SLF001  nobody else can ask
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5.journal"]
+    with Journal.open(journal.path) as journal:
+        assert all(same(*pair) for pair in zip(journal.entries(), given, strict=True))
+        assert not log.exists()  # and it remains so
+
+
+@pytest.mark.skipif(not COUNTS.exists(), reason="only Linux counts what a process writes")
+def test_all_but_a_little_is_written_once(tmp_path):
+    given = entries(32, settings=Settings())
+    words_bytes = sum(entry.measurement.words.nbytes for entry in given)
+    with create(tmp_path, [], settings=Settings()) as journal:
+        journal.add_sensor("left", Settings())
+        before = written_bytes()
+        for number in range(0, 32, 8):
+            journal.append(given[number : number + 8])
+        assert words_bytes < written_bytes() - before < 1.25 * words_bytes
+
+
+def written_bytes():
+    return int(re.search(r"wchar: (\d+)", COUNTS.read_text())[1])
+
+
 OPEN = """
 import sys
 from ertis_numba.errors import InUseError
@@ -320,9 +356,29 @@ def test_killed_while_it_was_made(tmp_path, moment):
         assert len(journal) == 3
 
 
-def test_a_log_that_is_not_in_the_main_file_yet(tmp_path):
-    with Journal.open(crashed(tmp_path)) as journal:
+@pytest.mark.parametrize("moment", ["between", "commit", "log"])
+def test_what_a_killed_process_leaves(tmp_path, moment):
+    path = crashed(tmp_path, moment=moment)
+    log, begin = (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal"))
+    if moment == "log":
+        assert log.stat().st_size > 2 * PAGE_BYTES
+    else:
+        assert begin.read_bytes()[:8] == (bytes(8) if moment == "between" else b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7")
+    with Journal.open(path) as journal:
+        assert len(journal) == 3
         assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
+        journal.append(entries(1, first=20))
+        assert log.exists() == (moment == "log")
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5.journal"]
+    with Journal.open(path) as journal:
+        assert [key.sequence for key in journal.index()] == [10, 11, 12, 20]
+
+
+@pytest.mark.parametrize("moment", ["between", "commit", "log"])
+def test_what_a_killed_process_leaves_is_sealed(tmp_path, moment):
+    sealed = seal(crashed(tmp_path, moment=moment))
+    assert (sealed.measurements, sealed.missing, sealed.damaged) == (3, 0, 0)
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5"]
 
 
 def test_a_target_elsewhere(tmp_path):
@@ -420,6 +476,8 @@ from pathlib import Path
 from ertis_numba.journal import Journal
 from tests.journals import EPOCH, entries
 with Journal.open(Path(sys.argv[1])) as journal:
+    if sys.argv[3] == "once":
+        journal._database.write_once()
     for number in range(int(sys.argv[2]), 10**9):
         for sensor in ("left", "right"):
             journal.append(entries(1, sensor=sensor, first=number))
@@ -428,13 +486,14 @@ with Journal.open(Path(sys.argv[1])) as journal:
 """
 
 
-def test_killed_while_it_discards(tmp_path):
+@pytest.mark.parametrize("how", ["log", "once"])
+def test_killed_while_it_discards(tmp_path, how):
     """What was appended and not discarded is there; what was discarded never comes back."""
     create(tmp_path, both()).close()
     path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
     for _ in range(6):
         with subprocess.Popen(
-            [sys.executable, "-c", DISCARD, path, str(max(last.values()) + 2)],
+            [sys.executable, "-c", DISCARD, path, str(max(last.values()) + 2), how],
             env=ENVIRONMENT,
             stdout=subprocess.PIPE,
             text=True,
@@ -470,19 +529,32 @@ def test_removing_waits_for_its_turn(tmp_path, act):
         assert not journal.path.exists()
 
 
+@pytest.mark.parametrize("moment", ["between", "commit", "log"])
 @pytest.mark.parametrize("aside", [False, True])
-def test_removing_takes_all_of_it_away(tmp_path, aside):
-    with Journal.open(crashed(tmp_path)) as journal:
-        assert (tmp_path / "rec.h5.journal-wal").exists()
+def test_removing_takes_all_of_it_away(tmp_path, aside, moment):
+    with Journal.open(crashed(tmp_path, moment=moment)) as journal:
+        journal.append(entries(1, first=20))
         left = [journal.set_aside().name] if aside else journal.remove() or []
     assert [path.name for path in tmp_path.iterdir()] == left
     if aside:
-        crashed(tmp_path)
+        crashed(tmp_path, [*entries(), *entries(1, first=20)], moment=moment)
         with Journal.open(tmp_path / "rec.h5.journal") as journal:
             assert journal.set_aside().name == "rec.h5.journal.2.damaged"
+        assert len(list(tmp_path.iterdir())) == 2
         for path in tmp_path.iterdir():
             with Journal.open(path) as journal:
-                assert len(list(journal.entries())) == 3
+                assert len(list(journal.entries())) == 4
+
+
+@pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
+def test_closing_takes_nothing_away_from_a_journal_made_since(tmp_path, monkeypatch, act):
+    """Whoever makes one of the same name while this one is about to be closed has a log of that name."""
+    with Journal.open(crashed(tmp_path, moment="between")) as journal, monkeypatch.context() as patch:
+        journal.append(entries(1, first=20))
+        log = tmp_path / "rec.h5.journal-journal"
+        patch.setattr(Journal, "close", lambda self: (log.write_text("new"), self._database.close()))
+        act(journal)
+    assert log.read_text() == "new"
 
 
 def test_processes_that_are_killed_lose_nothing(tmp_path):

@@ -4,8 +4,10 @@ import contextlib
 import json
 import os
 import stat
+import threading
 
 import pytest
+import zmq
 from click.testing import CliRunner
 from ertis_cli import _network
 from ertis_cli.keys import keys as keys_command
@@ -14,7 +16,16 @@ from hypothesis import strategies as st
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.network import addresses
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, default_folder, public_key
+from ertis_numba.network.gate import Gate
+from ertis_numba.network.keys import (
+    AllowList,
+    ClientKeys,
+    KeyPair,
+    Permission,
+    ServerKeys,
+    default_folder,
+    public_key,
+)
 
 PAIR = KeyPair.new("robot")
 
@@ -128,6 +139,13 @@ def test_a_folder_that_others_may_use_holds_no_secrets(folder):
     assert not list(folder.iterdir())
 
 
+def test_a_secret_in_a_folder_that_others_may_use_is_refused(folder):
+    secret, _ = PAIR.save(folder)
+    folder.chmod(0o755)
+    with pytest.raises(SettingsError, match=f"others may use its folder \\(mode 0755\\); run 'chmod 700 {folder}'"):
+        KeyPair.load(secret)
+
+
 def test_keys_are_never_written_over(folder):
     PAIR.save(folder)
     with pytest.raises(ArgumentError, match="exists; give another name"):
@@ -209,6 +227,46 @@ def test_a_list_is_read_as_it_was_saved(tmp_path):
     assert listed.find(PAIR.public) == _permission()
     assert listed.find(KeyPair.new("x").public) is None
     assert listed.remove("robot").keys == listed.remove(PAIR.public).keys == (other,)
+
+
+@pytest.mark.parametrize(("what", "mode"), [("allow.toml", 0o664), ("allow.toml", 0o646), (".", 0o775)])
+def test_a_list_that_others_may_change_is_refused(tmp_path, what, mode):
+    path = tmp_path / "allow.toml"
+    AllowList().allow(_permission()).save(path)
+    (tmp_path / what).chmod(mode)
+    with pytest.raises(SettingsError, match=f"others may change it.* \\(mode {mode:04o}\\); run 'chmod go-w"):
+        AllowList.load(path)
+    with zmq.Context() as context, pytest.raises(SettingsError, match="others may change"):
+        Gate(context, ServerKeys(PAIR, path))
+
+
+def test_a_list_is_its_owners_whatever_files_are_by_default(tmp_path):
+    before = os.umask(0)
+    try:
+        AllowList().save(tmp_path / "allow.toml")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "allow.toml").stat().st_mode) == 0o644
+
+
+def test_changes_at_once_lose_nothing_of_each_other(tmp_path):
+    path, threads = tmp_path / "allow.toml", []
+    for number in range(12):
+        permission = _permission(name=f"n{number}", public=KeyPair.new("x").public)
+        threads.append(threading.Thread(target=AllowList.change, args=(path, _slowly(permission))))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(each.name for each in AllowList.load(path).keys) == sorted(f"n{number}" for number in range(12))
+
+
+def _slowly(permission):
+    def change(before):
+        threading.Event().wait(0.01)
+        return before.allow(permission)
+
+    return change
 
 
 def test_a_key_that_is_allowed_again_has_what_was_said_last():

@@ -22,7 +22,12 @@ def test_what_is_saved_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "is damaged"), ('{"settled": 1}', "is damaged"), ('{"version": 2}', "has version 2"), ("", "is damaged")],
+    [
+        ("{", "is damaged"),
+        ('{"settled": 1}', "is damaged"),
+        ('{"version": 2, "news": 1}', "has version 2"),
+        ("", "is damaged"),
+    ],
 )
 def test_a_ledger_that_cannot_be_used_is_refused(content, message, tmp_path):
     (tmp_path / ".ertis-ledger").write_text(content)

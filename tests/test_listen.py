@@ -57,6 +57,8 @@ def test_events_of_every_product():
     assert [each["number"] for each in came] == [0, 1, 2, 3, 4]
     assert came[0]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 0.0, "range_m": pytest.approx(1.5, abs=1e-3)}
     assert (came[0]["sensor"], came[0]["epoch"], came[0]["sequence"], came[0]["made_in_ms"]) == ("front", 7, 1, 12.0)
+    stamp = ("sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
+    assert all(isinstance(each[name], int) for each in came[:3] for name in stamp)
     assert came[1]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 90.0, "range_m": 2.0}
     assert came[1]["n_points"] == 2
     assert came[2]["age_ms"] > 0

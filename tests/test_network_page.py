@@ -81,7 +81,7 @@ def lines_of(page, prompt):
 
 @pytest.mark.parametrize(
     "block",
-    [next(block for block in page.split("```") if "ertis serve" in block) for page in (README, PAGE)],
+    [next(block for block in page.split("```") if "$ ertis serve" in block) for page in (README, PAGE)],
     ids=["readme", "page"],
 )
 def test_one_machine(place, ports, block):

@@ -8,7 +8,7 @@ import pytest
 
 from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
 from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
-from ertis_numba.network.processing.subscribers import Item, Subscriber
+from ertis_numba.network.processing.subscribers import Item, Subscriber, Subscribers
 from ertis_numba.network.status import Status
 from tests.cases import SHORT
 from tests.driven import Application, driven, hello
@@ -104,6 +104,48 @@ def test_a_publisher_that_is_killed_comes_back_at_its_address_and_what_it_had_is
     assert [image.sequence for image, _ in application.got] == [1]
 
 
+def test_a_publisher_that_comes_back_listens_where_it_was_told_to(tmp_path):
+    central, viewer = KeyPair.new("central"), KeyPair.new("viewer")
+    AllowList().save(tmp_path / "allow.toml")
+    with driven(publish="tcp://0.0.0.0:0", keys=ServerKeys(central, tmp_path / "allow.toml")) as loop:
+        publisher = loop.processing.status().publisher_pid
+        os.kill(publisher, signal.SIGKILL)
+        loop.until(lambda: loop.processing.status().publisher_pid not in {0, publisher})
+        elsewhere = loop.processing.address.replace("127.0.0.1", "127.0.0.2")  # of this machine, but another address
+        with Application(elsewhere, ClientKeys(viewer, central.public)):
+            loop.until(lambda: loop.processing.refused.get("unknown key"))
+
+
+def test_a_sensor_may_change_as_often_as_it_likes():
+    with serving() as (loop, application):
+        subscribed(loop, application, "energyscape", "raw", credit=64)
+        for number in range(300):  # each describes what products of it are about
+            place = {"translation_m": (float(number), 0.0, 0.0)}
+            loop.processing.know(hello("left", **place), SHORT)
+            if number % 100 == 0:
+                loop.processing.know(hello("front", **place), SHORT)
+                publish(loop, 1)
+        loop.processing.publish_status(Status(version="1", pid=1, host="here", address="x", state="processing"))
+        publish(loop, 1)
+        loop.until(lambda: application.read() or len(application.got) == 8)
+        assert loop.processing.status().publisher_respawned == 0
+    places = [application.descriptions[image.description][0].translation_m[0] for image, _ in application.got]
+    assert places == [0.0, 0.0, 100.0, 100.0, 200.0, 200.0, 200.0, 200.0]
+
+
+def test_a_publisher_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
+    with serving() as (loop, _):
+        publisher = loop.processing._publisher  # noqa: SLF001  to have it seem to end slowly
+        child = publisher._child  # noqa: SLF001
+        monkeypatch.setattr(type(child), "ended", property(lambda _: False))
+        monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
+        os.kill(child.pid, signal.SIGKILL)
+        loop.until(lambda: not publisher.serves)
+        assert child.pipe.fileno() not in loop.processing.fds()
+        monkeypatch.undo()
+        loop.until(lambda: publisher.serves)
+
+
 def test_a_publisher_that_hangs_is_killed(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.publisher._HUNG_S", 1.5)
     with serving() as (loop, _):
@@ -195,6 +237,39 @@ class TestKeys:
             stranger.read()
         assert {refused.code for refused in sensor.others} == {"role"}
         assert stranger.others == stranger.got == []
+
+
+class TestSubscribers:
+    """Routing ids, as a socket that sends nothing gives them."""
+
+    class Frame:
+        def __init__(self, content):
+            self.bytes = content
+
+    class Socket:
+        def send_multipart(self, *_, **__):
+            pass
+
+    def hear(self, subscribers, number, name):
+        return subscribers.hear([self.Frame(bytes([0, number]))], name, Subscribe(products=("raw",)))
+
+    def test_a_key_cannot_take_the_places_of_others(self):
+        subscribers = Subscribers(self.Socket(), with_keys=True)
+        assert [self.hear(subscribers, number, "a") for number in range(20)] == [True] * 16 + [False] * 4
+        assert self.hear(subscribers, 100, "b")
+        assert self.hear(subscribers, 3, "a")  # is there already
+
+    def test_those_of_a_key_that_are_silent_make_room(self):
+        subscribers = Subscribers(self.Socket(), with_keys=True)
+        for number in range(16):
+            self.hear(subscribers, number, "a")
+        next(iter(subscribers)).retire()
+        assert self.hear(subscribers, 50, "a")
+        assert not self.hear(subscribers, 51, "a")
+
+    def test_without_keys_nobody_can_be_told_from_others(self):
+        subscribers = Subscribers(self.Socket())
+        assert all(self.hear(subscribers, number, "loopback") for number in range(40))
 
 
 class TestSubscriber:

@@ -16,7 +16,12 @@ from ertis_cli.main import cli
 from ertis_numba.journal import SUFFIX
 from ertis_numba.network.messages import Ping
 from tests.central import Node, stored, wanted
-from tests.journals import ENVIRONMENT, entries
+from tests.journals import ENVIRONMENT, TINY, entries
+
+REPORTED = {
+    *("event", "received", "stored", "missing", "recordings", "unsealed", "refused", "seconds", "ack", "commit"),
+    *("processing", "sensors"),
+}
 
 
 class Recording:
@@ -97,7 +102,33 @@ def test_it_ends_after_its_time(tmp_path):
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
     assert "info listening address=tcp://127.0.0.1:" in result.stderr
-    assert "0 measurements stored, 0 missing" in result.stderr
+    assert "0 measurements received, 0 missing" in result.stderr
+
+
+def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):
+    settings = TINY.replace(recording=TINY.recording.replace(n_samples=8192))
+    given = entries(1, first=0, settings=settings)
+    n_bytes = given[0].measurement.words.nbytes
+    for most_bytes in (n_bytes - 1, n_bytes):
+        with Recording(tmp_path, "--most-bytes", str(most_bytes)) as central, Node(central.address) as node:
+            answer = node.hello(first=0, settings=settings)
+            if most_bytes < n_bytes:
+                assert "let it take more (--most-bytes)" in answer.reason
+                continue
+            node.measure(*given)
+            node.hear_settled(0)
+
+
+def test_it_reports_what_serve_does(tmp_path):
+    with Recording(tmp_path) as central, Node(central.address) as node:
+        node.hello(first=2)
+        node.measure(*entries(3, first=2))
+        node.hear_settled(4)
+        central.process.send_signal(signal.SIGINT)
+        told = central.event("recorded")
+    assert set(told) == REPORTED
+    assert (told["received"], told["stored"], told["missing"]) == (3, 3, {"never reached the central node": 2})
+    assert told["missing"] == told["sensors"]["left"]["missing"]
 
 
 def test_metrics_are_served_while_it_runs(tmp_path):

@@ -301,6 +301,26 @@ def test_who_is_refused_is_told_once_and_tries_again_while_others_pass():
 
 
 @IMPATIENT
+def test_a_reason_that_holds_another_number_each_time_is_told_once():
+    asked = queue.Queue()
+
+    def refuse(message):
+        if isinstance(message, messages.Hello) and asked.qsize() < 5:
+            asked.put(message)
+            reason = f"no room for {asked.qsize()} more"
+            return messages.Refused(code="size", reason=reason, sensor=message.sensor, epoch=message.epoch)
+        return None
+
+    with StandIn() as central, Node(central.address, ("left", "right")) as node:
+        central.refusal = refuse
+        node.append([*entries(1), *entries(1, sensor="right")])
+        assert node.flush(SOON_S)
+        notes = sorted(note.partition(":")[0] for note in node.notes.queue)
+    about = "the central node refuses measurements of sensor"
+    assert notes == [f"{about} left", f"{about} right"]
+
+
+@IMPATIENT
 def test_another_version_is_told():
     with StandIn() as central, Node(central.address) as node:
         central.version = 9
@@ -345,6 +365,36 @@ def test_silence_is_answered_by_a_new_connection():
         assert node.reconnects == 1
     assert has_all(central, given)
     assert central.connections > 1
+
+
+def test_a_run_of_which_the_central_node_has_more_holds_no_later_one():
+    """As when the end of a spool was lost with the power."""
+    later = entries(3, first=0, epoch=EPOCH + 1)
+    with StandIn() as central, Node(central.address) as node:
+        central.settled[KEY] = 15
+        node.append([*entries(3), *later])  # 10 to 12
+        assert node.flush(SOON_S)
+        assert node.acks.get_nowait().settled == 12
+    assert KEY not in central.held
+    assert has_all(central, later, ("left", EPOCH + 1))
+
+
+def test_numbers_of_any_kind_are_sent():
+    given = entries(2, first=0)
+    stamp = given[0].measurement.stamp
+    numpy = replace(
+        stamp, sequence=np.int32(0), sync_count=np.int64(5), timestamp_ns=np.int64(9), epoch=np.uint32(EPOCH)
+    )
+    given[0] = replace(
+        given[0], measurement=replace(given[0].measurement, stamp=numpy), monotonic_ns=np.int64(3), crc32=None
+    )
+    with StandIn() as central, Node(central.address) as node:
+        node.append(given)
+        node.note_gap("left", np.int64(2), np.int64(4), "footer", epoch=np.int64(EPOCH))
+        assert node.flush(SOON_S)
+        assert not node.notes.qsize()
+    assert has_all(central, given)
+    assert central.gaps[KEY] == [(2, 4, "footer")]
 
 
 def test_what_is_thrown_away_is_counted_once():
@@ -455,6 +505,18 @@ BAD = {
         lambda node: node.note_gap("left", 2, 1, "x", epoch=1),
         "last missing sequence number is 1; give",
     ),
+    "number": (
+        lambda node: node.append(entries(1, first=2**48 + 1)),
+        f"sequence is {2**48 + 1}; give a whole number from 0 to {2**48}",
+    ),
+    "number of a gap": (
+        lambda node: node.note_gap("left", 20, 2**48 + 1, "x", epoch=EPOCH),
+        f"last missing sequence number is {2**48 + 1}; give a whole number from 0 to {2**48}",
+    ),
+    "half a number": (
+        lambda node: node.note_gap("left", 20, 21.5, "x", epoch=EPOCH),
+        "last missing sequence number is 21.5; give a whole number",
+    ),
     "epoch": (lambda node: node.note_gap("left", 1, 2, "x", epoch=-1), "epoch is -1; give a whole number from 0"),
     "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; give 64 at most"),
     "longer than the memory": (
@@ -493,18 +555,43 @@ def test_words_of_any_kind_are_sent_little_endian():
     assert central.held[KEY][0][1] == strided.tobytes()
 
 
-def test_a_failing_listener_stops_nothing(monkeypatch):
-    monkeypatch.setattr(link, "_FAILED_S", 0.0)
-    notes, given = queue.Queue(), entries(3)
+@IMPATIENT
+def test_a_failing_listener_stops_nothing(caplog):
+    given = entries(6)
 
-    def fail(_settled):
+    def fail(_):
         raise OSError("the pipe is closed")
 
-    with StandIn() as central, SensorNode(central.address, on_note=notes.put, on_settled=fail) as node:
+    with StandIn() as central, SensorNode(central.address, on_note=fail, on_settled=fail) as node:
         node.add_sensor("left", TINY)
+        node.append(given[:3])
+        assert node.flush(SOON_S)
+        central.silent = True
+        until(lambda: node.central == "away")  # which is told
+        node.append(given[3:])
+        central.silent = False
+        assert node.flush(SOON_S)
+        assert node.counts["left"].stored == 6
+    assert has_all(central, given)
+    told = [record.ertis_fields["text"] for record in caplog.records if record.name == "ertis.network.sensor_node"]
+    assert sorted(told) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_note", "on_settled")]
+
+
+def test_a_link_that_fails_is_made_again(monkeypatch):
+    monkeypatch.setattr(link, "_FAILED_S", 0.0)
+    given, failures = entries(3), [MemoryError("no room")]
+    frames_of = link.frames_of
+
+    def fail_once(*arguments):
+        if failures:
+            raise failures.pop()
+        return frames_of(*arguments)
+
+    monkeypatch.setattr(link, "frames_of", fail_once)
+    with StandIn() as central, Node(central.address) as node:
         node.append(given)
         assert node.flush(SOON_S)
-        assert "has failed (OSError: the pipe is closed); it is made again" in notes.get(timeout=SOON_S)
+        assert "has failed (MemoryError: no room); it is made again" in node.notes.get(timeout=SOON_S)
     assert has_all(central, given)
 
 

@@ -23,6 +23,7 @@ from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import open_recording
 from tests.cases import SHORT, noise
+from tests.test_record import REPORTED
 
 TIMEOUT_S = 60.0
 MEASUREMENT = noise(SHORT)
@@ -97,8 +98,18 @@ def is_gone(pid):
 
 
 def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
+    storing = (
+        "--record",
+        str(tmp_path),
+        "--name",
+        "tour",
+        "--rotate-every",
+        "500",
+        "--quarantine",
+        str(tmp_path / "q"),
+    )
     with (
-        serving(*LOOPBACK, "--record", str(tmp_path), "--workers", "1", "--device", "cpu") as served,
+        serving(*LOOPBACK, *storing, "--workers", "1", "--device", "cpu") as served,
         SensorNode(served.listen) as node,
         Subscriber(served.publish, products=("energyscape", "group", "status"), credit=64) as subscriber,
     ):
@@ -114,6 +125,8 @@ def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
                 groups += [product] * isinstance(product, Group)
         assert node.flush(TIMEOUT_S)
         told = served.end()
+    assert set(told) == REPORTED
+    assert (tmp_path / "q").is_dir()
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
     assert all(np.array_equal(image.energy, wanted.energy) for image in images)
@@ -125,6 +138,7 @@ def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
         sensor = told["sensors"][name]
         assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
         (recording,) = told["recordings"]
+        assert Path(recording).name.startswith("tour_")
         with open_recording(recording, sensor=name) as stored:
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
 
@@ -193,7 +207,8 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
     ("options", "told"),
     [
         (("--publish", "tcp://0.0.0.0:0"), "there are no keys"),
-        (("--quarantine", "missing"), "quarantine missing is no folder"),
+        (("--quarantine", "missing/folder"), "missing/folder: No such file or directory; give a folder"),
+        (("--record", "missing", "--rotate-size", "0"), "size of a recording is 0"),
         (("--deadline", "0"), "deadline is 0; give a number above 0"),
         (("--range", "5:1"), "processing.range_m runs from 5 to 1"),
     ],

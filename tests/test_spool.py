@@ -196,12 +196,16 @@ def test_what_is_damaged_in_the_spool_is_a_gap(tmp_path):
 
 
 def test_journals_that_cannot_be_sent_stay(tmp_path):
-    """One that another process has, one that is cut short, one twice, and an empty one, which goes."""
+    """One that another process has, one that is cut short, one with numbers that cannot be sent, one twice.
+
+    And an empty one, which goes.
+    """
     given = entries(4, epoch=7)
     kept(tmp_path, given)
     (path,) = journals(tmp_path)
     shutil.copy(path, tmp_path / "z_copy.h5.journal")
     (tmp_path / "a_empty.h5.journal").touch()
+    create(tmp_path, entries(1, first=2**48 + 1), name="c_far.h5").close()
     (tmp_path / "b_short.h5.journal").write_bytes(path.read_bytes()[: 2 * PAGE_BYTES])
     with (
         create(tmp_path, name="used.h5") as used,
@@ -212,9 +216,12 @@ def test_journals_that_cannot_be_sent_stay(tmp_path):
         notes = list(node.notes.queue)
         assert used.path.exists()
     assert has_all(central, given, ("left", 7))
-    assert [path.name for path in journals(tmp_path)] == ["b_short.h5.journal", "used.h5.journal", "z_copy.h5.journal"]
+    assert [path.name for path in journals(tmp_path)] == [
+        "b_short.h5.journal", "c_far.h5.journal", "used.h5.journal", "z_copy.h5.journal"
+    ]  # fmt: skip
     assert "what is in b_short.h5.journal is not sent" in notes[0]
-    assert "holds runs that another journal holds, too; move it elsewhere" in notes[1]
+    assert f"what is in c_far.h5.journal is not sent: sequence number {2**48 + 1} is above {2**48}" in notes[1]
+    assert "holds runs that another journal holds, too; move it elsewhere" in notes[2]
 
 
 def test_a_journal_of_a_capture_is_sent_too(tmp_path):

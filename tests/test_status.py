@@ -172,7 +172,9 @@ def test_the_command_prints_one_json_object(keys, tmp_path):
             catch_exceptions=False,
         )
     assert result.exit_code == 0
-    told = msgspec.convert(json.loads(result.stdout), Status)
+    report = json.loads(result.stdout)
+    assert report["event"] == "status"
+    told = msgspec.convert(report, Status)
     assert (told.address, told.state, told.keys) == (address, "storage", True)
 
 
@@ -180,6 +182,45 @@ def test_a_command_that_gets_no_answer_fails_in_a_line():
     result = CliRunner().invoke(cli, ["status", "tcp://127.0.0.1:1", "--patience", "0.1"])
     assert result.exit_code == 1
     assert len(result.stderr.splitlines()) == 1
+
+
+class _Asked:
+    """Is there, away, and there again, and then there is nobody who asks."""
+
+    def __init__(self):
+        self._answers = [
+            BUSY,
+            NetworkError("it has not answered"),
+            RefusedError("it hung up"),
+            BUSY,
+            KeyboardInterrupt(),
+        ]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def ask(self, _):
+        answer = self._answers.pop(0)
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_central_node_that_goes_away_is_waited_for(monkeypatch, as_json):
+    monkeypatch.setattr("ertis_numba.network.asking.Asking", lambda *_, **__: _Asked())
+    monkeypatch.setattr("ertis_cli.status._REFRESH_S", 0.0)
+    result = CliRunner().invoke(cli, ["status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
+    if as_json:
+        events = [json.loads(line) for line in result.stdout.splitlines()]
+        assert [each["event"] for each in events] == ["status", "away", "away", "status"]
+        assert events[1] == {"event": "away", "address": BUSY.address, "text": "it has not answered"}
+    else:
+        told = [line for line in result.stdout.splitlines() if line.startswith("away: ")]
+        assert told == [f"away: {why}; it said before:" for why in ("it has not answered", "it hung up")]
 
 
 def _printed(status):

@@ -4,19 +4,25 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Journal
+from ertis_numba.journal import Entry, Journal
 from ertis_numba.network.processing import Options
 from ertis_numba.network.processing.choice import Choice, Mode
 from ertis_numba.network.processing.notes import Forget
+from ertis_numba.network.processing.quarantine import Quarantine
+from ertis_numba.network.processing.runner import Kind, Lost
+from ertis_numba.network.processing.sensors import Sensors
 from tests.cases import SHORT
-from tests.driven import ANY, MEASUREMENT, driven, hello
+from tests.driven import ANY, MEASUREMENT, Lines, data, driven, hello
 
 TIMEOUT_S = 30.0
 
@@ -86,6 +92,149 @@ def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path
         (entry,) = journal.entries()
     assert np.array_equal(entry.measurement.words, MEASUREMENT.words)
     assert entry.measurement.stamp.sequence == 0
+
+
+def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.processing.processing._PAUSE_S", 0.5)
+    with driven() as loop:
+        for sensor in ("bad", "good"):
+            loop.processing.know(hello(sensor), SHORT)
+        loop.until(lambda: loop.workers("idle"))
+        runner = loop.processing._runner  # noqa: SLF001  to have measurements fail
+        with monkeypatch.context() as patch:
+            patch.setattr(runner, "submit", lambda job: failed.append(Lost(job, "it hangs", again=True)))
+            failed = []
+            for _ in range(3):
+                loop.offer("bad")
+                loop.step()
+                for _ in range(2):
+                    loop.processing._handle([failed.pop()])  # noqa: SLF001
+                    loop.processing._dispatch()  # noqa: SLF001
+        counts = loop.processing.counts("bad")
+        assert counts.dropped == {"failed twice": 3}
+        loop.offer("bad")
+        assert counts.dropped["too many of its sensor have failed"] == 1
+        told = loop.processing.drain_dropped()
+        assert told == [("bad", 7, number, "failed twice") for number in range(3)] + [
+            ("bad", 7, 3, "too many of its sensor have failed")
+        ]
+        assert loop.processing.drain_dropped() == []
+        loop.offer("good")
+        loop.settle()
+        assert loop.processing.counts("good").published == 1
+        loop.until(lambda: loop.offer("bad") or counts.published)  # after its pause
+
+
+def test_a_quarantine_has_an_end(tmp_path):
+    log = Lines("processing")
+    quarantine = Quarantine(tmp_path, log)
+    for number in range(110):
+        stamp = replace(MEASUREMENT.stamp, sequence=number)
+        quarantine.put(Entry(replace(MEASUREMENT, stamp=stamp), 0, zlib.crc32(MEASUREMENT.words.tobytes())))
+        while quarantine._waiting.qsize() > 8:  # noqa: SLF001
+            os.sched_yield()
+    quarantine.close()
+    (path,) = tmp_path.glob("quarantine_*.h5.journal")
+    with Journal.open(path) as journal:
+        assert len(list(journal.entries())) == 100
+    assert sum("100 are kept already" in fields["text"] for event, fields in log.lines if event == "not_kept") == 10
+
+
+def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.processing.quarantine._CLOSED_S", 0.05)
+    answers = threading.Event()
+    monkeypatch.setattr(Quarantine, "_write", lambda *_: answers.wait(TIMEOUT_S))
+    quarantine = Quarantine(tmp_path, Lines("processing"))
+    for _ in range(20):  # more than may wait
+        quarantine.put(Entry(MEASUREMENT, 0, 0))
+    quarantine.close()
+    assert quarantine._thread.is_alive()  # noqa: SLF001
+    answers.set()
+
+
+def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_there():
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: loop.workers("idle"))
+        runner = loop.processing._runner  # noqa: SLF001
+        (worker,) = runner._workers  # noqa: SLF001
+        sent = []
+        pipe, send = worker.child.pipe, worker.child.pipe.send
+        pipe.send = lambda note, **files: (sent.append(note), send(note, **files))
+        kind = Kind(99, SHORT.replace(air=SHORT.air.replace(temperature_c=3.0)).to_toml(), MEASUREMENT.words.nbytes)
+        runner.prepare(kind)
+        runner.forget(kind)
+        loop.until(lambda: loop.workers("idle"))
+        assert [type(note).__name__ for note in sent] == ["Prepare", "Forget"]
+        assert 99 not in worker.kinds
+
+
+def test_a_worker_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
+    with driven() as loop:
+        loop.processing.know(hello(), SHORT)
+        loop.until(lambda: loop.workers("idle"))
+        (worker,) = loop.processing._runner._workers  # noqa: SLF001  to have it seem to end slowly
+        child = worker.child
+        monkeypatch.setattr(type(child), "ended", property(lambda _: False))
+        monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
+        os.kill(child.pid, signal.SIGKILL)
+        loop.until(lambda: worker.state == "starting")
+        assert child.pipe.fileno() not in loop.processing.fds()
+        loop.offer()
+        monkeypatch.undo()
+        loop.settle()
+        assert loop.processing.counts("front").published == 1
+
+
+class TestSensors:
+    def sensors(self, **options):
+        described, kinds, log = [], [], Lines("processing")
+        tell = lambda *about: described.append(about)  # noqa: E731
+        made = Sensors(Options(publish=ANY, **options), log, describe=tell, prepare=kinds.append)
+        return made, kinds, log
+
+    def test_air_that_changes_slowly_makes_no_pipeline_of_each_measurement(self):
+        sensors, kinds, _ = self.sensors()
+        sensors.know(hello(), SHORT)
+        first = SHORT.air.temperature_c
+        for number in range(1000):
+            sensors.kind_of(data(temperature_c=first + number / 500))
+            assert abs(sensors["front"].settings.air.temperature_c - first - number / 500) <= 0.5
+        assert len(kinds) <= 5
+        sensors.know(hello(), SHORT)  # it connects again
+        sensors.kind_of(data(temperature_c=first + 2))
+        assert len(kinds) <= 5
+        assert sensors.kind_of(data(humidity_percent=float("nan"))) is None
+
+    def test_images_that_are_too_large_are_refused_before_anything_is_made(self):
+        sensors, kinds, log = self.sensors()
+        wide = SHORT.processing.replace(directions="3d:1000000", range_m=(0.4, 1.4))
+        sensors.know(hello(), SHORT.replace(processing=wide))
+        assert sensors.kind_of(data()) is None
+        assert kinds == []
+        ((event, fields),) = log.lines
+        assert (event, "256 MB at most" in fields["text"]) == ("unusable", True)
+        sensors.know(hello("good"), SHORT.replace(processing=SHORT.processing.replace(directions="3000")))
+        assert len(kinds) == 1
+
+    def test_a_pipeline_that_could_not_be_made_is_tried_again_after_a_while(self, monkeypatch):
+        sensors, kinds, _ = self.sensors()
+        now_s = time.monotonic()
+        sensors.know(hello(), SHORT)
+        kind = sensors.kind_of(data())
+        for after_s in (70.0, 140.0):
+            sensors.failed(kind.number, "no memory")
+            sensors.tick()
+            assert sensors.kind_of(data()) is None
+            monkeypatch.setattr(time, "monotonic", lambda after_s=after_s: now_s + after_s)
+            sensors.tick()
+            assert sensors.kind_of(data()) is kind
+        sensors.failed(kind.number, "no memory")
+        sensors.know(hello(), SHORT)
+        assert sensors.kind_of(data()) is None
+        monkeypatch.setattr(time, "monotonic", lambda: now_s + 151.0)
+        sensors.know(hello(), SHORT)
+        assert kinds == [kind] * 4
 
 
 def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():

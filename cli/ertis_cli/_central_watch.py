@@ -4,18 +4,35 @@ import json
 import sys
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import click
+
+from ertis_cli import options
 from ertis_cli._lines import Lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import TracebackType
     from typing import Self
 
     from ertis_numba.network.status import Status
 
-__all__ = ["CentralWatch"]
+__all__ = ["CentralWatch", "most_bytes", "name", "report", "rotate_every", "rotate_size"]
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+name: Decorator = click.option("--name", default="recording", show_default=True, help="Of recordings, before the time.")
+rotate_size: Decorator = click.option(
+    "--rotate-size", type=float, default=2000.0, show_default=True, metavar="MB", help="Of a recording that is full."
+)
+rotate_every: Decorator = click.option(
+    "--rotate-every", type=float, default=600.0, show_default=True, metavar="S", help="A new recording after so long."
+)
+most_bytes: Decorator = click.option(
+    "--most-bytes", type=int, default=4 * 2**20, show_default=True, help="Of a measurement; longer ones are refused."
+)
 
 _REFRESH_S = 0.5
 _EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
@@ -95,6 +112,59 @@ class CentralWatch:
     def _draw(self, status: "Callable[[], Status]") -> None:
         while not self._ended.wait(_REFRESH_S):
             self._err.write(f"\r\x1b[K{_progress(status())}")
+
+
+def report(status: "Status", recordings: list[str], *, event: str, quiet: bool, as_json: bool) -> None:
+    """Tell what has come of it; leave with an exit code of 1 where journals are left.
+
+    Parameters
+    ----------
+    status : Status
+    recordings : list of str
+        That were made.
+    event : str
+        Its name.
+    quiet, as_json : bool
+    """
+    import msgspec
+
+    sensors, archive = status.sensors, status.archive
+    missing: Counter[str] = Counter()
+    for each in sensors.values():
+        missing.update(each.missing)
+    left = 0 if archive is None else archive.sealing
+    if as_json:
+        told = {
+            "received": sum(each.received for each in sensors.values()),
+            "stored": sum(each.stored for each in sensors.values()),
+            "missing": missing,
+            "recordings": recordings,
+            "unsealed": left,
+            "refused": status.refused,
+            "seconds": status.uptime_s,
+            "ack": None if archive is None else archive.ack,
+            "commit": None if archive is None else archive.commit,
+            "processing": status.processing,
+            "sensors": sensors,
+        }
+        options.print_json({"event": event} | msgspec.to_builtins(told))
+    options.say(
+        f"{options.counted(sum(each.received for each in sensors.values()), 'measurement')} received, "
+        f"{missing.total()} missing",
+        quiet=quiet,
+    )
+    for sensor, each in sensors.items():
+        parts = [f"{each.received} received"]
+        if archive is not None:
+            parts.append(f"{each.stored} stored")
+        if status.processing is not None:
+            parts.append(f"{each.published} published")
+        parts += [f"{count} dropped ({reason})" for reason, count in each.dropped.items()]
+        parts += [f"{count} missing ({reason})" for reason, count in each.missing.items()]
+        options.say(f"{sensor}: {', '.join(parts)}", quiet=quiet)
+    if archive is not None and left:
+        click.echo(f"{options.counted(left, 'journal')} not sealed; seal by 'ertis recover {archive.folder}'", err=True)
+        click.get_current_context().exit(1)
 
 
 def _progress(status: "Status") -> str:

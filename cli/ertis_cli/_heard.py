@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Heard"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
+_STAMP = ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
 
@@ -61,11 +62,7 @@ class Heard:
         header = arrival.header
         age_s, made_in_s = arrival.age_s, arrival.made_in_s
         if self._as_json:
-            stamp = {
-                name: getattr(header, name)
-                for name in ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "monotonic_ns")
-                if hasattr(header, name)
-            }
+            stamp = {name: getattr(header, name) for name in _STAMP if hasattr(header, name)}
             times = {"age_ms": age_s, "made_in_ms": made_in_s}
             rounded = {name: None if value is None else round(1e3 * value, 3) for name, value in times.items()}
             options.print_json(

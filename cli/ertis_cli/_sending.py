@@ -48,6 +48,14 @@ class _Watch(Watch):
 class Sending:
     """A capture whose measurements go to a central node.
 
+    Parameters
+    ----------
+    address : str
+    spool : Path or None
+    sizes_mb : dict
+        "spool_bytes" and "ring_bytes" of a `SensorNode`; None for what it has by default.
+    quiet, as_json : bool
+
     Attributes
     ----------
     address : str
@@ -56,8 +64,11 @@ class Sending:
         What became of them, for programs, once `run` has returned.
     """
 
-    def __init__(self, address: str, spool: Path | None, *, quiet: bool, as_json: bool) -> None:
+    def __init__(
+        self, address: str, spool: Path | None, sizes_mb: dict[str, float | None], *, quiet: bool, as_json: bool
+    ) -> None:
         self.address, self._spool, self._quiet = address, spool, quiet
+        self._sizes = {name: round(1e6 * size_mb) for name, size_mb in sizes_mb.items() if size_mb is not None}
         self.watch = _Watch(quiet=quiet, as_json=as_json)
         self.report: dict[str, Any] = {}
 
@@ -66,7 +77,12 @@ class Sending:
         from ertis_numba.network.sensor_node import SensorNode
 
         self._node = self.watch.node = SensorNode(
-            self.address, keys=keys, spool=self._spool, on_settled=self.watch.settled, on_note=self.watch.linked
+            self.address,
+            keys=keys,
+            spool=self._spool,
+            on_settled=self.watch.settled,
+            on_note=self.watch.linked,
+            **self._sizes,
         )
         return self._node
 
@@ -110,7 +126,8 @@ class Sending:
         if self._spool and total["unsettled"]:
             self._say(f"{waiting} wait in {self._spool}; the next capture with --spool sends what is there")
         lost = sum(total[name] for name in _COUNTS) - (total["unsettled"] if self._spool else 0)
-        remedy = "give the spool a larger disk" if self._spool else "give --spool DIR, which keeps them on the disk"
+        larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
+        remedy = f"give the spool {larger}" if self._spool else "give --spool DIR, which keeps them on the disk"
         did_not = f"{options.counted(lost, 'measurement')} did not reach the central node at {self.address}; {remedy}"
         return did_not if lost else ""
 

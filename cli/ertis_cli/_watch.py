@@ -127,7 +127,7 @@ class Watch:
                         "epoch": stamp.epoch,
                         "sequence": stamp.sequence,
                         "sync_count": stamp.sync_count,
-                        "time_ns": stamp.timestamp_ns,
+                        "timestamp_ns": stamp.timestamp_ns,
                         "uncertainty_ns": stamp.timestamp_uncertainty_ns,
                         "crc32": entry.crc32,
                     }

@@ -42,6 +42,20 @@ __all__ = ["capture"]
     metavar="DIR",
     help="With --to: keep measurements there until the central node has them; in memory by default.",
 )
+@click.option(
+    "--spool-size",
+    "spool_mb",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MB",
+    help="Of measurements in the spool, above which new ones are refused; what the disk has room for by default.",
+)
+@click.option(
+    "--ring",
+    "ring_mb",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MB",
+    help="With --to: of measurements in memory; 64 by default. Without --spool, the oldest are lost when it is full.",
+)
 @_network.key
 @_network.server_key
 @click.option(
@@ -93,6 +107,8 @@ def capture(
     target: Path | None,
     address: str | None,
     spool: Path | None,
+    spool_mb: float | None,
+    ring_mb: float | None,
     key: str | None,
     server_key: str | None,
     mounting: Path | None,
@@ -136,14 +152,17 @@ def capture(
         _print_commands(setup, as_json=as_json)
         return
     _require_one_each(ports, names)
-    _require_one_place(address, target, for_address=(spool, key, server_key))
+    _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, key, server_key))
+    if spool_mb is not None and spool is None:
+        raise click.UsageError("--spool-size is given without --spool; give its folder, too")
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
     from ertis_numba.devices.sonar import Sonar
 
     if target is not None:
         check_target(target, overwrite=force)
-    send = None if address is None else Sending(address, spool, quiet=quiet, as_json=as_json)
+    sizes = {"spool_bytes": spool_mb, "ring_bytes": ring_mb}
+    send = None if address is None else Sending(address, spool, sizes, quiet=quiet, as_json=as_json)
     watch = Watch(quiet=quiet, as_json=as_json) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
         if send is not None:
@@ -273,7 +292,9 @@ def _checks(names: "Iterable[str]", settings: "Settings", *, splices: bool) -> "
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
     if address is None and any(for_address):
-        raise click.UsageError("--spool, --key and --server-key are about a central node; give --to, too")
+        raise click.UsageError(
+            "--spool, --spool-size, --ring, --key and --server-key are about a central node; give --to, too"
+        )
     if address is not None and target is not None:
         raise click.UsageError("--to and --output both say where measurements go; give one of them")
 

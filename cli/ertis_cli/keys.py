@@ -8,7 +8,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.network.keys import AllowList, Permission
+    from ertis_numba.network.keys import Permission
 
 __all__ = ["keys"]
 
@@ -69,7 +69,7 @@ def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
     """Let a key in, from the next second on; what it was allowed before is replaced."""
-    from ertis_numba.network.keys import ROLES, Permission, public_key
+    from ertis_numba.network.keys import ROLES, AllowList, Permission, public_key
 
     public, named = public_key(key)
     if not (name or named):
@@ -78,8 +78,7 @@ def allow(
     permission = Permission(name=name or named, public=public, role=chosen, serials=serials)
     path = _path(listed)
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    allowed = _load(path).allow(permission)
-    allowed.save(path)
+    AllowList.change(path, lambda before: before.allow(permission))
     _print(path, [permission], as_json=as_json)
 
 
@@ -89,10 +88,10 @@ def allow(
 @options.as_json
 def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
     """Let a key in no more, from the next second on, connected or not."""
+    from ertis_numba.network.keys import AllowList
+
     path = _path(listed)
-    before = _load(path)
-    after = before.remove(who)
-    after.save(path)
+    before, after = AllowList.change(path, lambda before: before.remove(who))
     removed = [permission for permission in before.keys if permission not in after.keys]
     if as_json:
         options.print_json({"list": str(path), "removed": [_report(permission) for permission in removed]})
@@ -105,21 +104,16 @@ def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
 @options.as_json
 def list_(*, listed: Path | None, as_json: bool) -> None:
     """Show who is let in, and as what."""
+    from ertis_numba.network.keys import AllowList
+
     path = _path(listed)
-    _print(path, list(_load(path).keys), as_json=as_json)
+    _print(path, list(AllowList.load(path).keys) if path.exists() else [], as_json=as_json)
 
 
 def _path(listed: Path | None) -> Path:
     from ertis_numba.network.keys import ALLOW_LIST, default_folder
 
     return listed or default_folder() / ALLOW_LIST
-
-
-def _load(path: Path) -> "AllowList":
-    """Return a list, which is empty before it is made."""
-    from ertis_numba.network.keys import AllowList
-
-    return AllowList.load(path) if path.exists() else AllowList()
 
 
 def _report(permission: "Permission") -> dict[str, Any]:

@@ -3,14 +3,11 @@
 import threading
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
-from ertis_cli import _network, options
-
-if TYPE_CHECKING:
-    from ertis_numba.network.status import Status
+from ertis_cli import _central_watch, _network, options
 
 __all__ = ["serve"]
 
@@ -21,6 +18,10 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--listen", metavar="ADDRESS", help="Where sensor nodes come; tcp://127.0.0.1:5601 by default.")
 @click.option("--publish", metavar="ADDRESS", help="Where applications come; tcp://127.0.0.1:5602 by default.")
 @click.option("--record", "folder", type=_FOLDER, metavar="DIR", help="Store measurements there as well.")
+@_central_watch.name
+@_central_watch.rotate_size
+@_central_watch.rotate_every
+@_central_watch.most_bytes
 @click.option("--workers", type=click.IntRange(1, 256), metavar="N", help="Processes; as many as cores by default.")
 @options.threads
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own by default.")
@@ -63,6 +64,10 @@ def serve(
     listen: str | None,
     publish: str | None,
     folder: Path | None,
+    name: str,
+    rotate_size: float,
+    rotate_every: float,
+    most_bytes: int,
     workers: int | None,
     threads: int | None,
     directions: str | None,
@@ -89,19 +94,24 @@ def serve(
     take longer than measurements to come, the oldest are dropped and counted. With --record, what is acknowledged is
     durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
     """
-    from ertis_cli._central_watch import CentralWatch
     from ertis_cli._watch import stopped_by_signals
+    from ertis_numba.errors import DataError
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH
     from ertis_numba.network.central_node import Archive, CentralNode
     from ertis_numba.network.processing import Options, Processing
 
     changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
     keys = _network.server_keys(key, allow)
+    if quarantine is not None:
+        try:
+            quarantine.mkdir(exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{quarantine}: {error.strerror}; give a folder that can be written") from error
     processing = Processing(
         Options(
             publish=publish or DEFAULT_PUBLISH,
             keys=keys,
-            processing={name: value for name, value in changes.items() if value is not None},
+            processing={option: value for option, value in changes.items() if value is not None},
             max_error_db=max_error_db,
             device=device,
             workers=workers,
@@ -112,7 +122,10 @@ def serve(
             cluster=scheduler,
         )
     )
-    watch = CentralWatch(quiet=quiet, as_json=as_json)
+    archive = None
+    if folder is not None:
+        archive = Archive(folder, name, rotate_bytes=1e6 * rotate_size, rotate_s=rotate_every)
+    watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
 
     def on_event(event: dict[str, Any]) -> None:
         watch.event(event | ({"publish": processing.address} if event["event"] == "listening" else {}))
@@ -120,8 +133,9 @@ def serve(
     node = CentralNode(
         listen or DEFAULT_LISTEN,
         keys=keys,
-        archive=None if folder is None else Archive(folder),
+        archive=archive,
         processing=processing,
+        most_bytes=most_bytes,
         on_event=on_event,
         on_stored=watch.stored if as_json and every else None,
     )
@@ -136,34 +150,4 @@ def serve(
             stack.enter_context(Metrics(metrics, lambda: node.latest))
         with watch.shows(lambda: node.latest):
             node.run(stop, duration)
-    _report(node.status(), watch.recordings, quiet=quiet, as_json=as_json)
-
-
-def _report(status: "Status", recordings: list[str], *, quiet: bool, as_json: bool) -> None:
-    """Tell what has come of it."""
-    import msgspec
-
-    sensors, archive = status.sensors, status.archive
-    if as_json:
-        report = msgspec.to_builtins(
-            {
-                "recordings": recordings,
-                "unsealed": 0 if archive is None else archive.sealing,
-                "refused": status.refused,
-                "seconds": status.uptime_s,
-                "ack": None if archive is None else archive.ack,
-                "processing": status.processing,
-                "sensors": sensors,
-            }
-        )
-        options.print_json({"event": "served"} | report)
-    for name, each in sensors.items():
-        dropped = "".join(f", {count} dropped ({reason})" for reason, count in each.dropped.items())
-        missing = "".join(f", {count} missing ({reason})" for reason, count in each.missing.items())
-        stored = "" if archive is None else f", {each.stored} stored"
-        told = f"{each.received} received, {each.published} published{dropped}{missing}{stored}"
-        options.say(f"{name}: {told}", quiet=quiet)
-    if archive is not None and archive.sealing:
-        left = options.counted(archive.sealing, "journal")
-        click.echo(f"{left} not sealed; seal by 'ertis recover {archive.folder}'", err=True)
-        click.get_current_context().exit(1)
+    _central_watch.report(node.latest, watch.recordings, event="served", quiet=quiet, as_json=as_json)

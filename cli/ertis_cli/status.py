@@ -13,6 +13,7 @@ from ertis_cli import _network, options
 if TYPE_CHECKING:
     from rich.console import Group
 
+    from ertis_numba.network.asking import Asking
     from ertis_numba.network.status import Percentiles, Status
 
 __all__ = ["status"]
@@ -41,7 +42,7 @@ def status(
     """Show how the central node at ADDRESS is, live on a terminal.
 
     ADDRESS is that where sensors send to it, or that where it publishes. With keys, those of an application or an
-    admin are needed.
+    admin are needed. A central node that goes away meanwhile is waited for.
     """
     from ertis_numba import checks
     from ertis_numba.network.asking import Asking
@@ -50,28 +51,41 @@ def status(
         raise click.UsageError("--once and --watch exclude each other; give one of them")
     checks.positive("--patience", patience)
     with Asking(address, keys=_network.client_keys(key, server_key)) as node:
-        if as_json or once or not (watch or sys.stdout.isatty()):
-            _print(node.ask(patience), as_json=as_json)
-            while watch:
-                time.sleep(_REFRESH_S)
-                _print(node.ask(patience), as_json=as_json)
+        if as_json or once or not sys.stdout.isatty():
+            for now, away in _looks(node, patience, again=watch):
+                _print(now, away, as_json=as_json)
             return
         with _live() as show:
-            while True:
-                show(_drawn(node.ask(patience)))
-                time.sleep(_REFRESH_S)
+            for now, away in _looks(node, patience, again=True):
+                show(_drawn(now, away))
 
 
-def _print(now: "Status", *, as_json: bool) -> None:
+def _looks(node: "Asking", patience_s: float, *, again: bool) -> "Iterator[tuple[Status, str]]":
+    """Yield how it is, or how it was last and why it does not answer; it has to answer the first time."""
+    from ertis_numba.errors import NetworkError
+
+    now = node.ask(patience_s)
+    yield now, ""
+    while again:
+        time.sleep(_REFRESH_S)
+        try:
+            now, away = node.ask(patience_s), ""
+        except NetworkError as error:  # it may be started again
+            away = str(error)
+        yield now, away
+
+
+def _print(now: "Status", away: str, *, as_json: bool) -> None:
     from rich.console import Console
 
     if as_json:
         import msgspec
 
-        options.print_json(msgspec.to_builtins(now))
+        event = {"address": now.address, "text": away} if away else msgspec.to_builtins(now)
+        options.print_json({"event": "away" if away else "status"} | event)
         return
     # A pipe is as wide as a table needs.
-    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(_drawn(now))
+    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(_drawn(now, away))
 
 
 @contextmanager
@@ -82,8 +96,8 @@ def _live() -> "Iterator[Any]":
         yield lambda drawn: live.update(drawn, refresh=True)
 
 
-def _drawn(now: "Status") -> "Group":
-    """Return the tables."""
+def _drawn(now: "Status", away: str = "") -> "Group":
+    """Return the tables; where it does not answer, those of before."""
     from rich.console import Group
     from rich.text import Text
 
@@ -92,7 +106,8 @@ def _drawn(now: "Status") -> "Group":
         f"{now.address} on {now.host}, {now.state}, up {_seconds(now.uptime_s)}, "
         f"{options.counted(now.peers, 'sensor node')}, {keys}, {now.memory_bytes / 1e6:.0f} MB"
     )
-    lines = [Text(head)]
+    lines = [Text(f"away: {away}; it said before:", style="bold red")] if away else []
+    lines.append(Text(head))
     if now.fault:
         lines.append(Text(f"fault: {now.fault}", style="bold red"))
     if now.refused:

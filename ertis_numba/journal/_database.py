@@ -2,6 +2,7 @@
 
 import os
 import sqlite3
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -9,17 +10,18 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
-from ertis_numba.journal._tables import APPLICATION_ID, VERSION, layout
+from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
 
 PAGE_BYTES: Final = 32_768  # of 4 to 64 KiB, it takes the least time for measurements of 128 KiB to 1 MiB
 LOG_BYTES: Final = 4_194_304  # of the write-ahead log; then what is in it moves to the main file
 _CACHE_KIB: Final = 4096
+_HEADER: Final = struct.Struct(">8s5I")  # of the rollback journal, see https://sqlite.org/fileformat.html
+_MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 
 _SETUP: Final = (
     "PRAGMA cell_size_check = ON",
-    "PRAGMA journal_mode = WAL",  # after locking_mode: then its index is in memory, and no -shm is made
     # What a commit wrote has reached the disk when it returns. NORMAL would leave that to the next checkpoint.
     "PRAGMA synchronous = FULL",
     "PRAGMA fullfsync = ON",  # on macOS, where fsync leaves it in the disk's cache
@@ -58,16 +60,18 @@ class Database:
 
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
+        self._writes_once = False  # as far as is known
+        self._ends: dict[str, int] = {}  # of the tables before a commit, until it is known to be one
         with self._told():
             self._file = before = path.stat()
             if not before.st_size and not empty:  # to lock it would make a database of it
                 raise DataError(f"{path} is empty; give a journal that 'ertis capture' left")
-            log = path.with_name(f"{path.name}-wal")
-            if before.st_size < PAGE_BYTES and log.exists() and log.stat().st_size:  # SQLite would throw the log away
-                raise DamagedError(
-                    f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; copy "
-                    "both again"
-                )
+            for log, least_bytes in _least(path):  # SQLite would throw the log away, or make up the rest with zeros
+                if before.st_size < least_bytes:
+                    raise DamagedError(
+                        f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; "
+                        "copy both again"
+                    )
             uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
             # Who uses a journal sees to it that two threads do not use it at once.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
@@ -98,7 +102,33 @@ class Database:
             )
         for statement in _SETUP:
             self.execute(statement)
+        if is_new:  # after locking_mode: then its index is in memory, and no -shm is made
+            self.execute("PRAGMA journal_mode = WAL")
         return is_new
+
+    def write_once(self) -> None:
+        """Have commits write to the main file at once, from now on, and for ever.
+
+        Until then they write to the log, which takes one sync, and move what is in it to the main file when it is full.
+        Where each commit fills the log, that is to write all twice. From now on a rollback journal keeps what the pages
+        that change were like; new rows take new pages, of which nothing has to be kept. A commit takes four syncs.
+
+        Raises
+        ------
+        DataError
+            The disk is full or fails. All is as before.
+        """
+        if not self._writes_once:
+            self._roll_back_by("DELETE")
+            self._writes_once = True
+
+    def _roll_back_by(self, mode: str) -> None:
+        """Go over to a rollback journal, which commits leave with a void header, as nobody else can have the file.
+
+        When the file is closed, DELETE removes it by its name.
+        """
+        if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
+            raise DataError(f"{self._path} cannot do without its log; close it, and try again")
 
     def require_name(self) -> None:
         """Refuse to go on with a file that has lost its name: what is written to it could not be found again.
@@ -133,7 +163,15 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Make what happens in the block durable when it ends, all or nothing."""
+        """Make what happens in the block durable when it ends, all or nothing; when it raises, no row was added."""
+        self._take_back()
+        with self._all_or_nothing():
+            self._ends = self._find_ends()
+            yield
+        self._ends = {}
+
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
         self.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -142,7 +180,28 @@ class Database:
             with suppress(sqlite3.Error):  # the first error is the one to tell
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
+            with suppress(DataError):  # the next transaction tries it again
+                self._take_back()
             raise
+
+    def _find_ends(self) -> dict[str, int]:
+        """Return the highest number of a row in each table that there is."""
+        names = {name for (name,) in self.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
+        tables = [table for table in TABLES if table in names]
+        ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
+        return dict(zip(tables, ends, strict=True))
+
+    def _take_back(self) -> None:
+        """Delete what a commit has added that failed all the same: in its very last step, when all was written."""
+        if ends := self._ends:
+            self._ends = {}
+            try:
+                with self._all_or_nothing():
+                    for table, last in ends.items():
+                        self.execute(f"DELETE FROM {table} WHERE id > ?", (last,))  # noqa: S608  our own
+            except BaseException:
+                self._ends = ends
+                raise
 
     def lay_out(self) -> None:
         """Make the tables; to be called in a transaction."""
@@ -152,10 +211,17 @@ class Database:
     def leave_log(self) -> None:
         """Bring all to the main file, and remove the log: then closing touches no file by its name.
 
-        Where the disk is full, the log stays.
+        Only closing may follow: a commit that is cut off could not be rolled back any more.
+
+        Raises
+        ------
+        DataError
+            The disk is full or fails. The log stays.
         """
-        with suppress(DataError):
-            self.execute("PRAGMA journal_mode = MEMORY")
+        for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # rolls back what a disk that failed has left
+            self.execute(statement)
+        self._roll_back_by("PERSIST")
+        _beside(self._path, "-journal").unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file; closing twice does no harm."""
@@ -186,6 +252,24 @@ class Database:
             raise DamagedError(f"{self._path} {_TOLD[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
+
+
+def _beside(path: Path, end: str) -> Path:
+    return path.with_name(f"{path.name}{end}")
+
+
+def _least(path: Path) -> Iterator[tuple[Path, int]]:
+    """Yield the logs beside a file, and how long the file has to be for each."""
+    log = _beside(path, "-wal")
+    if log.exists() and log.stat().st_size:
+        yield log, PAGE_BYTES
+    log = _beside(path, "-journal")
+    if log.exists():
+        with log.open("rb") as file:
+            header = file.read(_HEADER.size)
+        if len(header) == _HEADER.size and header.startswith(_MAGIC):
+            *_, n_pages, _, page_bytes = _HEADER.unpack(header)
+            yield log, n_pages * page_bytes
 
 
 def _line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
@@ -10,7 +11,7 @@ from ertis_numba.atomic import sync
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import _room
 from ertis_numba.journal._contents import Contents
-from ertis_numba.journal._database import Database
+from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
 from ertis_numba.settings import Settings
@@ -180,6 +181,9 @@ class Journal(Contents):
             seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
             _room.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
             self._database.require_name()
+            if sum(sizes_bytes) > LOG_BYTES:
+                with suppress(DataError):
+                    self._database.write_once()
             with self._database.transaction():
                 for row in rows:
                     self._database.execute(_INSERTION, row)
@@ -215,9 +219,25 @@ class Journal(Contents):
         DataError
             The journal cannot be written.
         """
-        Gap(self._sensor(sensor).name, first, last, reason, epoch)
-        with self._turn, self._database.transaction():
-            self._insert("gaps", (self._ids[sensor], epoch, first, last, reason))
+        self.note_gaps([Gap(sensor, first, last, reason, epoch)])
+
+    def note_gaps(self, gaps: Sequence[Gap]) -> None:
+        """Say durably what is missing, all of it or nothing.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such sensor.
+        DataError
+            The journal cannot be written.
+        """
+        with self._turn:
+            rows = [
+                (self._ids[self._sensor(gap.sensor).name], gap.epoch, gap.first, gap.last, gap.reason) for gap in gaps
+            ]
+            with self._database.transaction():
+                for row in rows:
+                    self._insert("gaps", row)
 
     def discard(self, sensor: str, epoch: int, up_to: int) -> int:
         """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
@@ -288,34 +308,44 @@ class Journal(Contents):
     def remove(self) -> None:
         """Close the journal and remove it: what is in it is in a recording, or is nothing."""
         with self._turn:
-            self._release()
-            self.path.unlink(missing_ok=True)
-            # Only where the disk was too full to take the log in; without the main file it means nothing.
-            for end in _BESIDE:
-                self.path.with_name(self.path.name + end).unlink(missing_ok=True)
-            self.close()
+            try:
+                with suppress(DataError):
+                    self._release()
+                self.path.unlink(missing_ok=True)
+                # Only where the disk was too full to take the log in; without the main file it means nothing.
+                for end in _BESIDE:
+                    self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+            finally:
+                self.close()
             sync(self.path.parent)
 
     def set_aside(self) -> Path:
-        """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that."""
+        """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that.
+
+        Raises
+        ------
+        DataError
+            The disk is full or fails. The journal has its name still.
+        """
         with self._turn:
-            self._release()
-            if self.path.with_name(f"{self.path.name}-wal").exists():
-                raise DataError(f"{self.path} cannot be set aside, its disk is full; free some space")
-            number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
-            while aside.exists():
-                number += 1
-                aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
-            self.path.rename(aside)
-            self.close()
+            try:
+                self._release()
+                number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
+                while aside.exists():
+                    number += 1
+                    aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
+                self.path.rename(aside)
+            finally:
+                self.close()
             sync(self.path.parent)
         return aside
 
     def _release(self) -> None:
         """Make the file ready to lose its name; it stays locked where the system lets an open file lose it."""
-        self._database.leave_log()
         if os.name == "nt":
             self.close()
+        else:
+            self._database.leave_log()
 
 
 _INSERTION: Final = insertion("measurements")

@@ -14,6 +14,7 @@ __all__ = ["left", "recording_bytes", "require"]
 _SPARE_BYTES: Final = SPARE_BYTES + 1_000_000  # what sealing wants to keep free while it writes, and a little more
 _SENSOR_BYTES: Final = 150_000  # a recording's tables: 90 kB were measured, and the settings may be longer
 _ROW_BYTES: Final = 150  # in these tables
+_KEPT_PAGES: Final = 6  # that a commit changes, beside one for each of its measurements
 
 
 def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
@@ -26,7 +27,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
 
     The disk of ``target`` has to have room for the recording of all that is in the journal, and some to spare;
     that of the journal for what is in the log now, which moves to the main file, and for the new measurements,
-    first in the log and then in the main file.
+    first in the log and then in the main file; or, without a log, for these and the pages that change.
 
     Parameters
     ----------
@@ -43,9 +44,12 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
         There is too little room.
     """
     log = path.with_name(f"{path.name}-wal")
-    log_bytes = log.stat().st_size if log.exists() else 0
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)
-    for folder, wanted_bytes in _wanted(path, target, log_bytes + 2 * grows_bytes, seals_bytes).items():
+    if log.exists():
+        journal_bytes = log.stat().st_size + 2 * grows_bytes
+    else:
+        journal_bytes = grows_bytes + (_KEPT_PAGES + len(sizes_bytes)) * PAGE_BYTES
+    for folder, wanted_bytes in _wanted(path, target, journal_bytes, seals_bytes).items():
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
             raise DataError(

@@ -18,7 +18,7 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
-from ertis_numba.network.keys import AllowList, Permission, ServerKeys
+from ertis_numba.network.keys import AllowList, Permission, ServerKeys, require_own
 from ertis_numba.network.sockets import DOMAIN, Strangers, was_chosen
 
 __all__ = ["EVERYBODY", "Gate"]
@@ -80,7 +80,7 @@ class Gate:
         self._allowed: dict[str, Permission] = {}
         self._text: bytes | None = None
         self._next_look_s = 0.0
-        self._changed = False
+        self._changed = self._doubted = False
         # A User-Id that did not come from here, whoever may have found a way to send one, is nobody's.
         self._mark = secrets.token_hex(16)
         self.note = ""
@@ -169,7 +169,7 @@ class Gate:
         return changed
 
     def _look(self) -> None:
-        """Read the list if it is time; nobody is in one that cannot be read."""
+        """Read the list if it is time; nobody is in one that cannot be read, twice as an editor may be writing it."""
         now_s = time.monotonic()
         if self._keys is None or now_s < self._next_look_s:
             return
@@ -177,13 +177,16 @@ class Gate:
         try:
             text = _read(path)
             if text == self._text:
+                self._doubted = False
                 return
-            self._allowed, self._text = {}, None
             listed = AllowList.from_toml(text.decode("utf-8-sig"), str(path))
             self._allowed = {permission.public: permission for permission in listed.keys}
-            self._text, self.note = text, ""
+            self._text, self.note, self._doubted = text, "", False
         except Exception as error:  # noqa: BLE001  whatever it is, nobody is let in
-            self._allowed, self._text = {}, None
+            if self._text is not None and not self._doubted:
+                self._doubted = True
+                return
+            self._allowed, self._text, self._doubted = {}, None, False
             self.note = str(error) if isinstance(error, SettingsError) else f"{path}: {error}; correct the list of keys"
         self._changed = self._changed or self._allowed != before
 
@@ -249,6 +252,7 @@ class Gate:
 
 
 def _read(path: Path) -> bytes:
+    require_own(path)
     with path.open("rb") as file:
         text = file.read(_LIST_BYTES + 1)
     if len(text) > _LIST_BYTES:

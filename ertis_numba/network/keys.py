@@ -3,6 +3,9 @@
 import os
 import re
 import stat
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias, get_args
@@ -17,6 +20,11 @@ from ertis_numba.atomic import replacing
 from ertis_numba.documents import Document, Table
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 __all__ = [
     "ALLOW_LIST",
     "ROLES",
@@ -28,6 +36,7 @@ __all__ = [
     "ServerKeys",
     "default_folder",
     "public_key",
+    "require_own",
 ]
 
 Role: TypeAlias = Literal["sensor", "application", "admin"]
@@ -38,6 +47,7 @@ ALLOW_LIST: Final = "allow.toml"
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,63}", re.ASCII)
 _Z85: Final = re.compile(r"[0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # ZeroMQ RFC 32
 _OTHERS: Final = 0o077
+_OTHERS_WRITE: Final = 0o022
 
 
 class _Public(Document, frozen=True, kw_only=True):
@@ -98,17 +108,22 @@ class KeyPair:
         Raises
         ------
         SettingsError
-            It cannot be read or used, or others on this machine may read it, too.
+            It cannot be read or used, or others on this machine may use it or its folder, too.
         """
         path = Path(path)
         try:
-            mode = path.stat().st_mode
+            mode, folder_mode = _mode(path), _mode(path.parent)
         except OSError as error:
             raise SettingsError(f"{path}: {error.strerror}; make keys by 'ertis keys new'") from error
-        if os.name == "posix" and stat.S_IMODE(mode) & _OTHERS:
+        if mode & _OTHERS:
             raise SettingsError(
-                f"{path} holds a secret and others may use it (mode {stat.S_IMODE(mode):04o}); "
+                f"{path} holds a secret and others may use it (mode {mode:04o}); "
                 f"run 'chmod 600 {path}', and make new keys if somebody has read it"
+            )
+        if folder_mode & _OTHERS:
+            raise SettingsError(
+                f"{path} holds a secret and others may use its folder (mode {folder_mode:04o}); "
+                f"run 'chmod 700 {path.parent}', or move it to a folder of its own"
             )
         read = _Secret.load(path)
         try:
@@ -203,16 +218,51 @@ class AllowList(Document, frozen=True, kw_only=True):
                     raise ArgumentError(f"{what} {value!r} is listed twice; list each key once, by a name of its own")
                 seen.add(value)
 
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a list.
+
+        Raises
+        ------
+        SettingsError
+            It cannot be read or used, or others on this machine may change it.
+        """
+        with suppress(OSError):  # which is told of below
+            require_own(Path(path))
+        return super().load(path)
+
     def save(self, path: str | Path) -> None:
-        """Write the list, as a whole or not at all.
+        """Write the list, as a whole or not at all; only its owner can change it.
 
         Raises
         ------
         ArgumentError
             There is no such folder.
         """
-        with replacing(Path(path), overwrite=True) as part:
-            part.write_text(self.to_toml(), encoding="utf-8")
+        _write(Path(path), self.to_toml(), mode=0o644, overwrite=True)
+
+    @classmethod
+    def change(cls, path: str | Path, how: Callable[["AllowList"], "AllowList"]) -> tuple["AllowList", "AllowList"]:
+        """Change a list, which is empty before it is made; two that do so at once lose nothing of each other's.
+
+        Returns
+        -------
+        tuple of AllowList
+            Before and after.
+
+        Raises
+        ------
+        SettingsError
+            As `load`.
+        NetworkError
+            Its folder cannot be written.
+        """
+        path = Path(path)
+        with _locked(path.with_name(f".{path.name}.lock")):
+            before = cls.load(path) if path.exists() else cls()
+            after = how(before)
+            after.save(path)
+        return before, after
 
     def allow(self, permission: Permission) -> "AllowList":
         """Return the list with a key in it, instead of what that key had before.
@@ -328,19 +378,58 @@ def _private(folder: Path) -> Path:
     """Return a folder that only its owner can use, made if it is not there."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        mode = stat.S_IMODE(folder.stat().st_mode)
+        mode = _mode(folder)
     except OSError as error:
         raise NetworkError(f"{folder}: {error.strerror}; give a folder that can be written (--dir)") from error
-    if os.name == "posix" and mode & _OTHERS:
+    if mode & _OTHERS:
         raise ArgumentError(
             f"{folder} can be used by others (mode {mode:04o}); run 'chmod 700 {folder}', or give another (--dir)"
         )
     return folder
 
 
-def _write(path: Path, text: str, *, mode: int) -> None:
+def require_own(path: Path) -> None:
+    """Refuse a list of keys that others on this machine may change, by itself or by another in its place.
+
+    Raises
+    ------
+    SettingsError
+        They may.
+    """
+    for where, what in ((path, "it"), (path.parent, "its folder")):
+        mode = _mode(where)
+        if mode & _OTHERS_WRITE and not mode & stat.S_ISVTX:
+            raise SettingsError(
+                f"{path} says who is let in and others may change {what} (mode {mode:04o}); "
+                f"run 'chmod go-w {where}', and look at what it says"
+            )
+
+
+def _mode(path: Path) -> int:
+    """Return who may use a file or folder; nobody else, where a system does not say."""
+    return stat.S_IMODE(path.stat().st_mode) if os.name == "posix" else 0
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Wait until nobody else is in such a block; a process that ends leaves it."""
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
+    except OSError as error:
+        raise NetworkError(f"{path.parent}: {error.strerror}; give a folder that can be written") from error
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(descriptor, msvcrt.LK_LOCK, 1)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _write(path: Path, text: str, *, mode: int, overwrite: bool = False) -> None:
     """Write a file that was never open to more than it is to be open to."""
-    with replacing(path) as part:
+    with replacing(path, overwrite=overwrite) as part:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(text)

@@ -7,7 +7,7 @@ import sys
 from datetime import UTC, datetime
 from typing import Any, Final, Protocol
 
-__all__ = ["Log", "Logfmt", "NDJson", "logger", "show"]
+__all__ = ["Log", "Logfmt", "NDJson", "Writable", "logger", "show"]
 
 _ROOT: Final = "ertis.network"
 _FIELDS: Final = "ertis_fields"

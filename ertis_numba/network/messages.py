@@ -16,6 +16,7 @@ from ertis_numba.errors import DataError, FormatVersionError
 __all__ = [
     "HEADER_BYTES",
     "MAGIC",
+    "MOST_SEQUENCE",
     "PRODUCTS",
     "VERSION",
     "Ack",
@@ -53,9 +54,9 @@ Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][
 Line = Annotated[str, Meta(max_length=512)]
 Reason = Annotated[str, Meta(min_length=1, max_length=64)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-_MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
-Number = Annotated[int, Meta(ge=0, le=_MOST_SEQUENCE)]
-Settled = Annotated[int, Meta(ge=-1, le=_MOST_SEQUENCE)]
+MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
+Number = Annotated[int, Meta(ge=0, le=MOST_SEQUENCE)]
+Settled = Annotated[int, Meta(ge=-1, le=MOST_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]

@@ -97,7 +97,7 @@ def bound(socket: "zmq.Socket[bytes]") -> str:
 def client(
     context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, most_bytes: int = MOST_BYTES
 ) -> "zmq.Socket[bytes]":
-    """Return a DEALER that connects, and connects again after a connection was lost.
+    """Return a DEALER that connects, and connects again after a connection was lost; a `Monitor` of it knows why.
 
     It does not after a server has refused it: who wants to try again makes a new one.
 
@@ -129,11 +129,14 @@ def client(
             made.setsockopt(zmq.CURVE_SERVERKEY, keys.server.encode())
             made.setsockopt(zmq.CURVE_PUBLICKEY, keys.pair.public.encode())
             made.setsockopt(zmq.CURVE_SECRETKEY, keys.pair.secret.encode())
+        made.get_monitor_socket(_EVENTS)  # before there is anything to tell
         made.connect(endpoint)
     except zmq.ZMQError as error:
+        Monitor(made).close()
         made.close(linger=0)
         raise NetworkError(f"{endpoint} cannot be connected to ({error}); give another address") from error
     except BaseException:
+        Monitor(made).close()
         made.close(linger=0)
         raise
     return made
@@ -148,13 +151,17 @@ class _Events:
     """Handshakes of a socket that have failed."""
 
     def __init__(self, socket: "zmq.Socket[bytes]") -> None:
-        self._watched = socket
+        self._watched, self.socket = socket, self._told_by(socket)
+
+    @staticmethod
+    def _told_by(socket: "zmq.Socket[bytes]") -> "zmq.Socket[bytes]":
         address = f"inproc://handshakes.{secrets.token_hex(8)}"
         socket.monitor(address, _EVENTS)
-        self.socket: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
-        self.socket.setsockopt(zmq.LINGER, 0)
-        self.socket.setsockopt(zmq.RCVHWM, _EVENTS_KEPT)
-        self.socket.connect(address)
+        made: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
+        made.setsockopt(zmq.LINGER, 0)
+        made.setsockopt(zmq.RCVHWM, _EVENTS_KEPT)
+        made.connect(address)
+        return made
 
     def _failures(self) -> Iterator[tuple[int, int]]:
         """Yield event and value of what has happened since."""
@@ -185,6 +192,10 @@ class Monitor(_Events):
     """
 
     final = False
+
+    @staticmethod
+    def _told_by(socket: "zmq.Socket[bytes]") -> "zmq.Socket[bytes]":
+        return socket.get_monitor_socket(_EVENTS)  # which `client` has made: a refusal may come at once
 
     def read(self) -> list[str]:
         """Return what went wrong since, each once, as lines."""

@@ -60,8 +60,9 @@ class Latencies:
 class SensorStatus(msgspec.Struct, kw_only=True):
     """One sensor, since the central node was started.
 
-    ``received = published + sum(dropped.values()) + in_flight`` where there is processing; ``received`` counts each
-    measurement once.
+    ``received`` counts each measurement once, however often it is sent. Where there is processing, each is under way
+    or has become something: ``received = published + sum(dropped.values()) + in_flight``, but for those that a mistake
+    in this package has cost, which is counted as ``refused["internal"]``.
     """
 
     connected: bool = False
@@ -157,6 +158,8 @@ class Status(msgspec.Struct, kw_only=True):
     peers: int = 0
     keys: bool = False
     """Whether nodes have to have keys."""
+    keys_note: str = ""
+    """Why the list of keys cannot be used, so that nobody is let in."""
     refused: Annotated[dict[str, int], "by reason"] = {}
     sensors: dict[str, SensorStatus] = {}
     archive: ArchiveStatus | None = None

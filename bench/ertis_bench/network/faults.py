@@ -1,5 +1,6 @@
 """What goes wrong in a network, and what becomes of it: killed nodes, bad disks, lost messages, strangers, overload."""
 
+import json
 import secrets
 import tempfile
 from collections.abc import Callable, Sequence
@@ -81,8 +82,11 @@ def run(
         if only and name not in only:
             continue
         say(about.format(**asdict(extent)))
-        with tempfile.TemporaryDirectory(prefix="ertis-") as folder:
+        # What a part finds is told at once: hours later something else may end the program. And an error of a part is
+        # not to be hidden by that of clearing up after it.
+        with tempfile.TemporaryDirectory(prefix="ertis-", ignore_cleanup_errors=True) as folder:
             report[name] = part(extent, Path(folder), seed)
+        say(f"  {json.dumps(report[name])}")
     return report
 
 

@@ -78,6 +78,7 @@ class Archive:
         self._snapshot = ArchiveStatus(folder=str(folder))
         self._busy_since_s: float | None = None
         self._next_look_s = 0.0
+        self._ends = False
         self.fault = ""
 
     def open(self) -> int:
@@ -132,10 +133,14 @@ class Archive:
         return found
 
     @property
-    def stuck(self) -> bool:
-        """Whether the disk has not answered for some seconds."""
+    def stuck(self) -> str:
+        """Why it will not say that anything fails, or works; empty where it would."""
         since_s = self._busy_since_s
-        return since_s is not None and time.monotonic() - since_s > _STUCK_S
+        if self._thread is not None and not self._thread.is_alive() and not self._ends:
+            return "what stores measurements has ended by a mistake in it; start the central node again"
+        if since_s is not None and time.monotonic() - since_s > _STUCK_S:
+            return "the disk does not answer"
+        return ""
 
     def status(self) -> ArchiveStatus:
         """Return how it is; returns at once, with numbers that are half a second old."""
@@ -148,6 +153,7 @@ class Archive:
         """Store what was offered, end the thread, and return whether that was done in time."""
         if self._thread is None:
             return True
+        self._ends = True
         self._queue.put(None)
         self._thread.join(0 if self.fault else timeout_s)
         self._stop.set()

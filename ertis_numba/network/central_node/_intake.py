@@ -3,75 +3,30 @@
 import time
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final, Protocol
+from collections.abc import Callable, Iterable
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry, Sensor
 from ertis_numba.journal import Gap as NotedGap
+from ertis_numba.network.central_node._admission import require_room, require_same, source_in
 from ertis_numba.network.central_node._items import Item, Run, Stored, Twin
-from ertis_numba.network.central_node._streams import SETTINGS_BYTES, Peer, Stream, Track, source_of
-from ertis_numba.network.messages import Ack, Bye, Data, Gap, Hello, Message, Ping, Refused
+from ertis_numba.network.central_node._roles import Store, Unwanted, Viewer
+from ertis_numba.network.central_node._streams import Peer, Stream, Track
+from ertis_numba.network.messages import Ack, Data, Gap, Hello, Message, Refused
 from ertis_numba.network.status import Latencies
-from ertis_numba.settings import Settings
 
-__all__ = ["Intake", "Store", "Unwanted", "Viewer"]
+__all__ = ["Intake"]
 
-_STREAMS: Final = 64  # of a peer
-_SENSORS: Final = 1024
-_PEERS: Final = 1024
-_SETTLED_KEPT: Final = 4096  # runs, where there is no archive
+_LEFT_KEPT: Final = 4096  # runs that nobody sends any more
 _WAITING_BYTES: Final = 64_000_000  # of a peer
 _ALL_WAITING_BYTES: Final = 512_000_000
 _SILENT_S: Final = 4.0
+_DROPS: Final = 32  # told in an ack
 _NEVER: Final = "never reached the central node"
-
-
-class Unwanted(Exception):  # noqa: N818  it is an answer
-    """A message that is not taken.
-
-    Parameters
-    ----------
-    code : str
-        As in `ertis_numba.network.messages.Refused`.
-    reason : str
-        The line to be told.
-    kind : str
-        By which it is counted.
-    """
-
-    def __init__(self, code: Any, reason: str, kind: str) -> None:
-        super().__init__(reason)
-        self.code, self.kind = code, kind
-
-    def answer(self, about: Message) -> Refused:
-        """Return what to tell the sender."""
-        sensor, epoch = getattr(about, "sensor", ""), getattr(about, "epoch", 0)
-        return Refused(code=self.code, reason=str(self)[:500], sensor=sensor, epoch=epoch)
-
-
-class Store(Protocol):
-    """What makes measurements durable."""
-
-    def settled(self, run: Run) -> int:
-        """Return how far a run is settled."""
-
-    def offer(self, item: Item) -> None:
-        """Have something stored; returns at once."""
-
-
-class Viewer(Protocol):
-    """What is shown measurements that are new."""
-
-    def know(self, hello: Hello, settings: Settings) -> None:
-        """Take note of a sensor."""
-
-    def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Take a measurement; returns at once, and keeps no reference to the words."""
 
 
 class Intake:
@@ -113,7 +68,7 @@ class Intake:
         self._on_stored = on_stored
         self._most_bytes = most_bytes
         self._streams: dict[Run, Stream] = {}
-        self._forgotten: OrderedDict[Run, int] = OrderedDict()
+        self._left: OrderedDict[Run, int] = OrderedDict()  # what was settled, or shown, where the store does not know
         self._due: dict[Run, Stream] = {}
         self._arrived_s: list[float] = []
         self._waiting_bytes = 0
@@ -123,27 +78,29 @@ class Intake:
 
     # What comes from nodes
 
-    def greet(self, peer_id: bytes, hello: Hello, payload: list[bytes]) -> Stream:
+    def greet(self, peer_id: bytes, hello: Hello, payload: list[bytes], key: str = "") -> Stream:
         """Take a greeting, and return the run.
+
+        Parameters
+        ----------
+        peer_id : bytes
+        hello : Hello
+        payload : list of bytes
+        key : str
+            Of the peer; there are fewer peers of each key than of all.
 
         Raises
         ------
         Unwanted
             It cannot be taken.
         """
-        if len(payload) != 1 or len(payload[0]) > SETTINGS_BYTES:
-            raise Unwanted("settings", f"a hello has no settings of at most {SETTINGS_BYTES} bytes; send them", "size")
-        if zlib.crc32(payload[0]) != hello.settings_crc32:
-            raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
-        try:
-            source = source_of(hello, payload[0], most_bytes=self._most_bytes)
-        except (ArgumentError, OSError) as error:
-            raise Unwanted("settings", " ".join(str(error).split()), "settings") from error
+        source = source_in(hello, payload, most_bytes=self._most_bytes)
         run = Run(hello.sensor, hello.epoch)
         peer = self.peers.get(peer_id)
-        self._require_room(peer, run)
+        require_room(self.peers, self.tracks, peer, run, key)
+        require_same(self.peers, self.tracks, peer_id, source)
         if peer is None:
-            peer = self.peers[peer_id] = Peer()
+            peer = self.peers[peer_id] = Peer(key=key)
         stream = self._streams.get(run)
         if stream is None:
             stream = self._streams[run] = self._begin(run, source, hello)
@@ -156,6 +113,8 @@ class Intake:
         if run not in peer.streams:
             peer.streams[run] = stream
             self._tell("joined", sensor=run.sensor, epoch=run.epoch, settled=stream.settled)
+        if stream.track.peers - {peer_id} and peer_id not in stream.track.peers:
+            stream.track.shared_s = peer.heard_s
         stream.track.peers.add(peer_id)
         stream.track.epoch, stream.track.settled = run.epoch, stream.settled
         self._reach(stream)
@@ -163,21 +122,13 @@ class Intake:
             self._viewer.know(hello, source.settings)
         return stream
 
-    def _require_room(self, peer: Peer | None, run: Run) -> None:
-        if peer is None and len(self.peers) >= _PEERS:
-            raise Unwanted("size", f"this central node has {_PEERS} sensor nodes; use another", "too many")
-        if peer is not None and run not in peer.streams and len(peer.streams) >= _STREAMS:
-            raise Unwanted("size", f"a sensor node has {_STREAMS} runs; say bye to those that are over", "too many")
-        if run.sensor not in self.tracks and len(self.tracks) >= _SENSORS:
-            raise Unwanted("size", f"this central node has {_SENSORS} sensors; use another", "too many")
-
     def _begin(self, run: Run, source: Sensor, hello: Hello) -> Stream:
-        if self._store is not None:
-            settled = self._store.settled(run)
-        else:
-            settled = self._forgotten.pop(run, hello.next_sequence - 1)
+        shown = self._left.pop(run, hello.next_sequence - 1 if self._store is None else -1)
+        settled = shown if self._store is None else self._store.settled(run)
         track = self.tracks.setdefault(run.sensor, Track())
-        return Stream(run, source, track, settled=settled, taken=settled, begins=hello.next_sequence, owner=b"")
+        return Stream(
+            run, source, track, settled=settled, taken=settled, shown=shown, begins=hello.next_sequence, owner=b""
+        )
 
     def _reach(self, stream: Stream) -> None:
         """Note that what the node does not have any more has never come."""
@@ -222,19 +173,20 @@ class Intake:
             epoch=data.epoch,
         )
         entry = Entry(Measurement(words, settings, stamp), data.monotonic_ns, data.crc32)
-        item = Item(stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id)
+        item = Item(stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id, stream.turn)
         self._reach(stream)
         if data.sequence <= stream.taken:
             self._again(stream, item, data)
         elif data.sequence > stream.taken + 1 or not self._has_room(peer_id, item):
-            stream.hole = True
             self._due[stream.run] = stream
         else:
             stream.remember(data.sequence, data.crc32)
-            stream.track.took(item.n_bytes, item.arrived_s)
             self._take(stream, item)
-            if self._viewer is not None:
-                self._viewer.offer(data, words, arrived_ns)
+            if data.sequence > stream.shown:  # it may have to be sent again, which does not make it another one
+                stream.shown = data.sequence
+                stream.track.took(source.n_bytes, item.arrived_s)
+                if self._viewer is not None:
+                    self._viewer.offer(data, words, arrived_ns)
 
     def _has_room(self, peer_id: bytes, item: Item) -> bool:
         if self._store is None:
@@ -266,10 +218,7 @@ class Intake:
         """
         stream = self._stream(peer_id, gap)
         self._reach(stream)
-        if gap.last <= stream.taken:
-            self._due[stream.run] = stream
-        elif gap.first > stream.taken + 1:
-            stream.hole = True
+        if gap.last <= stream.taken or gap.first > stream.taken + 1:
             self._due[stream.run] = stream
         else:
             try:
@@ -279,10 +228,13 @@ class Intake:
             self._take_gap(stream, noted)
 
     def _take_gap(self, stream: Stream, gap: NotedGap) -> None:
-        item = Item(stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner)
+        item = Item(stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner, stream.turn)
+        if not self._has_room(stream.owner, item):
+            self._due[stream.run] = stream
+            return
         self._take(stream, item)
         if self._store is None:
-            stream.track.missing[gap.reason] += gap.last - gap.first + 1
+            stream.track.miss(gap.reason, gap.last - gap.first + 1)
 
     def _take(self, stream: Stream, item: Item) -> None:
         stream.taken = item.last
@@ -303,7 +255,7 @@ class Intake:
             peer.waiting_bytes += item.n_bytes
         self._store.offer(item)
 
-    def ping(self, peer_id: bytes, _: Ping) -> None:
+    def ping(self, peer_id: bytes) -> None:
         """Note that a node is alive; it is to hear again what it may have missed."""
         peer = self.peers.get(peer_id)
         if peer is not None:
@@ -312,7 +264,7 @@ class Intake:
                 if stream.owner == peer_id:
                     self._due[run] = stream
 
-    def bye(self, peer_id: bytes, _: Bye | None = None) -> None:
+    def bye(self, peer_id: bytes) -> None:
         """Forget a node."""
         peer = self.peers.pop(peer_id, None)
         for stream in list(peer.streams.values()) if peer is not None else ():
@@ -334,18 +286,25 @@ class Intake:
         if stream.owner or stream.taken != stream.settled:
             return
         self._due.pop(stream.run, None)
-        if self._streams.pop(stream.run, None) is not None and self._store is None:
-            self._forgotten[stream.run] = stream.settled
-            if len(self._forgotten) > _SETTLED_KEPT:
-                self._forgotten.popitem(last=False)
+        known = self._store is not None and stream.shown <= stream.settled
+        if self._streams.pop(stream.run, None) is not None and not known:
+            self._left[stream.run] = max(stream.settled, stream.shown)
+            if len(self._left) > _LEFT_KEPT:
+                self._left.popitem(last=False)
         track = stream.track
         if not (track.received or track.missing or track.repeated or track.peers):
             self.tracks.pop(stream.run.sensor, None)
 
     def tick(self, now_s: float) -> None:
-        """Forget nodes that are silent."""
+        """Forget nodes that are silent, and tell of sensors that several send."""
         for peer_id in [peer_id for peer_id, peer in self.peers.items() if now_s - peer.heard_s > _SILENT_S]:
             self.bye(peer_id)
+        for sensor, track in self.tracks.items():
+            # One that has come back may be missed only some seconds later.
+            if track.shared_s and all(self.peers[each].heard_s > track.shared_s for each in track.peers):
+                track.shared_s = 0.0
+                if len(track.peers) > 1:
+                    self._tell("shared", sensor=sensor, text="several sensor nodes send it; give each its own name")
 
     # What comes from the archive
 
@@ -358,7 +317,7 @@ class Intake:
                 track.stored += 1
                 self._arrived_s.append(item.arrived_s)
             else:
-                track.missing[item.what.reason] += item.last - item.first + 1
+                track.miss(item.what.reason, item.last - item.first + 1)
             if stream is not None:
                 stream.settled = max(stream.settled, item.last)
                 stream.taken = max(stream.taken, stream.settled)
@@ -385,13 +344,9 @@ class Intake:
         stream = self._done(item)
         if stream is None:
             return
-        stream.taken = stream.settled
-        stream.recent.pop(item.first, None)
-        stream.hole = True
+        if item.turn == stream.turn:  # otherwise it is on its way again
+            stream.go_back()
         self._due[stream.run] = stream
-        if isinstance(item.what, Entry):
-            stream.track.received -= 1
-            stream.track.received_bytes -= item.n_bytes
         if reason and stream.owner:
             run = item.run
             self._send(stream.owner, Refused(code="settings", reason=reason[:500], sensor=run.sensor, epoch=run.epoch))
@@ -408,12 +363,19 @@ class Intake:
             track.waiting -= 1
         return stream
 
-    def acknowledge(self, drops: Mapping[Run, Iterable[tuple[int, str]]] | None = None) -> None:
+    def dropped(self, drops: Iterable[tuple[str, int, int, str]]) -> None:
+        """Take note of what processing has thrown away: sensor, epoch, sequence and why of each."""
+        for sensor, epoch, sequence, reason in drops:
+            stream = self._streams.get(Run(sensor, epoch))
+            if stream is not None:
+                stream.dropped.append((sequence, reason))
+
+    def acknowledge(self) -> None:
         """Tell nodes what is settled, where that is due."""
         for run, stream in self._due.items():
             if not stream.owner:
                 continue
-            dropped = tuple(drops.get(run, ()))[:32] if drops else ()
+            dropped = tuple(stream.dropped.popleft() for _ in range(min(_DROPS, len(stream.dropped))))
             ack = Ack(
                 sensor=run.sensor,
                 epoch=run.epoch,
@@ -422,8 +384,6 @@ class Intake:
                 dropped=dropped,
             )
             self._send(stream.owner, ack)
-            if stream.hole and stream.settled == stream.taken:
-                stream.hole = False
         self._due.clear()
         if self._arrived_s:
             now_s = time.monotonic()

@@ -1,11 +1,13 @@
 """What goes from the loop to the archive, and what comes back."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from ertis_numba.journal import Entry, Gap, Sealed, Sensor
 
 __all__ = ["Event", "Failed", "Fault", "Forgotten", "Item", "Resumed", "Run", "SealedOne", "Stored", "Twin"]
+
+_OVERHEAD: Final = 2048  # of an item and what belongs to it, beside the words
 
 
 class Run(NamedTuple):
@@ -31,6 +33,8 @@ class Item:
         By `time.monotonic`.
     owner : bytes
         Peer that sent it.
+    turn : int
+        Rises where a run has to be sent again; what was taken before is none of it any more.
     again : bool
         The number was settled before: stored only if it is another measurement than that.
     done : bool
@@ -44,13 +48,14 @@ class Item:
     source: Sensor
     arrived_s: float
     owner: bytes
+    turn: int = 0
     again: bool = False
     done: bool = False
 
     @property
     def n_bytes(self) -> int:
         """Memory that it takes, about."""
-        return self.what.measurement.words.nbytes if isinstance(self.what, Entry) else 64
+        return _OVERHEAD + (self.what.measurement.words.nbytes if isinstance(self.what, Entry) else 0)
 
 
 @dataclass(slots=True)

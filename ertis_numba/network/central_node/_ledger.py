@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 
 from ertis_numba.atomic import replacing
-from ertis_numba.errors import DataError, InUseError
+from ertis_numba.errors import DataError, FormatVersionError, InUseError
 from ertis_numba.network.central_node._items import Run
 
 if sys.platform == "win32":
@@ -37,6 +37,12 @@ class _Content(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     settled: dict[str, dict[str, int]] = {}
     open: list[str] = []
     unsealed: list[str] = []
+
+
+class _Version(msgspec.Struct):
+    """Of any content, however much of it is not known here."""
+
+    version: int = _VERSION
 
 
 class Ledger:
@@ -71,11 +77,13 @@ class Ledger:
 
     def _read(self) -> _Content:
         try:
-            content = msgspec.json.decode(self._path.read_bytes(), type=_Content)
-            if content.version != _VERSION:
-                raise DataError(
-                    f"{self._path} has version {content.version}, this package reads {_VERSION}; update ertis-numba"
+            text = self._path.read_bytes()
+            version = msgspec.json.decode(text, type=_Version).version
+            if version != _VERSION:
+                raise FormatVersionError(
+                    f"{self._path} has version {version}, this package reads {_VERSION}; update ertis-numba"
                 )
+            content = msgspec.json.decode(text, type=_Content)
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; allow reading it") from error
         except msgspec.MsgspecError as error:

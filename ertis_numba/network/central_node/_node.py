@@ -5,21 +5,25 @@ import socket as names
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from importlib.metadata import version
 from types import TracebackType
-from typing import Any, Final, Literal, Protocol, Self
+from typing import Any, Final, Literal, Self
 
 import zmq
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.errors import ArgumentError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.addresses import DEFAULT_LISTEN
 from ertis_numba.network.central_node._archive import Archive
-from ertis_numba.network.central_node._intake import Intake, Unwanted, Viewer
+from ertis_numba.network.central_node._images import Guarded, Images
+from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Item, Resumed, SealedOne, Stored, Twin
+from ertis_numba.network.central_node._reading import read, receive, require_role
+from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._telling import Telling, text_of
 from ertis_numba.network.gate import Gate
 from ertis_numba.network.keys import Permission, ServerKeys
 from ertis_numba.network.messages import (
@@ -35,63 +39,20 @@ from ertis_numba.network.messages import (
     Report,
     Welcome,
 )
-from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
+from ertis_numba.network.status import Status
 
-__all__ = ["CentralNode", "Images"]
+__all__ = ["CentralNode"]
 
 State = Literal["storage", "processing", "fault", "closing"]
 
 MOST_BYTES: Final = 4 * 2**20
 _TURN: Final = 32  # messages, before something else has its turn
-_FRAMES: Final = 4  # of a message, that are looked at
 _TICK_S: Final = 0.1
 _TOLD_S: Final = 1.0  # between two events about what was refused
 _STATUS_S: Final = 1.0
+_REPORT_S: Final = 0.2  # that a status may be old which somebody asks for
 _FINISH_S: Final = 5.0
 _VERSION: Final = version("ertis-numba")
-_TAKEN: Final = (Hello, Data, Gap, Ping, Bye, AskStatus)
-
-
-class ImageCounts(Protocol):
-    """What became of one sensor's measurements."""
-
-    published: int
-    dropped: Counter[str]
-    in_flight: int
-    queue: int
-    latency: Percentiles
-
-
-class Images(Viewer, Protocol):
-    """What makes images, as `ertis_numba.network.processing.Processing` does."""
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Applications that were refused, by reason."""
-
-    def start(self) -> None:
-        """Begin."""
-
-    def fds(self) -> Iterable[int]:
-        """Return what to poll."""
-
-    def ready(self, fd: int) -> None:
-        """Read from one of them."""
-
-    def tick(self, now_s: float) -> None:
-        """Do what is due."""
-
-    def counts(self, sensor: str) -> Any:
-        """Return what became of a sensor's measurements."""
-
-    def status(self) -> ProcessingStatus:
-        """Return how it is."""
-
-    def publish_status(self, status: Status) -> None:
-        """Let applications know."""
-
-    def close(self, timeout_s: float) -> None:
-        """End."""
 
 
 class CentralNode:
@@ -113,7 +74,8 @@ class CentralNode:
         Measurements of a run that may be under way.
     on_event : callable, optional
         Called with each event, a dict whose ``event`` says which: listening, joined, left, fault, resumed, sealed,
-        unsealed, conflict, refused.
+        unsealed, conflict, refused, shared (two nodes send one sensor), keys (how the list of keys is), internal (a
+        mistake in this package).
     on_stored : callable, optional
         Called with measurements that are durable: sensor, epoch, sequence and CRC-32 of each.
 
@@ -139,15 +101,16 @@ class CentralNode:
     ) -> None:
         if archive is None and processing is None:
             raise ArgumentError("a central node has neither archive nor processing; give at least one")
-        self._listen, self._keys, self._archive, self._processing = listen, keys, archive, processing
+        self._listen, self._keys, self._archive = listen, keys, archive
+        self._images = None if processing is None else Guarded(processing, self._internal)
         self._window = checks.whole("window", window, 1, 1024)
         self._most_bytes = checks.whole("most_bytes", most_bytes, 4096, 2**31)
-        self._on_event, self._on_stored = on_event, on_stored
+        self._telling, self._on_stored = Telling(on_event), on_stored
         self._intake = Intake(
             store=archive,
-            viewer=processing,
+            viewer=self._images,
             send=self._send,
-            tell=self._tell,
+            tell=self._telling.tell,
             on_stored=None if on_stored is None else self._every,
             most_bytes=most_bytes,
         )
@@ -156,9 +119,11 @@ class CentralNode:
         self._gate: Gate | None = None
         self._archive_fd = -1
         self._begun_s = self._next_tick_s = self._next_told_s = self._next_status_s = 0.0
-        self._told_refused: Counter[str] = Counter()
+        self._last_refused: Counter[str] = Counter()  # once the gate is closed
         self._badges: dict[bytes, list[zmq.Frame]] = {}
-        self._fault, self._closing = "", False
+        self._fault = ""
+        self._report: tuple[float, bytes] = -1.0, b""
+        self._closing = False
         self.address = ""
         self.latest = self.status()
 
@@ -176,15 +141,15 @@ class CentralNode:
     def _open(self) -> None:
         if self._archive is not None:
             self._archive_fd = self._archive.open()
-        if self._processing is not None:
-            self._processing.start()
+        if self._images is not None:
+            self._images.start()
         self._context = zmq.Context()
         self._gate = Gate(self._context, self._keys)
         self._socket = sockets.server(self._context, self._listen, keys=self._keys, most_bytes=self._most_bytes)
         self._gate.watch(self._socket)
         self.address = sockets.bound(self._socket)
         self._gate.self_test(self.address)
-        self._tell("listening", address=self.address, pid=os.getpid())
+        self._telling.tell("listening", address=self.address, pid=os.getpid())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -193,20 +158,23 @@ class CentralNode:
 
     def close(self) -> None:
         """Take nothing more in, and make recordings of what is stored; closing twice does no harm."""
-        if self._gate is not None:
-            self._tell_refused()
-            self._gate.close()
-        if self._socket is not None:
-            self._socket.close(linger=0)
-        if self._context is not None:
-            self._context.destroy(linger=0)
-        self._gate = self._socket = self._context = None
-        if self._processing is not None:
-            self._processing.close(_FINISH_S)
-        if self._archive is not None:
-            self._archive.close()
-            self._hear()
-        self.latest = self.status()
+        gate, socket, context = self._gate, self._socket, self._context
+        with ExitStack() as stack:  # whatever fails, the rest is closed
+            stack.callback(self._note_status)
+            if self._archive is not None:
+                stack.callback(self._hear)
+                stack.callback(self._archive.close)
+            if self._images is not None:
+                stack.callback(self._images.close, _FINISH_S)
+            if context is not None:
+                stack.callback(context.destroy, linger=0)
+            if socket is not None:
+                stack.callback(socket.close, linger=0)
+            if gate is not None:
+                self._last_refused = gate.refused
+                self._telling.refused(gate.refused)
+                stack.callback(gate.close)
+            self._gate = self._socket = self._context = None
 
     def run(self, stop: Callable[[], bool] | threading.Event, duration_s: float | None = None) -> None:
         """Take measurements in until it is to stop, and then wait until those are durable.
@@ -224,6 +192,8 @@ class CentralNode:
         while not ends() and (end_s is None or time.monotonic() < end_s):
             self._turn(self._socket)
         self._closing = True
+        for peer_id in self._intake.peers:
+            self._send(peer_id, Pong(state=self.state))
         if self._archive is not None and not self._archive.fault:
             self._archive.finish(_FINISH_S)
             self._hear()
@@ -235,7 +205,7 @@ class CentralNode:
         """Wait for something, and do what it asks."""
         poller = zmq.Poller()
         poller.register(socket, zmq.POLLIN)
-        others: list[int] = list(self._processing.fds()) if self._processing is not None else []
+        others = set() if self._images is None else set(self._images.fds())
         if self._archive is not None:
             poller.register(self._archive_fd, zmq.POLLIN)
         if self._gate is not None and self._gate.socket is not None:
@@ -247,9 +217,10 @@ class CentralNode:
             self._gate.serve()
         if self._archive_fd in ready:
             self._hear()
-        for fd in others:
-            if fd in ready and self._processing is not None:
-                self._processing.ready(fd)
+        if self._images is not None:
+            for fd in ready.keys() & others:
+                self._images.ready(fd)
+            self._intake.dropped(self._images.drain_dropped())
         if socket in ready:
             self._receive(socket)
         self._intake.acknowledge()
@@ -259,18 +230,22 @@ class CentralNode:
     def _receive(self, socket: "zmq.Socket[bytes]") -> None:
         for _ in range(_TURN):
             try:
-                frames = _message(socket)
+                frames = receive(socket)
             except zmq.Again:
                 return
             try:
                 self._handle(frames)
             except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
-                self._refused["internal"] += 1
-                self._tell("internal", text=f"{type(error).__name__}: {' '.join(str(error).split())}")
+                self._internal(error)
+
+    def _internal(self, error: Exception) -> None:
+        """Count a mistake in this package, and tell of it."""
+        self._refused["internal"] += 1
+        self._telling.internal(error)
 
     @property
     def _refused(self) -> Counter[str]:
-        return self._told_refused if self._gate is None else self._gate.refused
+        return self._last_refused if self._gate is None else self._gate.refused
 
     def _handle(self, frames: list[zmq.Frame]) -> None:
         """Do what a message asks, or say why not."""
@@ -285,48 +260,34 @@ class CentralNode:
             return
         message: Message | None = None
         try:
-            message = self._message(frames)
-            self._require(who, message)
-            self._take(sender, message, frames, arrived_ns)
+            message = read(frames)
+            require_role(who, message)
+            self._take(sender, who, message, frames, arrived_ns)
         except Unwanted as error:
             self._refused[error.kind] += 1
             self._send(sender, error.answer(message or Bye()))
+        except Exception as error:
+            text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
+            self._send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
+            raise
         else:
             if sender in self._intake.peers:
                 self._badges[sender] = frames[:2]
 
-    def _message(self, frames: list[zmq.Frame]) -> Message:
-        if len(frames) < 2:
-            raise Unwanted("message", "a message is empty; send a header", "message")
-        try:
-            message: Message = messages.decode(frames[1].buffer, _TAKEN)
-        except FormatVersionError as error:
-            raise Unwanted("version", str(error), "version") from error
-        except DataError as error:
-            raise Unwanted("message", str(error), "message") from error
-        return message
-
-    def _require(self, who: Permission, message: Message) -> None:
-        """Refuse what its sender may not say."""
-        if isinstance(message, AskStatus):
-            if not who.may_receive:
-                raise Unwanted("role", f"key {who.name} is a sensor's, which may not ask for the status", "role")
-        elif who.may_receive and who.role != "admin":
-            raise Unwanted("role", f"key {who.name} is an application's, which may not send measurements", "role")
-        if isinstance(message, Hello | Data | Gap) and not who.may_send(message.sensor):
-            raise Unwanted("serial", f"key {who.name} may not speak for sensor {message.sensor}; allow it", "serial")
-
-    def _take(self, sender: bytes, message: Message, frames: Sequence[zmq.Frame], arrived_ns: int) -> None:
+    def _take(
+        self, sender: bytes, who: Permission, message: Message, frames: Sequence[zmq.Frame], arrived_ns: int
+    ) -> None:
         match message:
             case Data():
                 self._intake.measure(sender, message, [frame.buffer for frame in frames[2:]], arrived_ns)
             case Gap():
                 self._intake.miss(sender, message)
             case Ping():
-                self._intake.ping(sender, message)
-                self._send(sender, Pong(state=self.state, text=self._fault[:500]))
+                self._intake.ping(sender)
+                self._send(sender, Pong(state=self.state, text=self._trouble[:500]))
             case Hello():
-                stream = self._intake.greet(sender, message, [frame.bytes for frame in frames[2:]])
+                key = "" if self._keys is None else who.public
+                stream = self._intake.greet(sender, message, [frame.bytes for frame in frames[2:]], key)
                 self._send(
                     sender,
                     Welcome(
@@ -341,7 +302,10 @@ class CentralNode:
             case Bye():
                 self._drop(sender)
             case AskStatus():
-                self._send(sender, Report(), self.status().encode())
+                now_s = time.monotonic()
+                if now_s - self._report[0] > _REPORT_S:
+                    self._report = now_s, self.status().encode()
+                self._send(sender, Report(), self._report[1])
 
     def _drop(self, peer_id: bytes) -> None:
         self._badges.pop(peer_id, None)
@@ -349,9 +313,15 @@ class CentralNode:
 
     def _send(self, peer_id: bytes, message: Message, *payload: bytes) -> None:
         """Send something if that is possible at once: whatever matters is said again."""
-        if self._socket is not None:
-            with suppress(zmq.ZMQError):  # the peer is gone, or does not read
-                self._socket.send_multipart([peer_id, messages.encode(message), *payload], zmq.NOBLOCK)
+        if self._socket is None:
+            return
+        parts = [peer_id, messages.encode(message), *payload]
+        with suppress(zmq.ZMQError):  # the peer is gone, or does not read
+            try:
+                self._socket.send_multipart(parts, zmq.NOBLOCK)
+            except zmq.Again:
+                self._socket.getsockopt(zmq.EVENTS)  # sees now what the peer has read, or only some milliseconds later
+                self._socket.send_multipart(parts, zmq.NOBLOCK)
 
     def _hear(self) -> None:
         """Take note of what the archive has done."""
@@ -365,12 +335,12 @@ class CentralNode:
                     self._intake.forgotten(item, reason)
                 case Fault(text):
                     self._fault = text
-                    self._tell("fault", text=text)
+                    self._telling.fault(self._trouble)
                 case Resumed():
                     self._fault = ""
-                    self._tell("resumed")
+                    self._telling.fault(self._trouble)
                 case SealedOne(sealed):
-                    self._tell(
+                    self._telling.tell(
                         "sealed",
                         recording=None if sealed.recording is None else str(sealed.recording),
                         measurements=sealed.measurements,
@@ -378,7 +348,7 @@ class CentralNode:
                         text=sealed.remark,
                     )
                 case Failed(text):
-                    self._tell("unsealed", text=text)
+                    self._telling.tell("unsealed", text=text)
 
     def _tick(self) -> None:
         now_s = time.monotonic()
@@ -390,16 +360,18 @@ class CentralNode:
         self._intake.tick(now_s)
         for peer_id in self._badges.keys() - self._intake.peers.keys():
             del self._badges[peer_id]
-        if self._processing is not None:
-            self._processing.tick(now_s)
+        if self._images is not None:
+            self._images.tick(now_s)
+        self._telling.fault(self._trouble)
+        self._telling.keys("" if self._gate is None else self._gate.note)
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_S
-            self.latest = self.status()
-            if self._processing is not None:
-                self._processing.publish_status(self.latest)
+            self._note_status()
+            if self._images is not None:
+                self._images.publish_status(self.latest)
         if now_s >= self._next_told_s:
             self._next_told_s = now_s + _TOLD_S
-            self._tell_refused()
+            self._telling.refused(self._refused)
 
     # What is told of it
 
@@ -408,67 +380,48 @@ class CentralNode:
         """What it does at present."""
         if self._closing:
             return "closing"
-        if self._archive is not None and (self._fault or self._archive.stuck):
+        if self._trouble:
             return "fault"
-        return "storage" if self._processing is None else "processing"
+        return "storage" if self._images is None else "processing"
+
+    @property
+    def _trouble(self) -> str:
+        """Why nothing can be stored at present; empty where it can."""
+        return self._fault or ("" if self._archive is None else self._archive.stuck)
 
     def status(self) -> Status:
         """Return how it is."""
-        state = self.state
         status = Status(
             version=_VERSION,
             pid=os.getpid(),
             host=names.gethostname(),
             address=self.address,
-            state=state,
-            fault=self._fault or ("the disk does not answer" if state == "fault" else ""),
+            state=self.state,
+            fault=self._trouble,
             uptime_s=round(time.monotonic() - self._begun_s, 3),
             time_ns=time.time_ns(),
             memory_bytes=_memory_bytes(),
             peers=len(self._intake.peers),
             keys=self._keys is not None,
-            refused=dict(self._refused + Counter({} if self._processing is None else self._processing.refused)),
+            keys_note="" if self._gate is None else self._gate.note,
+            refused=dict(self._refused + (Counter() if self._images is None else self._images.refused())),
             sensors={name: track.status() for name, track in self._intake.tracks.items()},
         )
         if self._archive is not None:
             status.archive = self._archive.status()
             status.archive.ack = self._intake.acks.percentiles()
-        if self._processing is not None:
-            status.processing = self._processing.status()
-            for name, sensor in status.sensors.items():
-                counts = self._processing.counts(name)
-                sensor.published, sensor.dropped = counts.published, dict(counts.dropped)
-                sensor.in_flight, sensor.queue = counts.in_flight, counts.queue
-                sensor.image_latency = counts.latency
+        if self._images is not None:
+            self._images.fill(status)
         return status
 
-    def _tell(self, event: str, **told: Any) -> None:
-        with suppress(OSError):  # who listened may be gone: measurements are taken all the same
-            self._on_event({"event": event} | told)
-
-    def _tell_refused(self) -> None:
-        now = Counter(self._refused)
-        for reason, count in (now - self._told_refused).items():
-            self._tell("refused", reason=reason, count=count)
-        self._told_refused = now
+    def _note_status(self) -> None:
+        self.latest = self.status()
 
     def _every(self, items: list[Item]) -> None:
         if self._on_stored is not None:
             with suppress(OSError):  # the same
                 for item in items:
                     self._on_stored(item.run.sensor, item.run.epoch, item.first, getattr(item.what, "crc32", 0))
-
-
-def _message(socket: "zmq.Socket[bytes]") -> list[zmq.Frame]:
-    """Return the frames of a message, the first of them if there are too many."""
-    frames = [socket.recv(zmq.NOBLOCK, copy=False)]
-    while frames[-1].more:
-        frame = socket.recv(zmq.NOBLOCK, copy=False)
-        if len(frames) < _FRAMES:
-            frames.append(frame)
-        else:
-            frames[-1] = frame
-    return frames
 
 
 def _memory_bytes() -> int:

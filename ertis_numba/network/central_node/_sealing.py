@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import InUseError
-from ertis_numba.journal import Sealed, seal_apart
+from ertis_numba.journal import SUFFIX, Sealed, seal_apart
 
 __all__ = ["Sealing"]
 
@@ -85,6 +85,9 @@ class Sealing:
         try:
             sealed = seal_apart(path, gently=not self._ends)
         except Exception as error:  # noqa: BLE001  whatever it is, the journal is still there and ingest goes on
+            if not path.exists() and path.with_name(path.name.removesuffix(SUFFIX)).exists():
+                self._n_done += 1  # somebody else has made the recording
+                return
             if isinstance(error, InUseError) and not self._ends:
                 waits_s = _AGAIN_S  # who seals it now will be done soon
             else:

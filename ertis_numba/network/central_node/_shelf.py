@@ -127,20 +127,21 @@ class Shelf:
             if item.last <= last:  # a commit that seemed to fail had not
                 self._tell_stored([item], 0.0)
             elif item.first != last + 1:
-                item.done = True
-                self._tell(Forgotten(item))
+                self._send_back(item)
             else:
-                volume = self._fitting(item, flush)
-                if isinstance(item.what, Entry):
-                    batch.append(item)
-                    ahead[item.run] = item.last
-                else:
+                if batch and isinstance(item.what, Entry) != isinstance(batch[-1].what, Entry):
                     flush()
-                    self._note(volume, item)
+                self._fit(item, flush)
+                batch.append(item)
+                ahead[item.run] = item.last
         flush()
 
-    def _fitting(self, item: Item, flush: Callable[[], None]) -> Volume:
-        """Return the journal that an item is to go into."""
+    def _send_back(self, item: Item, reason: str = "") -> None:
+        item.done = True
+        self._tell(Forgotten(item, reason))
+
+    def _fit(self, item: Item, flush: Callable[[], None]) -> None:
+        """Make sure of a journal that an item can go into."""
         if self.volume is not None and not self.volume.fits(item):
             flush()
             self.rotate()
@@ -148,9 +149,10 @@ class Shelf:
             name = journal_name(self._folder, self._name, taken=self._unsealed)
             self._save(open_=[name])  # before there is such a file: what a crash leaves of it is found
             self.volume = Volume.create(self._folder / name)
-        return self.volume
+        self.volume.know(item.source)
 
     def _append(self, batch: list[Item]) -> None:
+        """Store measurements, or gaps, in one transaction; by themselves where that cannot be."""
         if not batch or self.volume is None:
             return
         begun_s = time.monotonic()
@@ -158,23 +160,15 @@ class Shelf:
             self.volume.append(batch)
         except ArgumentError as error:
             if len(batch) == 1:
-                batch[0].done = True
-                self._tell(Forgotten(batch[0], " ".join(str(error).split())))
-            else:  # the others must not suffer for one that nothing can hold
-                for item in batch:
+                self._send_back(batch[0], " ".join(str(error).split()))
+                return
+            for item in batch:  # the others must not suffer for one that nothing can hold, but those that follow it
+                if item.first == self.settled.get(item.run, -1) + 1:
                     self._append([item])
+                else:
+                    self._send_back(item)
             return
         self._tell_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
-
-    def _note(self, volume: Volume, item: Item) -> None:
-        begun_s = time.monotonic()
-        try:
-            volume.note(item)
-        except ArgumentError as error:
-            item.done = True
-            self._tell(Forgotten(item, " ".join(str(error).split())))
-            return
-        self._tell_stored([item], 1e3 * (time.monotonic() - begun_s))
 
     def _tell_stored(self, items: list[Item], took_ms: float) -> None:
         for item in items:

@@ -4,6 +4,7 @@ import time
 from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import count
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, SettingsError
@@ -19,7 +20,10 @@ __all__ = ["SETTINGS_BYTES", "Peer", "Stream", "Track", "source_of"]
 SETTINGS_BYTES: Final = 262_144
 """Of the settings of a sensor, as TOML."""
 
+_turns = count()
 _RECENT_S: Final = 3.0
+_DROPS_KEPT: Final = 256  # of each run
+_REASONS: Final = 32  # that numbers are missing for, of each sensor
 _NUMBERS_KEPT: Final = 512  # whose CRC-32 is remembered, of each run
 
 
@@ -69,7 +73,7 @@ def _source(
     if source.n_bytes > most_bytes:
         raise SettingsError(
             f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {most_bytes}; record fewer "
-            "samples, or let it take more"
+            "samples, or let it take more (--most-bytes)"
         )
     return source
 
@@ -89,6 +93,12 @@ class Track:
     missing: Counter[str] = field(default_factory=Counter)
     peers: set[bytes] = field(default_factory=set)
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=128))
+    shared_s: float = 0.0  # since when several peers send it; 0 where none do, or that was told
+
+    def miss(self, reason: str, n_missing: int) -> None:
+        """Count numbers that no measurement has."""
+        known = reason in self.missing or len(self.missing) < _REASONS
+        self.missing[reason if known else "another reason"] += n_missing
 
     def took(self, n_bytes: int, arrived_s: float) -> None:
         """Count a measurement that has not come before."""
@@ -131,8 +141,12 @@ class Stream:
         The oldest number that the node has.
     owner : bytes
         The peer that has greeted last.
-    hole : bool
-        Something came beyond what is to come next: the node has to hear what that is.
+    shown : int
+        The number up to which measurements were counted and shown; what has to be sent again is not once more.
+    turn : int
+        Of what is taken now; see `Item`.
+    dropped : deque of (sequence, reason)
+        Thrown away by processing, which the node has not heard of; the latest.
     """
 
     run: Run
@@ -142,7 +156,9 @@ class Stream:
     taken: int
     begins: int
     owner: bytes
-    hole: bool = False
+    shown: int = -1
+    turn: int = field(default_factory=_turns.__next__)
+    dropped: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=_DROPS_KEPT))
     recent: OrderedDict[int, int] = field(default_factory=OrderedDict)
     _air: tuple[tuple[float, float, float], Settings] | None = None
 
@@ -168,6 +184,10 @@ class Stream:
             self._air = air, settings if settings.air == made else settings.replace(air=made)
         return self._air[1]
 
+    def go_back(self) -> None:
+        """Take what is not settled again."""
+        self.taken, self.turn = self.settled, next(_turns)
+
     def use(self, source: Sensor) -> None:
         """Take other settings from now on."""
         if source is not self.source:
@@ -185,8 +205,11 @@ class Peer:
         When it sent something, by `time.monotonic`.
     waiting_bytes : int
         Of it, that wait for the disk.
+    key : str
+        That it has shown; empty where there are none.
     """
 
     streams: dict[Run, Stream] = field(default_factory=dict)
     heard_s: float = 0.0
     waiting_bytes: int = 0
+    key: str = ""

@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
-from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import SUFFIX, Entry, Journal, Sensor
+from ertis_numba.errors import DamagedError
+from ertis_numba.journal import SUFFIX, Entry, Gap, Journal, Sensor
 from ertis_numba.network.central_node._items import Item, Run
 
-__all__ = ["Volume", "journal_name", "runs_of"]
+__all__ = ["Volume", "journal_name", "runs_of", "same"]
 
 _SOURCE = "central node"
 
@@ -76,28 +76,32 @@ class Volume:
     def fits(self, item: Item) -> bool:
         """Whether an item can go into this journal: its sensor is the same as before, and its number rises."""
         known = self._known.get(item.source.name)
-        if known is not None and known is not item.source:
-            if not _same(known, item.source):
-                return False
-            self._known[known.name] = item.source
+        if known is not None and known is not item.source and not same(known, item.source):
+            return False
         return item.first > self._counted.get(item.run, -1)
 
+    def know(self, source: Sensor) -> None:
+        """Expect measurements of a sensor."""
+        self._known[source.name] = source
+
     def append(self, items: list[Item]) -> None:
-        """Make measurements durable, all or none; see `Journal.append`."""
+        """Make measurements durable, or what is missing, all or none; see `Journal.append`.
+
+        Parameters
+        ----------
+        items : list of Item
+            Either measurements or gaps.
+        """
         for item in items:
             self._add(item.source)
-        self.journal.append([item.what for item in items if isinstance(item.what, Entry)])
+        entries = [item.what for item in items if isinstance(item.what, Entry)]
+        if not entries:
+            self.journal.note_gaps([item.what for item in items if isinstance(item.what, Gap)])
+            return
+        self.journal.append(entries)
         for item in items:
             self._counted[item.run] = item.last
-            self.n_bytes += item.n_bytes
-
-    def note(self, item: Item) -> None:
-        """Say durably what is missing."""
-        if isinstance(item.what, Entry):
-            raise ArgumentError("a measurement is given where a gap is noted; append it")
-        self._add(item.source)
-        gap = item.what
-        self.journal.note_gap(gap.sensor, gap.first, gap.last, gap.reason, epoch=gap.epoch)
+            self.n_bytes += item.source.n_bytes
 
     def _add(self, source: Sensor) -> None:
         if source.name not in self.journal.sensors:
@@ -108,24 +112,29 @@ class Volume:
                 translation_m=source.translation_m,
                 rotation_xyzw=source.rotation_xyzw,
             )
-        self._known[source.name] = source
+        self.know(source)
 
     def crc32_of(self, entry: Entry) -> int | None:
-        """Return the CRC-32 of the measurement with the number of this one; None where it is not held."""
+        """Return the CRC-32 of the measurement with the number of this one; None where it is not held.
+
+        Only this journal is looked at, not those before it.
+        """
         stamp = entry.measurement.stamp
         if stamp.sensor not in self.journal.sensors:
             return None
-        for key in self.journal.index(stamp.sensor):
-            if (key.epoch, key.sequence) == (stamp.epoch, stamp.sequence):
-                return self.journal.entry(key).crc32
-        return None
+        try:
+            key = self.journal.find(stamp.sensor, stamp.epoch, stamp.sequence)
+        except DamagedError:  # there is none
+            return None
+        return self.journal.entry(key).crc32
 
     def close(self) -> None:
         """Close the journal."""
         self.journal.close()
 
 
-def _same(one: Sensor, other: Sensor) -> bool:
+def same(one: Sensor, other: Sensor) -> bool:
+    """Whether a recording can hold measurements of both under one name."""
     parts: tuple[Callable[[Sensor], object], ...] = (
         lambda sensor: sensor.settings,
         lambda sensor: sensor.firmware,

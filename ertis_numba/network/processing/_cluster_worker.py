@@ -49,7 +49,7 @@ def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
     """Make the pipeline of a kind of measurements, unless it is there; return what it is, or why there can be none."""
     try:
         chain = _chain(settings, device)
-        threads = _threads()
+        threads = _threads(device)
         took_s, _ = chain.times_s(threads, 1)
     except (ArgumentError, DataError, DeviceError, MemoryError) as error:
         return str(error) or type(error).__name__
@@ -61,7 +61,7 @@ def process(settings: str, device: str, dtype: str, words: bytes, *, points: boo
     begun_s = time.perf_counter()
     try:
         chain = _chain(settings, device)
-        image = chain.image(words, threads=_threads())
+        image = chain.image(words, threads=_threads(device))
     except DataError as error:
         return str(error)
     found = chain.points(image, POINTS_BYTES // 16) if points else np.empty((0, 4), _WORDS)
@@ -82,13 +82,13 @@ def _chain(settings: str, device: str) -> "Chain":
         return _chains[key]
 
 
-def _threads() -> int:
+def _threads(device: str) -> int:
     """Return how many threads one measurement may have, where a worker is given several at once."""
     from distributed import get_worker  # noqa: PLC0415  there is one where this runs
 
     from ertis_numba import kernels  # noqa: PLC0415
 
-    return max(1, kernels.load("auto").max_threads // max(1, get_worker().state.nthreads))
+    return max(1, kernels.load(device).max_threads // max(1, get_worker().state.nthreads))
 
 
 def _address() -> str:

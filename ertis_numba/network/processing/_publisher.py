@@ -59,7 +59,7 @@ class _Publisher:
         self._gate = Gate(context, keys)
         self._socket = sockets.server(context, begin.address, keys=keys, most_bytes=_HEARD_BYTES)
         self._gate.watch(self._socket)
-        self._subscribers = Subscribers(self._socket)
+        self._subscribers = Subscribers(self._socket, with_keys=keys is not None)
         address = sockets.bound(self._socket)
         self._gate.self_test(address)
         self._poller = zmq.Poller()
@@ -98,7 +98,12 @@ class _Publisher:
             if not self._pipe.waiting:
                 refused = dict(self._gate.refused)
                 self._pipe.send(
-                    notes.Served(subscribers=self._subscribers.status(), refused=refused, reports=self._reports)
+                    notes.Served(
+                        subscribers=self._subscribers.status(),
+                        refused=refused,
+                        reports=self._reports,
+                        keys_note=self._gate.note,
+                    )
                 )
 
     def _may_receive(self, frames: Sequence[zmq.Frame]) -> bool:
@@ -112,7 +117,8 @@ class _Publisher:
                 self._views[note.slot] = View(descriptor, note.words_bytes, note.image_bytes)
                 os.close(descriptor)
             case notes.Describe():
-                self._subscribers.describe(note.description.number, [encode(note.description), *note.payloads])
+                about = note.description
+                self._subscribers.describe(about.sensor, about.number, [encode(about), *note.payloads])
             case notes.Publish():
                 self._publish(note)
             case notes.Grouped():
@@ -129,20 +135,22 @@ class _Publisher:
             for name in ("epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
         } | {"sensor": sensor, "number": 0, "dropped": 0}
         times: dict[str, Any] = {"received_ns": note.received_ns, "published_ns": 0}
+        about = self._subscribers.description(sensor, note.description)
+        raw_about = self._subscribers.description(sensor, note.raw_description)
         items = []
-        if self._subscribers.wanted("energyscape", sensor):
+        if about is not None and self._subscribers.wanted("energyscape", sensor):
             rows, columns = note.shape
             payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
             image = Image(description=note.description, shape=note.shape, dtype=note.dtype, **common, **times)
-            items.append(Item("energyscape", sensor, image, payloads, note.description))
-        if note.n_points >= 0 and self._subscribers.wanted("points", sensor):
+            items.append(Item("energyscape", sensor, image, payloads, about))
+        if about is not None and note.n_points >= 0 and self._subscribers.wanted("points", sensor):
             cloud = Points(description=note.description, n_points=note.n_points, **common, **times)
-            items.append(Item("points", sensor, cloud, (bytes(view.points(16 * note.n_points)),), note.description))
-        if self._subscribers.wanted("raw", sensor):
+            items.append(Item("points", sensor, cloud, (bytes(view.points(16 * note.n_points)),), about))
+        if raw_about is not None and self._subscribers.wanted("raw", sensor):
             air = {name: getattr(note.data, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")}
             raw = Raw(description=note.raw_description, crc32=note.data.crc32, **common, **air)
             words = bytes(view.words(note.words_bytes))
-            items.append(Item("raw", sensor, raw, (words,), note.raw_description))
+            items.append(Item("raw", sensor, raw, (words,), raw_about))
         self._pipe.send(notes.Taken(job=note.job, published_ns=time.monotonic_ns()))
         for item in items:
             self._subscribers.offer(item)
@@ -175,7 +183,7 @@ class _Publisher:
         match message:
             case Subscribe():
                 if not self._subscribers.hear(frames, name, message):
-                    reason = "too many applications are connected; end one"
+                    reason = "too many applications are connected, of this key or in all; end one"
                     self._refuse(frames, Refused(code="size", reason=reason), "too many")
             case AskStatus() if self._status:
                 self._reply(frames, [encode(Report()), self._status])

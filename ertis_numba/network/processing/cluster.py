@@ -103,7 +103,7 @@ class Cluster:
         self._prepared: dict[int, Prepared] = {}
         self._attempts: dict[int, _Attempt] = {}
         self._free: list[Slot] = []
-        self._n_slots = self._n_attempts = 0
+        self._n_slots = self._n_attempts = self._n_asked = 0
         self.respawned = 0
         self._closing = threading.Event()
         self._looker = threading.Thread(target=self._look, name="cluster", daemon=True)
@@ -129,6 +129,7 @@ class Cluster:
         for kind, readying in self._readying.items():
             for address in self._members.keys() - readying.asked:
                 readying.asked.add(address)
+                self._n_asked += 1
                 future = self._client.submit(
                     there.prepare,
                     kind,
@@ -136,7 +137,7 @@ class Cluster:
                     self._options.device,
                     workers=[address],
                     allow_other_workers=False,
-                    key=f"ertis-{self._run}-prepare-{kind}-{len(readying.futures)}",
+                    key=f"ertis-{self._run}-prepare-{kind}-{self._n_asked}",
                     pure=False,
                 )
                 readying.futures.append(future)

@@ -1,5 +1,6 @@
 """Which measurements were emitted together, as the SYNC chain says."""
 
+import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -16,6 +17,9 @@ _SHORTEST_S: Final = 0.02  # between pulses, while that is not known
 _LEAST_S, _INTERVALS = 1.0, 10.0  # that an incomplete group waits for: that long, or so many intervals
 _RECENT: Final = 256  # closed groups, that are not opened again
 _FUTURE_S: Final = 0.5
+_PACE_S, _PACE = 2.0, 0.1  # a clock that stays behind for so long, but for that share of it, is wrong
+_FAR: Final = 128  # pulses that a count may be away from where time has got: less than `_RECENT`
+_MOST_NS: Final = 2**63 - 1
 _AWAY: Final = 3.0  # as many times that: a sensor that has sent nothing for so long is not waited for
 
 Flag = Literal["incomplete", "clock", "pulse"]
@@ -27,6 +31,9 @@ class _Run:
 
     slot: str
     ahead_ns: int  # of its clock that nobody sets, to the one of all
+    count: int  # at which it began …
+    began_ns: int  # … by the clock of all
+    paced_ns: tuple[int, int]  # since when it is looked at whether it is behind, by the clock of all and of this node
     used_ns: int = 0
 
 
@@ -42,7 +49,10 @@ class Groups:
 
     Within a run (epoch) sensors have the same SYNC count. Counts of several runs differ by an offset that is found
     by time: by the timestamp of the first measurement, and from then on by the sensor node's clock that nobody sets,
-    so that a clock which is set by an hour puts no measurement into another group.
+    so that a clock which is set by an hour puts no measurement into another group. Where that time cannot be, as it is
+    yet to come, or is long ago although no older measurements are being caught up with, the time of arrival counts. A
+    count that is not where time has got is compared anew, like that of another run: whatever one sensor says, it moves
+    no groups of others.
 
     Attributes
     ----------
@@ -72,11 +82,9 @@ class Groups:
 
     def add(self, data: Data, arrived_ns: int) -> list[Group]:
         """Take a measurement, and return the groups that are closed now."""
-        run = self._run(data, arrived_ns)
+        run = self._checked(self._run(data, arrived_ns), data, arrived_ns)
         run.used_ns = self._seen_ns[data.sensor] = arrived_ns
-        at_ns = data.monotonic_ns + run.ahead_ns
-        self._ahead_ns = at_ns - arrived_ns
-        self._place(self._pulses.add(run.slot, (data, arrived_ns), data.sync_count, at_ns))
+        self._place(self._pulses.add(run.slot, (data, arrived_ns), data.sync_count, data.monotonic_ns + run.ahead_ns))
         return self._close(arrived_ns)
 
     def tick(self, now_ns: int) -> list[Group]:
@@ -93,11 +101,39 @@ class Groups:
             slot = self._runs.pop(oldest).slot
             self._place(self._pulses.forget(slot))
             self._free.append(slot)
-        at_ns = data.timestamp_ns
-        if self._ahead_ns is not None and at_ns - arrived_ns - self._ahead_ns > _FUTURE_S * 1e9:
-            at_ns = arrived_ns + self._ahead_ns  # nothing comes before it was measured: that clock is wrong
-        made = self._runs[data.epoch] = _Run(self._free.pop(0), at_ns - data.monotonic_ns)
+        return self._begun(self._free.pop(0), data, arrived_ns, data.timestamp_ns)
+
+    def _begun(self, slot: str, data: Data, arrived_ns: int, at_ns: int) -> _Run:
+        if self._ahead_ns is None:
+            self._ahead_ns = min(at_ns, time.time_ns()) - arrived_ns
+        now_ns = arrived_ns + self._ahead_ns
+        if at_ns - now_ns > _FUTURE_S * 1e9:
+            at_ns = now_ns  # nothing comes before it was measured: that clock is wrong
+        made = _Run(slot, at_ns - data.monotonic_ns, data.sync_count, at_ns, (at_ns, arrived_ns))
+        self._runs[data.epoch] = made
         return made
+
+    def _checked(self, run: _Run, data: Data, arrived_ns: int) -> _Run:
+        """Return the run as it is to be used: begun anew, if its time or its count cannot be right."""
+        at_ns = data.monotonic_ns + run.ahead_ns
+        if self._ahead_ns is None:
+            return run
+        if at_ns - arrived_ns > self._ahead_ns and at_ns <= time.time_ns():
+            self._ahead_ns = at_ns - arrived_ns  # what came until now was old, and is caught up with
+        now_ns = arrived_ns + self._ahead_ns
+        since_ns, came_ns = run.paced_ns
+        behind = now_ns - at_ns > _LEAST_S * 1e9
+        if behind and arrived_ns - came_ns > _PACE_S * 1e9:
+            behind = abs((at_ns - since_ns) - (arrived_ns - came_ns)) > _PACE * (arrived_ns - came_ns)
+            at_ns = at_ns if behind else now_ns
+        if not behind or arrived_ns - came_ns > _PACE_S * 1e9:
+            run.paced_ns = at_ns, arrived_ns
+        expected = (at_ns - run.began_ns) / self._pulses.interval_ns
+        is_far = abs(data.sync_count - run.count - expected) > _FAR
+        if not is_far and at_ns == data.monotonic_ns + run.ahead_ns and at_ns - now_ns <= _FUTURE_S * 1e9:
+            return run
+        self._place(self._pulses.forget(run.slot))
+        return self._begun(run.slot, data, arrived_ns, at_ns)
 
     def _place(self, found: list[tuple[tuple[Data, int], int]]) -> None:
         realigned = self._pulses.realigned > self._realigned
@@ -143,6 +179,6 @@ class Groups:
             group=number,
             members=tuple((data.sensor, data.epoch, data.sequence) for data in members[:_MOST]),
             missing=tuple(missing[:_MOST]),
-            spread_ns=spread_ns,
+            spread_ns=min(spread_ns, _MOST_NS),
             flags=tuple(sorted(group.flags)),
         )

@@ -190,11 +190,15 @@ class Wanted(_Note, frozen=True, kw_only=True):
 
 
 class Served(_Note, frozen=True, kw_only=True):
-    """How it goes; sent each second. ``reports`` counts those `Report` that were taken."""
+    """How it goes; sent each second.
+
+    ``reports`` counts those `Report` that were taken, ``keys_note`` says why the list of keys cannot be used.
+    """
 
     subscribers: tuple[SubscriberStatus, ...]
     refused: dict[str, int]
     reports: int
+    keys_note: str = ""
 
 
 FromPublisher = Started | Taken | Wanted | Served

@@ -5,6 +5,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFa
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.workers import Workers
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Air, Settings
 
 __all__ = ["Processing"]
 
@@ -38,13 +39,28 @@ _PUBLISHER_DIED: Final = "the publisher died"
 _REFUSED: Final = "it cannot be processed"
 _CHANGED: Final = "the settings of its sensor changed"
 _UNUSABLE: Final = "its settings cannot be used"
+_UNDESCRIBED: Final = "nothing describes it"
+_PAUSED: Final = "too many of its sensor have failed"
+_IN_A_ROW: Final = 3  # measurements of a sensor that have failed twice, after which it has to pause …
+_PAUSE_S: Final = 10.0  # … for that long, and twice as long each further time
+_LONGEST_PAUSE_S: Final = 640.0
+
+
+@dataclass(slots=True)
+class _Failing:
+    """A sensor whose measurements workers fail with, which costs the others of their time."""
+
+    in_a_row: int = 0
+    pause_s: float = _PAUSE_S
+    until_s: float = 0.0
 
 
 class Processing:
     """Makes images of measurements in worker processes and publishes them.
 
     It is a part of the loop of who takes measurements in: poll `fds`, call `ready` for each that can be read, and
-    `tick` at least ten times a second. No call blocks for longer than the copy of one measurement takes.
+    `tick` at least ten times a second. These calls wait for no other process and no disk: what they take is the copy
+    of a measurement, and where a worker or the publisher is started, the milliseconds that this takes.
 
     Parameters
     ----------
@@ -74,6 +90,7 @@ class Processing:
         self._begun_s = time.monotonic()
         self._took = Latencies()
         self._retried = self._quarantined = 0
+        self._failing: dict[str, _Failing] = {}  # by sensor
         self._final: ProcessingStatus | None = None
 
     @property
@@ -123,11 +140,11 @@ class Processing:
         self._arrivals_s.append(now_s)
         kind = self._sensors.kind_of(data)
         self._tell(self._groups.add(data, arrived_ns))
-        if kind is None:
-            counts = self._queues.counts_of(data.sensor)
-            counts.received += 1
-            counts.in_flight += 1
-            counts.drop(_UNUSABLE)
+        failing = self._failing.get(data.sensor)
+        paused = failing is not None and now_s < failing.until_s
+        if kind is None or paused:
+            self._queues.take_in(data)
+            self._queues.drop(data, _PAUSED if paused else _UNUSABLE)
             return
         self._n_jobs += 1
         reason = SUPERSEDED if self._sensors.is_ready(kind) else _GETTING_READY
@@ -144,7 +161,7 @@ class Processing:
         if self._runner is None:
             return
         if fd in self._publisher.fds():
-            self._confirm(*self._publisher.ready())
+            self._confirm(self._publisher.ready())
         else:
             self._handle(self._runner.ready(fd))
         self._dispatch()
@@ -156,6 +173,7 @@ class Processing:
         self._handle(self._runner.tick(now_s, self._rate_hz(now_s)))
         self._confirm(*self._publisher.tick(now_s))
         self._tell(self._groups.tick(time.monotonic_ns()))
+        self._sensors.tick()
         self._tidy(self._runner)
         for sensor in list(self._order):
             self._publish_of(sensor)
@@ -164,6 +182,12 @@ class Processing:
     def counts(self, sensor: str) -> Counts:
         """Return what became of a sensor's measurements."""
         return self._queues.counts_of(sensor)
+
+    def drain_dropped(self) -> list[tuple[str, int, int, str]]:
+        """Return sensor, epoch, number and reason of what was dropped since, the latest of it if it is a lot."""
+        found = list(self._queues.dropped)
+        self._queues.dropped.clear()
+        return found
 
     def status(self) -> ProcessingStatus:
         """Return how it goes."""
@@ -254,6 +278,7 @@ class Processing:
                 case Done(job=job, took_s=took_s):
                     self._took.add(1e3 * took_s)
                     self._done.add(job.number)
+                    self._failing.pop(job.data.sensor, None)
                     self._publish_of(job.data.sensor)
                     if job.tries:
                         self._publish(job)
@@ -265,19 +290,30 @@ class Processing:
         about = {"sensor": job.data.sensor, "epoch": job.data.epoch, "sequence": job.data.sequence, "text": event.text}
         job.tries += 1
         self._leave(job)
-        counts = self._queues.counts_of(job.data.sensor)
         if not event.again:
             self._log.warning("dropped", **about)
-            counts.drop(_REFUSED)
+            self._queues.drop(job.data, _REFUSED)
         elif job.tries < _TRIES:
             self._log.warning("retried", **about)
             self._retried += 1
             self._queues.again(job)
         else:
             self._log.error("failed_twice", **about)
-            counts.drop(_FAILED_TWICE)
+            self._queues.drop(job.data, _FAILED_TWICE)
             self._keep(job)
+            self._failed_twice(job.data.sensor)
         self._publish_of(job.data.sensor)
+
+    def _failed_twice(self, sensor: str) -> None:
+        """Have a sensor pause after some in a row: each has cost workers two deadlines, and was before all others."""
+        failing = self._failing.setdefault(sensor, _Failing())
+        failing.in_a_row += 1
+        if failing.in_a_row < _IN_A_ROW:
+            return
+        failing.until_s = time.monotonic() + failing.pause_s
+        self._log.error("paused", sensor=sensor, text=f"{_PAUSED}; it is tried again in {failing.pause_s:g} s")
+        failing.pause_s = min(2 * failing.pause_s, _LONGEST_PAUSE_S)
+        self._queues.drop_sensor(sensor, _PAUSED)
 
     def _keep(self, job: Job) -> None:
         """Put a measurement where somebody can look at it."""
@@ -285,6 +321,10 @@ class Processing:
         if self._quarantine is None:
             return
         data, settings = job.data, self._sensors[job.data.sensor].settings
+        air = Air(
+            temperature_c=data.temperature_c, humidity_percent=data.humidity_percent, pressure_pa=data.pressure_pa
+        )
+        settings = settings.replace(air=air)
         layout = microphones(settings.array)
         shape = (settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
         words = np.frombuffer(bytes_of(job.words), f"<u{layout.word_bits // 8}")
@@ -315,7 +355,7 @@ class Processing:
         if not self._publisher.serves or sensor.kind is not job.kind:
             self._runner.give_back(slot)
             reason = _PUBLISHER_DIED if sensor.kind is job.kind else _CHANGED
-            self._queues.counts_of(job.data.sensor).drop(reason)
+            self._queues.drop(job.data, reason)
             return
         note = notes.Publish(
             job=job.number,
@@ -329,7 +369,9 @@ class Processing:
             n_points=job.n_points if job.points else -1,
             words_bytes=job.words.nbytes,
         )
-        self._publisher.publish(job, note)
+        if not self._publisher.publish(job, note):
+            self._runner.give_back(slot)
+            self._queues.drop(job.data, _UNDESCRIBED)
 
     def _leave(self, job: Job) -> None:
         """Take a job out of the order in which others are published."""
@@ -337,7 +379,7 @@ class Processing:
         if job in jobs:
             jobs.remove(job)
 
-    def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job]) -> None:
+    def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job] = ()) -> None:
         """Count what was published, or has died with the publisher, and take the slots back."""
         for job, published_ns in taken:
             counts = self._queues.counts_of(job.data.sensor)
@@ -345,7 +387,7 @@ class Processing:
             counts.in_flight -= 1
             counts.times.add((published_ns - job.arrived_ns) / 1e6)
         for job in lost:
-            self._queues.counts_of(job.data.sensor).drop(_PUBLISHER_DIED)
+            self._queues.drop(job.data, _PUBLISHER_DIED)
         for job in (*(job for job, _ in taken), *lost):
             if job.slot is not None and self._runner is not None:
                 self._runner.give_back(job.slot)
@@ -358,9 +400,6 @@ class Processing:
 def _runner(options: Options, log: Log) -> Runner:
     if options.cluster is None:
         return Workers(options, log)
-    from ertis_numba.network.processing.cluster import (  # type: ignore[import-not-found,unused-ignore]  # noqa: PLC0415
-        Cluster,
-    )
+    from ertis_numba.network.processing.cluster import Cluster  # noqa: PLC0415  which needs another package
 
-    made: Runner = Cluster(options, lambda text: log.warning("cluster", text=text))
-    return made
+    return Cluster(options, lambda text: log.warning("cluster", text=text))

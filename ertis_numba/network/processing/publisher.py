@@ -68,8 +68,9 @@ class Publisher:
         self._points: tuple[str, ...] | None = ()
         self._jobs: dict[int, Job] = {}
         self._slots: dict[int, Slot] = {}
-        self._descriptions: dict[int, tuple[Description, tuple[bytes, ...]]] = {}
+        self._descriptions: dict[str, dict[int, tuple[Description, tuple[bytes, ...]]]] = {}  # by sensor
         self._told: set[int] = set()
+        self._keys_note = ""
         self._reports_sent = self._reports_taken = 0
 
     def start(self) -> None:
@@ -107,15 +108,20 @@ class Publisher:
 
     def describe(self, description: Description, payloads: tuple[bytes, ...]) -> None:
         """Say what products are about, before the first of them."""
-        self._descriptions[description.number] = description, payloads
-        while len(self._descriptions) > DESCRIPTIONS:
-            del self._descriptions[min(self._descriptions)]
+        kept = self._descriptions.setdefault(description.sensor, {})
+        kept[description.number] = description, payloads
+        while len(kept) > DESCRIPTIONS:
+            self._told.discard(stale := min(kept))
+            del kept[stale]
 
-    def publish(self, job: Job, publish: notes.Publish) -> None:
-        """Hand over a job that is done; `Taken` tells of it, or its death does."""
+    def publish(self, job: Job, publish: notes.Publish) -> bool:
+        """Hand over a job that is done; `Taken` tells of it, or its death does. False if nothing describes it."""
         child, slot = self._child, job.slot
         if child is None or slot is None:
             raise AssertionError("nothing can be published now; ask serves first")
+        described = self._descriptions.get(job.data.sensor, {})
+        if not {publish.description, publish.raw_description} <= described.keys():
+            return False
         if self._slots.get(slot.number) is not slot:
             self._slots[slot.number] = slot
             note = notes.Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
@@ -123,10 +129,11 @@ class Publisher:
         for number in (publish.description, publish.raw_description):
             if number not in self._told:
                 self._told.add(number)
-                description, payloads = self._descriptions[number]
+                description, payloads = described[number]
                 child.pipe.send(notes.Describe(description=description, payloads=payloads))
         self._jobs[job.number] = job
         child.pipe.send(publish)
+        return True
 
     def group(self, group: Group) -> None:
         """Tell of a group that is closed; it is not told while the process does not listen."""
@@ -141,18 +148,20 @@ class Publisher:
 
     def fds(self) -> Iterable[int]:
         """Return what is to be polled now."""
-        return () if self._child is None else (self._child.pipe.fileno(),)
+        return () if self._child is None or self._child.pipe.closed else (self._child.pipe.fileno(),)
 
-    def ready(self) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
-        """Return jobs that were published, with the time, and jobs that the process has died with."""
+    def ready(self) -> Sequence[tuple[Job, int]]:
+        """Return jobs that were published, with the time."""
         if self._child is None:
-            return (), ()
+            return ()
         taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
-        lost = self._died() if self._child.pipe.closed else ()
-        return taken, lost
+        if self._child.pipe.closed:  # `tick` clears up, when it is gone
+            self._child.kill()
+            self._serves = False
+        return taken
 
     def tick(self, now_s: float) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
-        """Do as `ready`; start the process again, or end one that hangs, if it is time."""
+        """Do as `ready`, and return jobs that the process has died with; start it again, or end one that hangs."""
         if self._child is None:
             if now_s >= self._next_s:
                 self._begin()
@@ -161,10 +170,10 @@ class Publisher:
         if now_s - self._heard_s > (_HUNG_S if self._serves else _STARTED_S):
             self._log.warning("publisher_killed", pid=self._child.pid, text="it hangs")
             self._child.kill()
+            self._heard_s = now_s
         if not self._child.ended:
             return (), ()
-        taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
-        return taken, self._died()
+        return self.ready(), self._died()
 
     def close(self) -> None:
         """End it."""
@@ -185,7 +194,9 @@ class Publisher:
                 "secret": keys.pair.secret,
                 "allow": str(keys.allow),
             }
-        self._child.pipe.send(notes.Begin(address=self.address, **given))
+        # At the port that it has had, and the host that was given: where it can be reached may be one of several.
+        address = f"{self._options.publish.rpartition(':')[0]}:{self.address.rpartition(':')[2]}"
+        self._child.pipe.send(notes.Begin(address=address, **given))
 
     def _take(self, note: FromPublisher) -> tuple[Job, int] | None:
         self._heard_s = time.monotonic()
@@ -200,6 +211,9 @@ class Publisher:
             case notes.Served():
                 self.subscribers, self._deaths = note.subscribers, 0
                 self._reports_taken = note.reports
+                if note.keys_note not in {self._keys_note, ""}:
+                    self._log.error("keys", text=note.keys_note)
+                self._keys_note = note.keys_note
                 names = {*self._refused_before, *note.refused}
                 self.refused = {name: self._refused_before.get(name, 0) + note.refused.get(name, 0) for name in names}
             case notes.Taken(job=number, published_ns=published_ns):
@@ -211,7 +225,6 @@ class Publisher:
         """Clear up after the process, and return what it had taken with it."""
         if self._child is None:
             return []
-        self._child.kill()
         self._child.close()
         self._log.warning("publisher_died", pid=self._child.pid, text="another takes its place")
         self._child, self._serves = None, False

@@ -2,6 +2,7 @@
 
 import queue
 import threading
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -14,6 +15,8 @@ from ertis_numba.network.log import Log
 __all__ = ["Quarantine"]
 
 _WAITING: Final = 16
+_MOST: Final = 100  # measurements that are kept: what is wrong with one sensor must not fill a disk
+_CLOSED_S: Final = 2.0
 
 
 class Quarantine:
@@ -32,20 +35,26 @@ class Quarantine:
         self._folder, self._log = folder, log
         self._waiting: queue.Queue[Entry | None] = queue.Queue(_WAITING)
         self._thread = threading.Thread(target=self._run, name="quarantine", daemon=True)
-        self._thread.start()
         self._journal: Journal | None = None
+        self._kept = 0
+        self._thread.start()
 
     def put(self, entry: Entry) -> None:
-        """Keep a measurement, unless the disk is far behind."""
+        """Keep a measurement, unless there are many already or the disk is far behind."""
+        if self._kept >= _MOST:
+            self._lost(entry, f"{_MOST} are kept already; see what is wrong with them")
+            return
+        self._kept += 1
         try:
             self._waiting.put_nowait(entry)
         except queue.Full:
             self._lost(entry, "the disk is too slow")
 
     def close(self) -> None:
-        """End it, when what waits is written."""
-        self._waiting.put(None)
-        self._thread.join()
+        """End it, when what waits is written; a disk that does not answer is not waited for."""
+        with suppress(queue.Full):
+            self._waiting.put(None, timeout=_CLOSED_S)
+        self._thread.join(_CLOSED_S)
 
     def _lost(self, entry: Entry, why: str) -> None:
         stamp = entry.measurement.stamp

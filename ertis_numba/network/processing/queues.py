@@ -1,16 +1,18 @@
 """What waits for a worker, and what became of all that came: the latest wins, and nothing is lost uncounted."""
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
+from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.status import Latencies, Percentiles
 
 __all__ = ["SUPERSEDED", "Counts", "Queues"]
 
 _QUEUE: Final = 2  # measurements of a sensor that wait; the oldest gives way to a new one
+_TOLD: Final = 4096  # of those that were dropped, until somebody asks
 SUPERSEDED: Final = "superseded"
 
 
@@ -45,17 +47,21 @@ class Counts:
         """What those times come to."""
         return self.times.percentiles()
 
-    def drop(self, reason: str) -> None:
-        """Count a measurement that ends without an image."""
-        self.dropped[reason] += 1
-        self.in_flight -= 1
-
 
 class Queues:
-    """Measurements that wait, two of each sensor at most, served in turn."""
+    """Measurements that wait, two of each sensor at most, served in turn.
+
+    Attributes
+    ----------
+    counts : dict of str to Counts
+        By sensor.
+    dropped : deque of (sensor, epoch, sequence, reason)
+        The latest that were dropped; whoever tells of them takes them out.
+    """
 
     def __init__(self) -> None:
         self.counts: dict[str, Counts] = {}
+        self.dropped: deque[tuple[str, int, int, str]] = deque(maxlen=_TOLD)
         self._waiting: dict[str, deque[Job]] = {}
         self._again: deque[Job] = deque()  # jobs that get another try, before all others
 
@@ -63,16 +69,27 @@ class Queues:
         """Return the counts of a sensor, which begin with 0."""
         return self.counts.setdefault(sensor, Counts())
 
+    def take_in(self, data: Data) -> Counts:
+        """Count a measurement that has come; return the counts of its sensor."""
+        counts = self.counts_of(data.sensor)
+        counts.received += 1
+        counts.in_flight += 1
+        return counts
+
+    def drop(self, data: Data, reason: str) -> None:
+        """Count a measurement that ends without an image."""
+        counts = self.counts_of(data.sensor)
+        counts.dropped[reason] += 1
+        counts.in_flight -= 1
+        self.dropped.append((data.sensor, data.epoch, data.sequence, reason))
+
     def add(self, job: Job, reason: str = SUPERSEDED) -> None:
         """Let a measurement wait; the oldest of its sensor is dropped, for a reason, if there are too many."""
         sensor = job.data.sensor
-        counts = self.counts_of(sensor)
-        counts.received += 1
-        counts.in_flight += 1
+        counts = self.take_in(job.data)
         waiting = self._waiting.setdefault(sensor, deque())
         if len(waiting) == _QUEUE:
-            waiting.popleft()
-            counts.drop(reason)
+            self.drop(waiting.popleft().data, reason)
         waiting.append(job)
         counts.queue = len(waiting)
 
@@ -100,16 +117,18 @@ class Queues:
 
     def drop_kind(self, kind: int, reason: str) -> None:
         """Drop all that waits of a kind."""
-        for job in [job for job in self._again if job.kind.number == kind]:
-            self._again.remove(job)
-            self.counts[job.data.sensor].drop(reason)
-        for sensor, waiting in self._waiting.items():
-            for job in [job for job in waiting if job.kind.number == kind]:
-                waiting.remove(job)
-                self.counts[sensor].drop(reason)
-            self.counts[sensor].queue = len(waiting)
+        self._drop(lambda job: job.kind.number == kind, reason)
 
-    def drop_all(self, reason: str) -> None:
-        """Drop all that waits."""
-        for kind in {job.kind.number for job in [*self._again, *(j for each in self._waiting.values() for j in each)]}:
-            self.drop_kind(kind, reason)
+    def drop_sensor(self, sensor: str, reason: str) -> None:
+        """Drop all that waits of a sensor."""
+        self._drop(lambda job: job.data.sensor == sensor, reason)
+
+    def _drop(self, condition: Callable[[Job], bool], reason: str) -> None:
+        for job in list(filter(condition, self._again)):
+            self._again.remove(job)
+            self.drop(job.data, reason)
+        for sensor, waiting in self._waiting.items():
+            for job in list(filter(condition, waiting)):
+                waiting.remove(job)
+                self.drop(job.data, reason)
+            self.counts[sensor].queue = len(waiting)

@@ -91,7 +91,7 @@ class KindReady:
 
 @dataclass(frozen=True, slots=True)
 class KindFailed:
-    """Jobs of a kind can never be run."""
+    """Jobs of a kind cannot be run, unless another `Runner.prepare` succeeds."""
 
     kind: int
     text: str
@@ -106,7 +106,7 @@ Event: TypeAlias = Done | Lost | KindReady | KindFailed
 
 
 class Runner(Protocol):
-    """Runs jobs; it never blocks for longer than the copy of one measurement takes.
+    """Runs jobs, and waits for none: calls take the copy of a measurement, or the start of a process, until `close`.
 
     Attributes
     ----------

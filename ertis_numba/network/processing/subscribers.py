@@ -15,10 +15,12 @@ from ertis_numba.network.status import SubscriberStatus
 
 __all__ = ["DESCRIPTIONS", "Item", "Subscriber", "Subscribers"]
 
-DESCRIPTIONS: Final = 256
-"""That are kept: two of each sensor, and those of before a change of its settings."""
+DESCRIPTIONS: Final = 4
+"""That are kept of each sensor: of its images and of its words, and those of before a change of its settings."""
 
 _MOST: Final = 256
+_MOST_OF_KEY: Final = 16
+_DESCRIBED: Final = 16  # descriptions of each sensor that an application is taken to have still
 _SILENT_S: Final = 3.0
 _UNDER_WAY_BYTES: Final = 64_000_000  # that an application may have been sent and not yet have taken
 _AFTER_S: Final = 60.0  # that one is remembered when it says nothing any more
@@ -39,15 +41,15 @@ class Item:
         But for its numbers.
     payloads : sequence of bytes
         Shared by all that get it.
-    description : int
-        That has to be sent before; -1 if there is none.
+    description : (number, frames), optional
+        That has to be sent before.
     """
 
     product: Product
     sensor: str
     header: Header
     payloads: Sequence[bytes]
-    description: int = -1
+    description: tuple[int, Sequence[bytes]] | None = None
 
     @property
     def n_bytes(self) -> int:
@@ -75,7 +77,7 @@ class Subscriber:
     number: int = 0  # of the next product
     sent: int = 0
     dropped: int = 0
-    described: set[int] = field(default_factory=set)
+    described: dict[str, deque[int]] = field(default_factory=dict)  # by sensor
     under_way: deque[int] = field(default_factory=deque)  # bytes of each product that it has not consumed yet
     waiting: dict[tuple[str, str], tuple[int, Item]] = field(default_factory=dict)
 
@@ -135,12 +137,15 @@ class Subscribers:
     ----------
     socket : zmq.Socket
         A ROUTER.
+    with_keys : bool
+        Whether names are those of keys, each of which may have a share of the places only.
     """
 
-    def __init__(self, socket: "zmq.Socket[bytes]") -> None:
+    def __init__(self, socket: "zmq.Socket[bytes]", *, with_keys: bool = False) -> None:
         self._socket = socket
+        self._most_of_key = _MOST_OF_KEY if with_keys else _MOST
         self._all: dict[bytes, Subscriber] = {}
-        self._descriptions: dict[int, list[bytes]] = {}
+        self._descriptions: dict[str, dict[int, Sequence[bytes]]] = {}
 
     def __iter__(self) -> Iterator[Subscriber]:
         return (each for each in self._all.values() if each.active)
@@ -150,7 +155,7 @@ class Subscribers:
         routing_id, now_s = frames[0].bytes, time.monotonic()
         known = self._all.get(routing_id)
         if known is None:
-            if sum(1 for _ in self) >= _MOST:
+            if not self._has_room(name):
                 return False
             known = self._all[routing_id] = Subscriber(frames, name, wants, before=wants.consumed)
         known.frames, known.heard_s, known.active = frames, now_s, True
@@ -158,15 +163,30 @@ class Subscribers:
         self._send(routing_id, known)
         return True
 
+    def _has_room(self, name: str) -> bool:
+        """Whether a key may have another application; those of it that are silent make room."""
+        of_key = {routing_id: each for routing_id, each in self._all.items() if each.name == name}
+        silent = [routing_id for routing_id, each in of_key.items() if not each.active]
+        if len(of_key) >= self._most_of_key and silent:
+            self.forget(min(silent, key=lambda routing_id: of_key[routing_id].heard_s))
+            return self._has_room(name)
+        return len(of_key) < self._most_of_key and sum(1 for _ in self) < _MOST
+
     def forget(self, routing_id: bytes) -> None:
         """Know of an application no more."""
         self._all.pop(routing_id, None)
 
-    def describe(self, number: int, frames: list[bytes]) -> None:
+    def describe(self, sensor: str, number: int, frames: Sequence[bytes]) -> None:
         """Keep what products are about, for those who get one of them."""
-        self._descriptions[number] = frames
-        while len(self._descriptions) > DESCRIPTIONS:
-            del self._descriptions[min(self._descriptions)]
+        kept = self._descriptions.setdefault(sensor, {})
+        kept[number] = frames
+        while len(kept) > DESCRIPTIONS:
+            del kept[min(kept)]
+
+    def description(self, sensor: str, number: int) -> tuple[int, Sequence[bytes]] | None:
+        """Return what products of a sensor are about, as an `Item` has it; None if that is not known (any more)."""
+        frames = self._descriptions.get(sensor, {}).get(number)
+        return None if frames is None else (number, frames)
 
     def wanted(self, product: Product, sensor: str) -> bool:
         """Whether anybody wants this."""
@@ -219,10 +239,13 @@ class Subscribers:
     def _send(self, routing_id: bytes, each: Subscriber) -> None:
         while (found := each.next()) is not None:
             key, number, item = found
-            if item.description >= 0 and item.description not in each.described:
-                if not self._put(routing_id, self._descriptions[item.description]):
-                    return
-                each.described.add(item.description)
+            if item.description is not None:
+                about, frames = item.description
+                described = each.described.setdefault(item.sensor, deque(maxlen=_DESCRIBED))
+                if about not in described:
+                    if not self._put(routing_id, frames):
+                        return
+                    described.append(about)
             changes: dict[str, Any] = {"number": number, "dropped": each.dropped}
             if isinstance(item.header, Image | Points):
                 changes["published_ns"] = time.monotonic_ns()

@@ -101,6 +101,7 @@ class Workers:
     def prepare(self, kind: Kind) -> None:
         """See `Runner`."""
         self._kinds[kind.number] = kind
+        self._tries.pop(kind.number, None)
         for worker in self._workers:
             self._next_kind(worker)
 
@@ -108,6 +109,7 @@ class Workers:
         """See `Runner`."""
         self._kinds.pop(kind.number, None)
         self._prepared.pop(kind.number, None)
+        self._tries.pop(kind.number, None)
         for worker in self._workers:
             if kind.number in worker.kinds and worker.child is not None:
                 worker.kinds.discard(kind.number)
@@ -152,7 +154,8 @@ class Workers:
 
     def fds(self) -> Iterable[int]:
         """See `Runner`."""
-        return [worker.child.pipe.fileno() for worker in self._workers if worker.child is not None]
+        children = (worker.child for worker in self._workers)
+        return [child.pipe.fileno() for child in children if child is not None and not child.pipe.closed]
 
     def ready(self, fd: int) -> Sequence[Event]:
         """See `Runner`."""
@@ -172,6 +175,7 @@ class Workers:
             worker.child.pipe.flush()
             if now_s > worker.deadline_s:
                 self._log.warning("worker_killed", pid=worker.child.pid, text="it was not done in time")
+                worker.deadline_s = float("inf")
                 worker.child.kill()
             if worker.child.ended:
                 found += self._heard(worker)  # it may have told something before
@@ -229,14 +233,16 @@ class Workers:
                 case Prepared():
                     found += self._became_ready(worker, note)
                 case Unusable(kind=kind, text=text):
-                    self._kinds.pop(kind, None)
                     worker.preparing, worker.deadline_s = None, float("inf")
-                    found.append(KindFailed(kind, text))
+                    if self._kinds.pop(kind, None) is not None:
+                        found.append(KindFailed(kind, text))
                 case Made() | Failed():
                     found += self._finished(worker, note)
-        if worker.child.pipe.closed or worker.child.ended:
-            worker.child.kill()
+        if worker.child.ended:
             found += self._died(worker)
+        elif worker.child.pipe.closed:  # `tick` clears up, when it is gone and writes no more
+            worker.ready = False
+            worker.child.kill()
         else:
             self._next_kind(worker)
         return found
@@ -259,7 +265,10 @@ class Workers:
     def _became_ready(self, worker: _Worker, note: Prepared) -> list[Event]:
         kind = worker.preparing
         worker.preparing, worker.deadline_s = None, float("inf")
-        if kind is None or kind.number not in self._kinds:
+        if worker.child is None or kind is None:
+            return []
+        if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
+            worker.child.pipe.send(Forget(kind=note.kind))
             return []
         worker.kinds.add(kind.number)
         self._give_memory(worker, kind.words_bytes, self._image_bytes(note))

@@ -11,6 +11,7 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.errors import DamagedError, DataError, InUseError, NetworkError
 from ertis_numba.journal import SUFFIX, Entry, Gap, Journal
+from ertis_numba.network.messages import MOST_SEQUENCE
 from ertis_numba.network.sensor_node._runs import Item, Run
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
 
@@ -83,6 +84,10 @@ class DiskSpool(Spool):
         found = [(key.sequence, key.sequence, "", key.sensor, key.epoch) for key in journal.index()]
         found += [(gap.first, gap.last, gap.reason, gap.sensor, gap.epoch) for gap in journal.gaps]
         for first, last, reason, name, epoch in sorted(found):
+            if last > MOST_SEQUENCE:
+                raise DataError(
+                    f"sequence number {last} is above {MOST_SEQUENCE}; seal it by 'ertis recover {journal.path}'"
+                )
             run = runs.setdefault((name, epoch), Run(journal.sensors[name], epoch, journal))
             if reason:
                 run.add_gap(first, last, reason)

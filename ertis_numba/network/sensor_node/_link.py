@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 import zmq
 
-from ertis_numba.errors import DataError, ErtisError, FormatVersionError
+from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.sensor_node._runs import Run
@@ -29,6 +29,7 @@ _TURN_MS = 100
 _UNDER_WAY_BYTES = 32_000_000
 _AT_ONCE = 32  # messages sent or received before the others have a turn
 _LINE_CHARACTERS = 400
+_MOST_TOLD = 256
 _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused)
 
 
@@ -41,7 +42,7 @@ class Link(threading.Thread):
     keys : ClientKeys or None
     spool : Spool
     on_settled, on_note : callable
-        Called from this thread.
+        Called from this thread; they must not raise.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ class Link(threading.Thread):
         self._heard_s = self._ping_s = 0.0
         self._is_blocked = False
         self._was_there = False
-        self._told: set[str] = set()
+        self._told: set[tuple[str, str]] = set()  # what it was about, and the sensor
         self._next_sensor = 0
         self._greeted: set[tuple[str, int]] = set()
         self.central: Central = "away"
@@ -103,9 +104,10 @@ class Link(threading.Thread):
             try:
                 self._turn()
             except Exception as error:  # noqa: BLE001  measurements are kept whatever happens, and sent later
-                self._note(f"the link to {self._address} has failed ({_line(error)}); it is made again")
+                text = f"the link to {self._address} has failed ({_line(error)}); it is made again"
+                self._note(text, "link", type(error).__name__)
                 self._stopping.wait(_FAILED_S)
-                with suppress(ErtisError, zmq.ZMQError):
+                with suppress(Exception):
                     self._connect()
         if self._socket is not None:
             self._send(self._socket, [messages.encode(messages.Bye())])
@@ -145,7 +147,7 @@ class Link(threading.Thread):
                 self._wake_out.recv(4096)
         if monitor.socket in events:
             for text in monitor.read():
-                self._note(text)
+                self._note(text, text)  # which are a handful
         if events.get(socket, 0) & zmq.POLLOUT:
             self._is_blocked = False
         self._receive(socket)
@@ -159,7 +161,8 @@ class Link(threading.Thread):
 
     def _lose(self) -> None:
         if self.central != "away" or not self._was_there:
-            self._note(f"the central node at {self._address} does not answer; measurements are kept meanwhile")
+            text = f"the central node at {self._address} does not answer; measurements are kept meanwhile"
+            self._note(text, "away")
         self.central = "away"
         self._connect()
 
@@ -176,9 +179,9 @@ class Link(threading.Thread):
             except FormatVersionError as error:
                 self._heard_s = time.monotonic()
                 with self._spool.turn:
-                    self._wait(list(self._spool.runs.values()), str(error))
+                    self._wait(list(self._spool.runs.values()), str(error), "version")
             except DataError as error:
-                self._note(f"the central node says what cannot be understood: {error}")
+                self._note(f"the central node says what cannot be understood: {error}", "message")
             else:
                 self._heard_s = time.monotonic()
                 self._take(message)
@@ -220,7 +223,8 @@ class Link(threading.Thread):
             self._was_there = True
             self._told.clear()
         if state == "fault" and text is not None:
-            self._note(f"the central node cannot store: {text or 'it does not say why'}; measurements are kept")
+            why = text or "it does not say why"
+            self._note(f"the central node cannot store: {why}; measurements are kept", "fault")
         elif state != "fault" and before == "fault":
             self._on_note("the central node stores again")
             self._told.clear()
@@ -243,7 +247,8 @@ class Link(threading.Thread):
         if message.code == "size" and self._say_bye():
             return
         about = f" of sensor {message.sensor}" if message.sensor else ""
-        self._wait(runs, f"the central node refuses measurements{about}: {message.reason}")
+        text = f"the central node refuses measurements{about}: {message.reason}"
+        self._wait(runs, text, f"refused {message.code}", message.sensor)
 
     def _say_bye(self) -> bool:
         """Have the central node forget runs that are over, which it has room for some of; whether there were any."""
@@ -259,16 +264,16 @@ class Link(threading.Thread):
                     run.stage = "new"
         return True
 
-    def _wait(self, runs: list[Run], text: str) -> None:
+    def _wait(self, runs: list[Run], text: str, about: str, sensor: str = "") -> None:
         """Try again later, and let others pass meanwhile."""
-        self._note(text)
+        self._note(text, about, sensor)
         for run in runs:
             run.stage, run.since_s = "waiting", time.monotonic() + _REFUSED_S
 
-    def _note(self, text: str) -> None:
-        """Tell something once, until it has changed."""
-        if text not in self._told:
-            self._told.add(text)
+    def _note(self, text: str, about: str, sensor: str = "") -> None:
+        """Tell something once until the central node is there again, even if another number is in it each time."""
+        if (about, sensor) not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add((about, sensor))
             self._on_note(text)
 
     # What goes.
@@ -325,7 +330,7 @@ class Link(threading.Thread):
         try:
             entry = self._spool.entry(item, run)
         except DataError as error:  # the disk of the spool
-            self._wait([run], str(error))
+            self._wait([run], str(error), "spool", run.sensor.name)
             return False
         if entry is None and not item.reason:  # it has made room for later ones meanwhile
             return False

@@ -3,13 +3,15 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Generic, Self, TypeVar
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import Entry, Sensor
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.log import logger
+from ertis_numba.network.messages import MOST_SEQUENCE
 from ertis_numba.network.sensor_node._disk import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
@@ -17,6 +19,25 @@ from ertis_numba.network.sensor_node._wire import Settled
 from ertis_numba.settings import Settings
 
 __all__ = ["SensorNode"]
+
+Told = TypeVar("Told")
+
+
+class _Listener(Generic[Told]):
+    """Calls a function of the user; where that fails, it is logged once until it works again, and nothing ends."""
+
+    def __init__(self, name: str, function: Callable[[Told], None]) -> None:
+        self._name, self._function, self._fails = name, function, False
+
+    def __call__(self, told: Told) -> None:
+        try:
+            self._function(told)
+        except Exception as error:  # noqa: BLE001  measurements are sent whatever becomes of who watches
+            if not self._fails:
+                logger("sensor_node").error("listener", text=f"{self._name} failed: {type(error).__name__}: {error}")
+            self._fails = True
+        else:
+            self._fails = False
 
 
 class SensorNode:
@@ -41,9 +62,9 @@ class SensorNode:
         Of measurements in the spool; when it is full, new ones are refused and become gaps. As much as the disk
         allows by default.
     on_settled : callable, optional
-        Called with a `Settled` when the central node has more, from another thread.
+        Called with a `Settled` when the central node has more, from another thread. An exception is logged.
     on_note : callable, optional
-        Called with a line about what whoever watches should know, from another thread.
+        Called with a line about what whoever watches should know, from another thread. An exception is logged.
 
     Raises
     ------
@@ -64,12 +85,14 @@ class SensorNode:
     ) -> None:
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
-        self._on_settled, self._on_note = on_settled, on_note
+        self._on_settled, self._on_note = _Listener("on_settled", on_settled), _Listener("on_note", on_note)
         if spool_bytes is not None and spool is None:
             raise ArgumentError("spool_bytes is given without a spool; give its folder, too")
         checks.whole("ring_bytes", ring_bytes, 1)
         self._spool = (
-            Spool(ring_bytes) if spool is None else DiskSpool(Path(spool), ring_bytes, spool_bytes, on_note=on_note)
+            Spool(ring_bytes)
+            if spool is None
+            else DiskSpool(Path(spool), ring_bytes, spool_bytes, on_note=self._on_note)
         )
         self._link: Link | None = None
 
@@ -146,7 +169,9 @@ class SensorNode:
             There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
             bytes.
         """
-        self._spool.note_gap(sensor, first, last, reason, epoch=epoch)
+        checks.gap(first, last, reason)
+        last = checks.whole("last missing sequence number", last, 0, MOST_SEQUENCE)
+        self._spool.note_gap(sensor, int(first), last, reason, epoch=checks.whole("epoch", epoch, 0, 2**63 - 1))
         self._wake()
 
     def _wake(self) -> None:

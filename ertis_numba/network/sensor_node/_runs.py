@@ -179,7 +179,8 @@ class Run:
         """Begin to send, and return what was settled before."""
         self.stage, self.since_s, self.window = "welcome", now_s, window
         last = -1 if self.following is None else self.following - 1
-        self.reached = max(self.reached, min(settled, last))
+        settled = min(settled, last)  # it may have more than is left here, as when the end of a spool was lost
+        self.reached = max(self.reached, settled)
         done = self.settle(settled, now_s)
         self.go_back(now_s)
         return done

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Stamp
 from ertis_numba.journal import Entry, Sensor, require_same
+from ertis_numba.network.messages import MOST_SEQUENCE
 from ertis_numba.network.sensor_node._runs import Item, Run
 
 if TYPE_CHECKING:
@@ -124,14 +126,24 @@ class Spool:
         """Refuse measurements that do not fit to their sensors, or whose numbers do not rise."""
         last: dict[tuple[str, int], int] = {}
         for entry in entries:
-            stamp, settings = entry.measurement.stamp, entry.measurement.settings
-            sensor = self._known(stamp.sensor)
+            settings = entry.measurement.settings
+            sensor = self._known(entry.measurement.stamp.sensor)
             if settings is not self._accepted.get(sensor.name):
                 require_same(sensor, settings)
                 self._accepted[sensor.name] = settings
-            words = sensor.entry_row(entry, 0)[-1]  # checked, contiguous and little-endian; and the CRC-32 is there
-            if words is not entry.measurement.words:
-                entry.measurement = type(entry.measurement)(words, settings, stamp)
+            # Checked: words are contiguous and little-endian, and numbers are Python's, as what encodes them wants.
+            _, epoch, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(entry, 0)
+            checks.whole("sequence", number, 0, MOST_SEQUENCE)
+            stamp = Stamp(
+                sensor=sensor.name,
+                sequence=number,
+                sync_count=sync_count,
+                timestamp_ns=time_ns,
+                timestamp_uncertainty_ns=uncertainty_ns,
+                epoch=epoch,
+            )
+            entry.measurement = type(entry.measurement)(words, settings, stamp)
+            entry.monotonic_ns, entry.crc32 = rest[0], crc32
             key = stamp.sensor, stamp.epoch
             if stamp.sequence <= last.get(key, -1):
                 raise ArgumentError(
@@ -192,8 +204,6 @@ class Spool:
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
         """Keep which of a sensor's numbers are missing, and why."""
-        checks.gap(first, last, reason)
-        checks.whole("epoch", epoch, 0, 2**63 - 1)
         with self.turn:
             self._run(sensor, epoch).add_gap(first, last, reason)
             self.counts[sensor].missing[reason] += last - first + 1

@@ -1,0 +1,60 @@
+"""Who is let greet for what."""
+
+import zlib
+from collections.abc import Mapping
+from typing import Final
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import Sensor
+from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._streams import SETTINGS_BYTES, Peer, Track, source_of
+from ertis_numba.network.central_node._volumes import same
+from ertis_numba.network.messages import Hello
+
+__all__ = ["require_room", "require_same", "source_in"]
+
+_STREAMS: Final = 64  # of a peer
+_SENSORS: Final = 1024
+_PEERS: Final = 1024
+_PEERS_OF_KEY: Final = 64
+
+
+def source_in(hello: Hello, payload: list[bytes], *, most_bytes: int) -> Sensor:
+    """Return the sensor of a greeting, or refuse what is none."""
+    if len(payload) != 1 or len(payload[0]) > SETTINGS_BYTES:
+        raise Unwanted("settings", f"a hello has no settings of at most {SETTINGS_BYTES} bytes; send them", "size")
+    if zlib.crc32(payload[0]) != hello.settings_crc32:
+        raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
+    try:
+        return source_of(hello, payload[0], most_bytes=most_bytes)
+    except (ArgumentError, OSError) as error:
+        raise Unwanted("settings", " ".join(str(error).split()), "settings") from error
+
+
+def require_room(
+    peers: Mapping[bytes, Peer], tracks: Mapping[str, Track], peer: Peer | None, run: Run, key: str
+) -> None:
+    """Refuse what is one too many; ``peer`` is None where it has not greeted, ``key`` empty where there are none."""
+    if peer is None and len(peers) >= _PEERS:
+        raise Unwanted("size", f"this central node has {_PEERS} sensor nodes; use another", "too many")
+    if peer is None and key and sum(each.key == key for each in peers.values()) >= _PEERS_OF_KEY:
+        raise Unwanted("size", f"{_PEERS_OF_KEY} sensor nodes have this key; give each its own", "too many")
+    if peer is not None and run not in peer.streams and len(peer.streams) >= _STREAMS:
+        raise Unwanted("size", f"a sensor node has {_STREAMS} runs; say bye to those that are over", "too many")
+    if run.sensor not in tracks and len(tracks) >= _SENSORS:
+        raise Unwanted("size", f"this central node has {_SENSORS} sensors; use another", "too many")
+
+
+def require_same(peers: Mapping[bytes, Peer], tracks: Mapping[str, Track], peer_id: bytes, source: Sensor) -> None:
+    """Refuse a sensor that another node sends with other settings: each measurement would begin a recording."""
+    track = tracks.get(source.name)
+    for other in track.peers - {peer_id} if track is not None else ():
+        for stream in peers[other].streams.values():
+            if stream.run.sensor == source.name and not same(stream.source, source):
+                raise Unwanted(
+                    "settings",
+                    f"another sensor node sends sensor {source.name}, with other settings; give each sensor a name of "
+                    "its own, or end the other",
+                    "settings",
+                )

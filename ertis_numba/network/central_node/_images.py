@@ -1,0 +1,140 @@
+"""What makes images, as the central node sees it; whatever goes wrong in it, measurements are taken all the same."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.network.messages import Data, Hello
+from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
+from ertis_numba.settings import Settings
+
+__all__ = ["Guarded", "Images"]
+
+_Result = TypeVar("_Result")
+
+
+class ImageCounts(Protocol):
+    """What became of one sensor's measurements."""
+
+    published: int
+    dropped: Counter[str]
+    in_flight: int
+    queue: int
+    latency: Percentiles
+
+
+class Images(Protocol):
+    """What makes images, as `ertis_numba.network.processing.Processing` does."""
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Applications that were refused, by reason."""
+
+    def start(self) -> None:
+        """Begin."""
+
+    def know(self, hello: Hello, settings: Settings) -> None:
+        """Take note of a sensor."""
+
+    def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
+        """Take a measurement, whose words nobody changes any more; returns at once."""
+
+    def fds(self) -> Iterable[int]:
+        """Return what to poll."""
+
+    def ready(self, fd: int) -> None:
+        """Read from one of them."""
+
+    def tick(self, now_s: float) -> None:
+        """Do what is due."""
+
+    def counts(self, sensor: str) -> Any:
+        """Return what became of a sensor's measurements."""
+
+    def drain_dropped(self) -> list[tuple[str, int, int, str]]:
+        """Return what was dropped since: sensor, epoch, sequence and why of each."""
+
+    def status(self) -> ProcessingStatus:
+        """Return how it is."""
+
+    def publish_status(self, status: Status) -> None:
+        """Let applications know."""
+
+    def close(self, timeout_s: float) -> None:
+        """End."""
+
+
+class Guarded:
+    """Images, whose mistakes are told and cost measurements at most; a `Viewer`.
+
+    Parameters
+    ----------
+    images : Images
+    on_error : callable
+        Called with what was raised.
+    """
+
+    def __init__(self, images: Images, on_error: Callable[[Exception], None]) -> None:
+        self._images, self._on_error = images, on_error
+
+    def _try(self, act: Callable[[], _Result], instead: _Result) -> _Result:
+        try:
+            return act()
+        except Exception as error:  # noqa: BLE001  whatever it is, ingest goes on
+            self._on_error(error)
+            return instead
+
+    def start(self) -> None:
+        """Begin; raises what `Images.start` does."""
+        self._images.start()
+
+    def know(self, hello: Hello, settings: Settings) -> None:
+        """Take note of a sensor."""
+        self._try(lambda: self._images.know(hello, settings), None)
+
+    def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
+        """Take a measurement."""
+        self._try(lambda: self._images.offer(data, words, arrived_ns), None)
+
+    def fds(self) -> list[int]:
+        """Return what to poll."""
+        return self._try(lambda: list(self._images.fds()), [])
+
+    def ready(self, fd: int) -> None:
+        """Read from one of them."""
+        self._try(lambda: self._images.ready(fd), None)
+
+    def tick(self, now_s: float) -> None:
+        """Do what is due."""
+        self._try(lambda: self._images.tick(now_s), None)
+
+    def drain_dropped(self) -> list[tuple[str, int, int, str]]:
+        """Return what was dropped since."""
+        return self._try(self._images.drain_dropped, [])
+
+    def refused(self) -> Counter[str]:
+        """Return applications that were refused, by reason."""
+        return self._try(lambda: Counter(self._images.refused), Counter())
+
+    def fill(self, status: Status) -> None:
+        """Put into a status what it has to say."""
+        self._try(lambda: self._fill(status), None)
+
+    def _fill(self, status: Status) -> None:
+        status.processing = self._images.status()
+        for name, sensor in status.sensors.items():
+            counts: ImageCounts = self._images.counts(name)
+            sensor.published, sensor.dropped = counts.published, dict(counts.dropped)
+            sensor.in_flight, sensor.queue = counts.in_flight, counts.queue
+            sensor.image_latency = counts.latency
+
+    def publish_status(self, status: Status) -> None:
+        """Let applications know."""
+        self._try(lambda: self._images.publish_status(status), None)
+
+    def close(self, timeout_s: float) -> None:
+        """End."""
+        self._try(lambda: self._images.close(timeout_s), None)

@@ -1,0 +1,52 @@
+"""Reads what comes: messages of this protocol, of who may send them."""
+
+from typing import Final
+
+import zmq
+
+from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.network import messages
+from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.keys import Permission
+from ertis_numba.network.messages import AskStatus, Bye, Data, Gap, Hello, Message, Ping
+
+__all__ = ["read", "receive", "require_role"]
+
+_FRAMES: Final = 4  # of a message, that are looked at
+_TAKEN: Final = (Hello, Data, Gap, Ping, Bye, AskStatus)
+
+
+def receive(socket: "zmq.Socket[bytes]") -> list[zmq.Frame]:
+    """Return the frames of a message, the first of them if there are too many."""
+    frames = [socket.recv(zmq.NOBLOCK, copy=False)]
+    while frames[-1].more:
+        frame = socket.recv(zmq.NOBLOCK, copy=False)
+        if len(frames) < _FRAMES:
+            frames.append(frame)
+        else:
+            frames[-1] = frame
+    return frames
+
+
+def read(frames: list[zmq.Frame]) -> Message:
+    """Return the message in frames, or refuse what is none."""
+    if len(frames) < 2:
+        raise Unwanted("message", "a message is empty; send a header", "message")
+    try:
+        message: Message = messages.decode(frames[1].buffer, _TAKEN)
+    except FormatVersionError as error:
+        raise Unwanted("version", str(error), "version") from error
+    except DataError as error:
+        raise Unwanted("message", str(error), "message") from error
+    return message
+
+
+def require_role(who: Permission, message: Message) -> None:
+    """Refuse what its sender may not say."""
+    if isinstance(message, AskStatus):
+        if not who.may_receive:
+            raise Unwanted("role", f"key {who.name} is a sensor's, which may not ask for the status", "role")
+    elif who.may_receive and who.role != "admin":
+        raise Unwanted("role", f"key {who.name} is an application's, which may not send measurements", "role")
+    if isinstance(message, Hello | Data | Gap) and not who.may_send(message.sensor):
+        raise Unwanted("serial", f"key {who.name} may not speak for sensor {message.sensor}; allow it", "serial")

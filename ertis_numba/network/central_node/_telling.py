@@ -1,0 +1,65 @@
+"""What a central node tells of itself while it runs, each thing once."""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final
+
+__all__ = ["Telling", "text_of"]
+
+_TOLD_S: Final = 1.0  # between two events about mistakes
+
+
+class Telling:
+    """Makes events of what has changed.
+
+    Parameters
+    ----------
+    on_event : callable
+        Called with each event.
+    """
+
+    def __init__(self, on_event: Callable[[dict[str, Any]], None]) -> None:
+        self._on_event = on_event
+        self._fault = self._note = ""
+        self._refused: Counter[str] = Counter()
+        self._next_internal_s = 0.0
+
+    def tell(self, event: str, **told: Any) -> None:
+        """Tell of an event."""
+        with suppress(OSError):  # who listened may be gone: measurements are taken all the same
+            self._on_event({"event": event} | told)
+
+    def internal(self, error: Exception) -> None:
+        """Tell of a mistake in this package, but not all the time."""
+        now_s = time.monotonic()
+        if now_s >= self._next_internal_s:
+            self._next_internal_s = now_s + _TOLD_S
+            self.tell("internal", text=text_of(error))
+
+    def fault(self, text: str) -> None:
+        """Tell why nothing can be stored, if that is new; ``text`` is empty where it can."""
+        before, self._fault = self._fault, text
+        if text and text != before:
+            self.tell("fault", text=text)
+        elif before and not text:
+            self.tell("resumed")
+
+    def keys(self, note: str) -> None:
+        """Tell why the list of keys cannot be used, if that is new; ``note`` is empty where it can."""
+        if note != self._note:
+            self._note = note
+            self.tell("keys", text=note or "the list of keys can be used again")
+
+    def refused(self, counts: Counter[str]) -> None:
+        """Tell what was refused since."""
+        now = counts.copy()
+        for reason, count in (now - self._refused).items():
+            self.tell("refused", reason=reason, count=count)
+        self._refused = now
+
+
+def text_of(error: Exception) -> str:
+    """Return what an error is, in a line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

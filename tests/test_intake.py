@@ -1,0 +1,200 @@
+"""The intake by itself: what it counts, what it shows, and what it holds, whatever its store says."""
+
+import time
+import zlib
+
+import numpy as np
+import pytest
+
+from ertis_numba.network.central_node import _admission, _intake
+from ertis_numba.network.central_node._intake import Intake
+from ertis_numba.network.central_node._items import Forgotten, Run, Stored
+from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.messages import Ack, Gap, Hello, Refused
+from ertis_numba.settings import Air
+from tests.central import data_of
+from tests.journals import EPOCH, TINY, entries
+
+RUN = Run("left", EPOCH)
+
+
+class Store:
+    """Takes items, and stores none."""
+
+    def __init__(self):
+        self.items = []
+
+    def settled(self, _):
+        return -1
+
+    def offer(self, item):
+        self.items.append(item)
+
+
+class Viewer:
+    """Counts what it is shown."""
+
+    def __init__(self):
+        self.shown = []
+
+    def know(self, *_):
+        pass
+
+    def offer(self, data, words, _):
+        assert isinstance(words, np.ndarray)
+        self.shown.append(data.sequence)
+
+
+class Taken:
+    """An intake, and what it has sent and told."""
+
+    def __init__(self, *, store=True):
+        self.store, self.viewer = Store() if store else None, Viewer()
+        self.sent, self.told = [], []
+        self.intake = Intake(
+            store=self.store,
+            viewer=self.viewer,
+            send=lambda _, message: self.sent.append(message),
+            tell=lambda event, **more: self.told.append((event, more)),
+            on_stored=None,
+            most_bytes=100_000,
+        )
+
+    def greet(self, peer=b"a", *, settings=TINY, epoch=EPOCH, key="", first=0):
+        text = settings.to_toml().encode()
+        hello = Hello(sensor="left", epoch=epoch, next_sequence=first, settings_crc32=zlib.crc32(text))
+        return self.intake.greet(peer, hello, [text], key)
+
+    def measure(self, *given):
+        for entry in given:
+            data, words = data_of(entry)
+            self.intake.measure(b"a", data, [memoryview(words)], time.monotonic_ns())
+
+    def store_of(self, *items):
+        for item in items:
+            item.done = True
+        self.intake.stored(Stored(list(items), 0.0))
+
+    def acks(self):
+        self.intake.acknowledge()
+        return [message for message in self.sent if isinstance(message, Ack)]
+
+
+def test_what_is_sent_again_is_counted_and_shown_once():
+    taken, given = Taken(), entries(3, first=0)
+    taken.greet()
+    taken.measure(*given)
+    first, second, third = taken.store.items
+    taken.store_of(first)
+    for forgotten in (Forgotten(second, "no room"), Forgotten(third)):
+        taken.intake.forgotten(forgotten.item, forgotten.reason)
+    taken.measure(*given[1:])
+    track = taken.intake.tracks["left"]
+    assert taken.viewer.shown == [0, 1, 2]
+    assert (track.received, track.received_bytes) == (3, 3 * 4096)
+    assert [item.first for item in taken.store.items] == [0, 1, 2, 1, 2]
+    taken.store_of(*taken.store.items[3:])
+    assert (track.stored, track.repeated, track.waiting) == (3, 0, 0)
+
+
+def test_what_was_forgotten_of_an_older_turn_is_not_taken_twice():
+    taken, given = Taken(), entries(3, first=0)
+    taken.greet()
+    taken.measure(*given)
+    first, second, third = taken.store.items
+    taken.store_of(first)
+    taken.intake.forgotten(second, "no room")
+    taken.measure(given[1])  # on its way again, when the archive comes to what followed it
+    taken.intake.forgotten(third, "")
+    taken.measure(given[1])
+    assert [item.first for item in taken.store.items] == [0, 1, 2, 1]
+    assert taken.intake.tracks["left"].repeated == 1
+
+
+def test_what_was_shown_is_known_when_its_node_comes_back():
+    taken, given = Taken(), entries(2, first=0)
+    taken.greet()
+    taken.measure(*given)
+    taken.intake.bye(b"a")
+    for item in taken.store.items[:2]:
+        taken.intake.forgotten(item, "")
+    taken.greet()
+    taken.measure(*given)
+    assert taken.viewer.shown == [0, 1]
+    assert taken.intake.tracks["left"].received == 2
+
+
+@pytest.mark.parametrize("first", [0, 1_000])
+def test_gaps_that_wait_are_bounded_too(first, monkeypatch):
+    monkeypatch.setattr(_intake, "_WAITING_BYTES", 10_000)
+    taken = Taken()
+    taken.greet(first=first)
+    for number in range(first, first + 100):
+        taken.intake.miss(b"a", Gap(sensor="left", epoch=EPOCH, first=number, last=number, reason="lost"))
+    assert 0 < len(taken.store.items) < 10
+    reached = taken.store.items[-1].last
+    taken.store_of(*taken.store.items)
+    assert taken.acks()[-1].settled == reached
+    taken.intake.miss(b"a", Gap(sensor="left", epoch=EPOCH, first=reached + 1, last=2_000, reason="lost"))
+    assert taken.store.items[-1].last == 2_000
+
+
+def test_reasons_of_gaps_are_bounded():
+    taken = Taken(store=False)
+    taken.greet()
+    for number in range(100):
+        gap = Gap(sensor="left", epoch=EPOCH, first=number, last=number, reason=f"reason {number}")
+        taken.intake.miss(b"a", gap)
+    missing = taken.intake.tracks["left"].missing
+    assert len(missing) < 40
+    assert missing.total() == 100
+
+
+def test_an_ack_says_what_was_dropped_a_few_at_a_time():
+    taken = Taken(store=False)
+    taken.greet()
+    taken.intake.dropped([("left", EPOCH, number, "superseded") for number in range(40)])
+    taken.intake.dropped([("nobody", EPOCH, 1, "superseded")])
+    taken.measure(*entries(1, first=0))
+    assert taken.acks()[-1].dropped == tuple((number, "superseded") for number in range(32))
+    taken.intake.ping(b"a")
+    assert taken.acks()[-1].dropped == tuple((number, "superseded") for number in range(32, 40))
+    taken.intake.ping(b"a")
+    assert taken.acks()[-1].dropped == ()
+
+
+def test_a_sensor_that_another_node_sends_with_other_settings_is_refused():
+    taken, other = Taken(), TINY.replace(air=Air(temperature_c=5.0))
+    taken.greet(b"a")
+    with pytest.raises(Unwanted, match="another sensor node sends sensor left, with other settings") as refused:
+        taken.greet(b"b", settings=other, epoch=9)
+    assert isinstance(refused.value.answer(Ack(sensor="left", epoch=9, settled=0, status="stored")), Refused)
+    taken.greet(b"a", settings=other)  # its own may change
+    taken.intake.bye(b"a")
+    taken.greet(b"b", epoch=9)  # and who has left is in nobody's way
+
+
+def test_a_sensor_that_two_live_nodes_send_is_told_once():
+    taken = Taken()
+    taken.greet(b"a")
+    taken.greet(b"b", epoch=9)
+    taken.intake.tick(time.monotonic())
+    assert "shared" not in dict(taken.told)  # the first may have gone, and be the second
+    for peer in (b"a", b"b"):
+        taken.intake.ping(peer)
+    for _ in range(2):
+        taken.intake.tick(time.monotonic())
+    assert [more["sensor"] for event, more in taken.told if event == "shared"] == ["left"]
+
+
+def test_a_key_has_fewer_peers_than_there_are_of_all(monkeypatch):
+    monkeypatch.setattr(_admission, "_PEERS_OF_KEY", 2)
+    taken = Taken()
+    for peer in (b"a", b"b"):
+        taken.greet(peer, epoch=peer[0], key="one")
+    with pytest.raises(Unwanted, match="2 sensor nodes have this key"):
+        taken.greet(b"c", key="one")
+    taken.greet(b"a", epoch=8, key="one")
+    taken.greet(b"c", epoch=7, key="another")
+    for peer in (b"d", b"e", b"f"):  # where there are no keys
+        taken.greet(peer, epoch=peer[0])
