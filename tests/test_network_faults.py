@@ -303,7 +303,7 @@ def test_mixed_groups_are_found():
 def test_a_part_that_could_not_be_tried_is_told():
     assert tables.row("hosts", None)[2] == "not tried: only root may"
     report = {"machine": machine.describe(), "seed": 3, "long": False, "only": ["hosts"], "hosts": None}
-    assert "By `ertis bench network-faults --only hosts --seed 3`." in tables.faults(report)
+    assert "By `ertis bench network-faults --only hosts --seed 3`." in tables.network_faults(report)
 
 
 def test_frames_survive_any_cut():

@@ -31,7 +31,7 @@ COMMANDS = {
     "recover": ("ertis_cli.recover:recover", "Make recordings of what a crash has left."),
     "serve": ("ertis_cli.serve:serve", "Be the central node that makes images of what sensors send."),
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
-    "status": ("ertis_cli.status:status", "Show how a central node is."),
+    "status": ("ertis_cli.status:status", "Show how the central node at ADDRESS is, live on a terminal."),
     "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),
 }
 """Where each command is, and what its help says first: commands are imported when they are run."""

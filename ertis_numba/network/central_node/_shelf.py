@@ -286,7 +286,7 @@ class Shelf:
 
     def _set_aside(self, path: Path) -> None:
         """Give a journal that cannot be read another name: nothing that it may hold in secret is sealed twice."""
-        for end in ("-wal", ""):
+        for end in ("-wal", "-journal", ""):
             part = path.with_name(path.name + end)
             if part.exists():
                 part.rename(path.with_name(f"{path.name}.damaged{end}"))
