@@ -211,14 +211,7 @@ class Shelf:
         self._is_saved = True
 
     def rotate(self) -> None:
-        """Begin new recordings with what comes next.
-
-        Raises
-        ------
-        Exception
-            A journal that has failed still does; it is taken up at the next start.
-        """
-        self._mend(0)
+        """Begin new recordings with what comes next."""
         volumes, self.volume, self._twins = (self.volume, self._twins), None, None
         for volume in volumes:
             if volume is not None:
