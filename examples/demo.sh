@@ -29,6 +29,10 @@ export ERTIS_EMULATED_DIR="$PWD/demo/sensors" # where the links to emulated sens
 begin demo/emulate.jsonl ertis emulate examples/platform.toml --sync-rate 10 --json --quiet
 begin demo/serve.jsonl ertis serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --record demo/recordings --json --quiet
 central=$(said demo/serve.jsonl address) images=$(said demo/serve.jsonl publish)
+echo 'waiting for the workers: the first run compiles kernels ...' >&2
+until ertis status "$central" --json | grep -q '"state": "idle"'; do
+    sleep 0.5
+done
 begin demo/heard.jsonl ertis listen "$images" --json --quiet
 
 set -x

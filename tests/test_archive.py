@@ -292,6 +292,19 @@ def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):
         assert opened.archive.settled(RUN) == -1
 
 
+def test_what_was_stored_before_a_fault_is_sealed_at_the_end(tmp_path, monkeypatch):
+    first, second = (item_of(entry) for entry in from_zero(2))
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(first)
+        opened.until_stored(0)
+        failing(monkeypatch, times=10**9)
+        opened.give(second)
+        opened.until(Fault)
+    assert [type(event) for event in opened.events if isinstance(event, Resumed | SealedOne)] == [SealedOne]
+    assert not list(tmp_path.glob("*.journal"))
+    assert told(opened) == [0]
+
+
 def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
     given, left = from_zero(3), tmp_path / "left"
     left.mkdir()

@@ -138,7 +138,7 @@ def test_a_recording_says_where_sensors_are(tmp_path):
 def test_what_never_arrives_is_an_error(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
-    message = "3 measurements did not reach the central node at tcp://127.0.0.1:9; give --spool DIR, which keeps them"
+    message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
     assert err.splitlines()[-1].startswith(f"ertis: error: {message}")
     assert (events[-1]["event"], events[-1]["kept"], events[-1]["unsettled"]) == ("captured", 3, 3)
 

@@ -1,4 +1,7 @@
-"""What the README and docs/network.md say of the network runs, word by word but for ports and hosts."""
+"""What the README and docs/network.md say of the network runs, word by word but for ports, hosts and what is heard.
+
+The emulated sensors hear two measurements over and over: to render thirty takes longer than all else together.
+"""
 
 import contextlib
 import os
@@ -62,6 +65,8 @@ class Shell:
         if name == "serve" and "--listen" not in arguments:
             arguments += ["--listen", f"tcp://127.0.0.1:{self.ports['5601']}"]
             arguments += ["--publish", f"tcp://127.0.0.1:{self.ports['5602']}"]
+        if name == "emulate":
+            arguments += ["--count", "2"]
         command = [sys.executable, "-m", "ertis_cli", name, *arguments]
         if not line.endswith("&"):
             done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Sending"]
 
+_SAFE_S = 3.0
+_SOON_S = 1.0
 _COUNTS = ("refused", "overwritten", "damaged", "unsettled")
 
 
@@ -33,8 +35,11 @@ class _Watch(Watch):
             event = {"event": "settled", "sensor": settled.sensor, "epoch": settled.epoch, "settled": settled.settled}
             self._print(event | {"status": settled.status, "dropped": [list(each) for each in settled.dropped]})
 
+    why = ""
+
     def linked(self, text: str) -> None:
         """Tell what happened between this node and the central node."""
+        self.why = text
         if self._as_json:
             self._print({"event": "note", "text": text})
         self._say(text)
@@ -62,6 +67,8 @@ class Sending:
     watch : Watch
     report : dict
         What became of them, for programs, once `run` has returned.
+    n_lost : int
+        Of what was kept, how many nobody has now.
     """
 
     def __init__(
@@ -71,6 +78,7 @@ class Sending:
         self._sizes = {name: round(1e6 * size_mb) for name, size_mb in sizes_mb.items() if size_mb is not None}
         self.watch = _Watch(quiet=quiet, as_json=as_json)
         self.report: dict[str, Any] = {}
+        self.n_lost = 0
 
     def node(self, keys: "ClientKeys | None") -> "SensorNode":
         """Return the sensor node, which is to be opened before `run` and closed after it."""
@@ -97,8 +105,12 @@ class Sending:
             else "measurements that the central node does not have yet are lost"
         )
         failure = self.watch.run(session, self._node, checks, where=where)
+        if self._spool and self._node.central == "away":  # they are safe, and wait for another time
+            patience_s = min(patience_s, _SAFE_S)
         try:
-            self._node.flush(patience_s)
+            if not self._node.flush(min(patience_s, _SOON_S)) and patience_s > _SOON_S:
+                self._say(f"waiting up to {patience_s:g} s for the central node; Ctrl-C ends that")
+                self._node.flush(patience_s - _SOON_S)
         except (KeyboardInterrupt, SystemExit):
             click.echo(where, err=True)
             raise
@@ -128,8 +140,10 @@ class Sending:
         lost = sum(total[name] for name in _COUNTS) - (total["unsettled"] if self._spool else 0)
         larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
         remedy = f"give the spool {larger}" if self._spool else "give --spool DIR, which keeps them on the disk"
-        did_not = f"{options.counted(lost, 'measurement')} did not reach the central node at {self.address}; {remedy}"
-        return did_not if lost else ""
+        why = f" ({self.watch.why})" if self.watch.why else ""
+        self.n_lost = lost
+        told = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}{why}"
+        return f"{told}; {remedy}" if lost else ""
 
     def _say(self, text: str) -> None:
         options.say(text, quiet=self._quiet)

@@ -193,11 +193,13 @@ def report(
     quiet: bool,
     as_json: bool,
     more: dict[str, Any] | None = None,
+    n_lost: int = 0,
 ) -> None:
-    """Tell what has come of it; ``more`` is for programs, too."""
+    """Tell what has come of it; ``more`` is for programs, too, and ``n_lost`` were lost after they had been kept."""
     counts = session.counts
     several = len(counts) > 1
     stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))
+    lost += n_lost
     groups = f", {session.complete} complete groups, {session.incomplete} incomplete" if several else ""
     options.say(f"{target}: {options.counted(stored, 'measurement')}, {lost} lost{groups}", quiet=quiet)
     for sensor, each in counts.items():

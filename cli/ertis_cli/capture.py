@@ -201,6 +201,7 @@ def capture(
         quiet=quiet,
         as_json=as_json,
         more=None if send is None else send.report,
+        n_lost=0 if send is None else send.n_lost,
     )
     if failure is not None:
         raise failure

@@ -51,6 +51,7 @@ def record(
     from contextlib import ExitStack
 
     from ertis_cli._watch import stopped_by_signals
+    from ertis_numba import checks
     from ertis_numba.network.addresses import DEFAULT_LISTEN
     from ertis_numba.network.central_node import Archive, CentralNode
 
@@ -65,6 +66,8 @@ def record(
         on_stored=watch.stored if as_json and every else None,
     )
     stop = threading.Event()
+    if duration is not None:
+        checks.positive("--duration", duration)
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
         signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end

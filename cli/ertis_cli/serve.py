@@ -95,10 +95,12 @@ def serve(
     durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
     """
     from ertis_cli._watch import stopped_by_signals
+    from ertis_numba import checks
     from ertis_numba.errors import DataError
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH
     from ertis_numba.network.central_node import Archive, CentralNode
     from ertis_numba.network.processing import Options, Processing
+    from ertis_numba.settings import Settings
 
     changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
     keys = _network.server_keys(key, allow)
@@ -119,6 +121,7 @@ def serve(
             deadline_s=deadline,
             dtype=dtype,
             quarantine=quarantine,
+            expected=Settings.from_preset("default_25_50"),  # most sensors: images begin with their first measurement
             cluster=scheduler,
         )
     )
@@ -140,6 +143,8 @@ def serve(
         on_stored=watch.stored if as_json and every else None,
     )
     stop = threading.Event()
+    if duration is not None:
+        checks.positive("--duration", duration)
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
         signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end

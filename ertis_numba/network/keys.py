@@ -111,6 +111,8 @@ class KeyPair:
             It cannot be read or used, or others on this machine may use it or its folder, too.
         """
         path = Path(path)
+        if path.name.endswith(".public.toml"):
+            raise SettingsError(f"{path} holds a public key; give the file .secret.toml of the same name")
         try:
             mode, folder_mode = _mode(path), _mode(path.parent)
         except OSError as error:

@@ -192,7 +192,7 @@ class Archive:
         while True:
             items, ends = self._next()
             if items and not self._store(shelf, items):
-                break
+                ends = True  # without them: nobody was told that they are stored
             self._tend(shelf, ends=ends)
             if ends:
                 break
@@ -255,7 +255,7 @@ class Archive:
         finally:
             self._busy_since_s = None
         self._commits.add(1e3 * (time.monotonic() - begun_s))
-        if self.fault:
+        if self.fault and not self._ends:
             self.fault = ""
             self._tell(Resumed())
         return True

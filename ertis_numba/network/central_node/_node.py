@@ -48,6 +48,7 @@ State = Literal["storage", "processing", "fault", "closing"]
 MOST_BYTES: Final = 4 * 2**20
 _TURN: Final = 32  # messages, before something else has its turn
 _TICK_S: Final = 0.1
+_LINGER_MS: Final = 500
 _TOLD_S: Final = 1.0  # between two events about what was refused
 _STATUS_S: Final = 1.0
 _REPORT_S: Final = 0.2  # that a status may be old which somebody asks for
@@ -169,7 +170,7 @@ class CentralNode:
             if context is not None:
                 stack.callback(context.destroy, linger=0)
             if socket is not None:
-                stack.callback(socket.close, linger=0)
+                stack.callback(socket.close, linger=_LINGER_MS)  # the last acks
             if gate is not None:
                 self._last_refused = gate.refused
                 self._telling.refused(gate.refused)

@@ -211,7 +211,14 @@ class Shelf:
         self._is_saved = True
 
     def rotate(self) -> None:
-        """Begin new recordings with what comes next."""
+        """Begin new recordings with what comes next.
+
+        Raises
+        ------
+        Exception
+            A journal that has failed still does; it is taken up at the next start.
+        """
+        self._mend(0)
         volumes, self.volume, self._twins = (self.volume, self._twins), None, None
         for volume in volumes:
             if volume is not None:

@@ -40,6 +40,8 @@ class Options:
         Of images that are sent.
     quarantine : Path, optional
         Folder for measurements that two workers have died of.
+    expected : Settings, optional
+        Of a sensor that is likely to come: workers get ready for it before it does.
     cluster : str, optional
         Address of a dask scheduler whose workers are to be used instead of local ones.
 
@@ -60,6 +62,7 @@ class Options:
     prepare_s: float = 300.0
     dtype: Literal["float32", "float16"] = "float32"
     quarantine: Path | None = None
+    expected: Settings | None = None
     cluster: str | None = None
 
     def __post_init__(self) -> None:

@@ -114,6 +114,8 @@ class Processing:
         try:
             self._runner = _runner(self._options, self._log)
             self._publisher.start()
+            if self._options.expected is not None:
+                self._sensors.expect(self._options.expected)
             if self._options.quarantine is not None:
                 self._quarantine = Quarantine(self._options.quarantine, self._log)
         except BaseException:

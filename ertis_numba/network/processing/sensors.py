@@ -86,6 +86,10 @@ class Sensors:
         self._take(hello, settings, settings)
         return True
 
+    def expect(self, settings: Settings) -> None:
+        """Get ready for a sensor that has not come yet."""
+        self._kind_of("expected", settings)
+
     def _take(self, hello: Hello, said: Settings, settings: Settings) -> None:
         known = Known(hello, said, settings, self._kind_of(hello.sensor, settings))
         self._known[hello.sensor] = known
@@ -143,6 +147,8 @@ class Sensors:
     def unused(self, under_way: Callable[[Kind], bool]) -> list[Kind]:
         """Forget kinds that no sensor has any more, and of which nothing is under way; return them."""
         used = {known.kind.number for known in self._known.values() if known.kind is not None}
+        if not self._known:  # then there is what was expected, if anything
+            return []
         found = [kind for kind in self._kinds.values() if kind.number not in used and not under_way(kind)]
         for kind in found:
             del self._kinds[kind.settings]
