@@ -369,6 +369,26 @@ def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     assert stored(tmp_path)[0] == wanted(from_zero(1))
 
 
+@pytest.mark.parametrize(("share", "rests"), [(0.5, 4.0), (2.0, 0.5)], ids=["room", "scarce"])
+def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, share, rests):
+    asked = []
+
+    def seals(journal, **options):
+        asked.append(options["rests"])
+        return seal_apart(journal, **options)
+
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+    (path,) = tmp_path.glob(f"*{SUFFIX}")
+    usage = shutil.disk_usage(tmp_path)._replace(free=int(4 * path.stat().st_size / share))
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_apart", seals)
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing.shutil.disk_usage", lambda _: usage)
+    with Opened(tmp_path, seal=True) as opened:
+        opened.until(SealedOne)
+    assert asked == [rests]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,7 @@ class Shell:
 
     def __init__(self, ports):
         self.ports = ports
-        self.running = []
+        self.running, self.readers = [], []
 
     def __enter__(self):
         return self
@@ -56,7 +57,10 @@ class Shell:
     def __exit__(self, *_):
         for process in reversed(self.running):
             process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=30)
+            process.wait(30)
+        for process, reader in zip(self.running, self.readers, strict=True):
+            reader.join(30)
+            process.stdout.close()
 
     def run(self, line):
         for before, port in self.ports.items():
@@ -77,6 +81,8 @@ class Shell:
         self.running.append(process)
         while READY[name] not in (told := process.stdout.readline()):
             assert told, line
+        self.readers.append(threading.Thread(target=process.stdout.read, daemon=True))
+        self.readers[-1].start()  # what nobody reads would stop it
         return told
 
 

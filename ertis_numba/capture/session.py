@@ -168,6 +168,7 @@ class Session:
         self._errors: dict[str, Exception] = {}
         self._tracks = {sensor: _Track() for sensor in sonars}
         self._pulses: SyncCounts[Arrived] = SyncCounts(list(sonars), shortest_s=settings.recording.duration_s)
+        self._waiting: list[Entry] = []  # to be stored together
         self._groups: dict[int, int] = {}
         self._closed = -(2**63)  # the latest group that is not open any more
         self._ended: set[str] = set()
@@ -291,7 +292,15 @@ class Session:
 
     def _store(self, sink: Sink, ready: list[tuple[Arrived, int]]) -> None:
         """Make measurements durable, then tell of them."""
-        entries = [entry for event, number in ready if (entry := self._entry(sink, event, number)) is not None]
+        for event, number in ready:
+            entry = self._entry(sink, event, number)
+            if entry is not None:
+                self._waiting.append(entry)
+        self._append(sink)
+
+    def _append(self, sink: Sink) -> None:
+        """Make durable what waits for it."""
+        entries, self._waiting = self._waiting, []
         if not entries:
             return
         stored = sink.append(entries)
@@ -340,6 +349,7 @@ class Session:
         track = self._tracks[sensor]
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
+            self._append(sink)  # what was measured before the gap comes before it
             sink.note_gap(sensor, first, stop - 1, why, epoch=self._epoch)
             self.counts[sensor].missing[why] += stop - first
             track.sequence = stop - 1

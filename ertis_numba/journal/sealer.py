@@ -60,7 +60,7 @@ def seal_apart(
     journal: Path,
     *,
     overwrite: bool = False,
-    gently: bool = False,
+    rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
 ) -> Sealed:
     """Make the recording of a journal in a process of its own; see `ertis_numba.storage.sealing.seal`.
@@ -73,8 +73,8 @@ def seal_apart(
     journal : Path
     overwrite : bool
         Replace a file of the recording's name, even if it holds something else.
-    gently : bool
-        Let others have the processors and the disk first.
+    rests : float, optional
+        Let others have the processors first, and the disk for so many times as long as each little step takes.
     progress : callable, optional
         Called with the number of measurements that are written and that of all, at most some hundred times.
 
@@ -93,7 +93,7 @@ def seal_apart(
     command = [sys.executable, "-P", "-m", "ertis_numba.storage._sealing_process", "--json"]
     told: dict[str, Any] = {}
     try:
-        chosen = [*(["--force"] if overwrite else []), *(["--gently"] if gently else [])]
+        chosen = [*(["--force"] if overwrite else []), *([] if rests is None else [f"--rests={rests}"])]
         reason = _run([*command, *chosen, "--", str(journal)], told, progress)
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_where(journal, told)) from error

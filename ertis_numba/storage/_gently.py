@@ -12,7 +12,6 @@ __all__ = ["Pace", "shrinking"]
 _NICE: Final = 19  # the lowest priority that there is
 _STEP_BYTES: Final = 4_000_000
 _SHRINK_BYTES: Final = 32_000_000
-_REST: Final = 0.5  # by what a step has taken
 _MOST_REST_S: Final = 0.5
 
 
@@ -26,10 +25,12 @@ class Pace:
     ----------
     path : Path
         It may not be there yet.
+    rests : float
+        How many times as long as a step the rest after it is.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, rests: float) -> None:
+        self._path, self._rests = path, rests
         self._done_bytes = 0
         if hasattr(os, "nice"):
             os.nice(_NICE)
@@ -45,7 +46,7 @@ class Pace:
         begun_s = time.monotonic()
         _sync_data(self._path)
         self._done_bytes = n_bytes
-        time.sleep(min(_REST * (time.monotonic() - begun_s), _MOST_REST_S))
+        time.sleep(min(self._rests * (time.monotonic() - begun_s), _MOST_REST_S))
 
 
 def _sync_data(path: Path) -> None:
@@ -57,7 +58,7 @@ def _sync_data(path: Path) -> None:
 
 
 @contextmanager
-def shrinking(path: Path) -> Iterator[None]:
+def shrinking(path: Path, rests: float) -> Iterator[None]:
     """If the block removes a file, give its room back little by little: to free GB at once keeps the disk busy."""
     if os.name != "posix" or not path.exists():
         yield
@@ -70,6 +71,6 @@ def shrinking(path: Path) -> Iterator[None]:
             os.ftruncate(descriptor, max(0, left - _SHRINK_BYTES))
             begun_s = time.monotonic()
             os.fsync(descriptor)
-            time.sleep(min(_REST * (time.monotonic() - begun_s), _MOST_REST_S))
+            time.sleep(min(rests * (time.monotonic() - begun_s), _MOST_REST_S))
     finally:
         os.close(descriptor)

@@ -39,11 +39,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("journal", type=Path)
     parser.add_argument("--force", action="store_true", help="replace a file of the recording's name")
-    parser.add_argument("--gently", action="store_true", help="let others have the processors and the disk first")
+    parser.add_argument(
+        "--rests", type=float, help="let others have the processors, and the disk for so many times as long as a step"
+    )
     parser.add_argument("--json", action="store_true", help="tell progress and result as lines of JSON")
     given = parser.parse_args(arguments)
     recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
-    pace = Pace(part_of(recording, TOKEN)) if given.gently else None
+    pace = None if given.rests is None else Pace(part_of(recording, TOKEN), given.rests)
 
     def progress(done: int, of: int) -> None:
         if pace is not None:
@@ -52,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _tell_progress(done, of)
 
     try:
-        with shrinking(given.journal) if given.gently else nullcontext():
+        with nullcontext() if given.rests is None else shrinking(given.journal, given.rests):
             sealed = seal(given.journal, overwrite=given.force, progress=progress)
     except KeyboardInterrupt:
         return INTERRUPTED

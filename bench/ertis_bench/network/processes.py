@@ -175,7 +175,7 @@ class Process:
             self._process.kill()
         self._process.wait()
         self._listener.join(_WAIT_S)
-        if self._process.stdout is not None:
+        if self._process.stdout is not None and not self._listener.is_alive():  # to close it would wait for the reader
             self._process.stdout.close()
 
 

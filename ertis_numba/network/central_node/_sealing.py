@@ -1,6 +1,7 @@
 """Journals that are full become recordings, beside what goes on."""
 
 import queue
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -17,6 +18,15 @@ _AGAIN_S: Final = 5.0
 
 _LATEST_S: Final = 300.0
 """… but not longer than this."""
+
+_RESTS: Final = 4.0
+"""Times as long as a step: sealing beside ingest takes a fifth of the disk's time, and what is left grows, …"""
+
+_FEW_RESTS: Final = 0.5
+"""… until it takes up more than …"""
+
+_SHARE: Final = 0.25
+"""… this share of the room that is free."""
 
 
 class Sealing:
@@ -39,7 +49,7 @@ class Sealing:
         self._on_sealed, self._on_failed = on_sealed, on_failed
         self._given: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
         self._waiting: list[tuple[float, float, Path]] = []  # when it is due, how long it waited, which
-        self._n_given = self._n_done = 0
+        self._left: set[Path] = set()
         self._ends = False
         self.sealed = self.failed = 0
         self._thread = threading.Thread(target=self._run, name="sealing", daemon=True)
@@ -48,11 +58,11 @@ class Sealing:
     @property
     def left(self) -> int:
         """Journals that are not recordings yet."""
-        return self._n_given - self._n_done
+        return len(self._left)
 
     def give(self, path: Path) -> None:
         """Seal a journal, when those before are done."""
-        self._n_given += 1
+        self._left.add(path)
         self._given.put(path)
 
     def hurry(self) -> None:
@@ -83,10 +93,10 @@ class Sealing:
 
     def _seal(self, path: Path, waited_s: float) -> None:
         try:
-            sealed = seal_apart(path, gently=not self._ends)
+            sealed = seal_apart(path, rests=None if self._ends else self._rests(path.parent))
         except Exception as error:  # noqa: BLE001  whatever it is, the journal is still there and ingest goes on
             if not path.exists() and path.with_name(path.name.removesuffix(SUFFIX)).exists():
-                self._n_done += 1  # somebody else has made the recording
+                self._left.discard(path)  # somebody else has made the recording
                 return
             if isinstance(error, InUseError) and not self._ends:
                 waits_s = _AGAIN_S  # who seals it now will be done soon
@@ -96,6 +106,11 @@ class Sealing:
             self._waiting.append((time.monotonic() + waits_s, waits_s, path))
             self._on_failed(f"{path.name} is not sealed yet: {' '.join(str(error).split())}")
             return
-        self._n_done += 1
+        self._left.discard(path)
         self.sealed += 1
         self._on_sealed(sealed)
+
+    def _rests(self, folder: Path) -> float:
+        """Return how long sealing may rest: long, so that ingest has the disk, until the room gets scarce."""
+        n_bytes = sum(path.stat().st_size for path in tuple(self._left) if path.exists())
+        return _RESTS if n_bytes < _SHARE * shutil.disk_usage(folder).free else _FEW_RESTS
