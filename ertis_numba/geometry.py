@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,15 @@ class Layout:
     def n_words(self) -> int:
         """Words per PDM sample."""
         return -(-len(self.enabled) // self.word_bits)
+
+    @property
+    def word_type(self) -> np.dtype[np.unsignedinteger[Any]]:
+        """Type of a word, little-endian as it is stored and sent."""
+        return np.dtype(f"<u{self.word_bits // 8}")
+
+    def words_shape(self, n_samples: int) -> tuple[int, ...]:
+        """Return the shape of a measurement's words: (sample,), or (sample, word) where there are several."""
+        return (n_samples,) if self.n_words == 1 else (n_samples, self.n_words)
 
     @property
     def enabled_positions_m(self) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.journal._tables import insertion
-from ertis_numba.settings import Recording
+from ertis_numba.settings import Air, Recording
 from tests.files import line, noise
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -26,6 +26,14 @@ def entries(count=3, *, sensor="left", first=10, settings=TINY, epoch=EPOCH, see
         stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, epoch=epoch)
         made.append(Entry(replace(measurement, stamp=stamp), monotonic_ns=1_000 + number))
     return made
+
+
+def both():
+    """Measurements of two sensors in turn, the first one in changing air."""
+    left, right = entries(), entries(2, sensor="right", first=0, seed=2)
+    warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
+    left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
+    return [left[0], right[0], left[1], left[2], right[1]]
 
 
 def create(folder, given=None, *, name="rec.h5", settings=TINY):

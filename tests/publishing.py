@@ -19,6 +19,7 @@ from ertis_numba.settings import Processing, Settings
 
 SETTINGS = Settings(processing=Processing(directions="2d:31", range_m=(0.5, 3.0)))
 RANGE_M = np.arange(0.5, 3.0, 0.01)
+ALL = ("energyscape", "points", "raw", "group", "status")
 PATIENCE_S = 20.0
 PART = 5_000  # bytes of a frame: images come in several
 
@@ -228,3 +229,24 @@ class Publisher:
 def kind_of(item):
     kinds = {Energyscape: "energyscape", PointCloud: "points", Measurement: "raw", Status: "status"}
     return kinds.get(type(item), "group")
+
+
+def subscribed(publisher, count=1):
+    publisher.pump(lambda: len(publisher.peers) == count)
+
+
+def got(publisher, subscriber):
+    """Return what the subscriber receives next while the publisher serves."""
+    items = []
+
+    def came():
+        item = subscriber.receive(0)
+        items.extend([] if item is None else [item])
+        return bool(items)
+
+    publisher.pump(came)
+    return items[0]
+
+
+def consumed(publisher, count):
+    publisher.pump(lambda: all(peer.wanted.consumed == count for peer in publisher.peers.values()))

@@ -1,6 +1,8 @@
 """``ertis capture --to``: what sensors measure reaches a central node, or the command says that it does not."""
 
+import contextlib
 import json
+import queue
 import signal
 import subprocess
 import sys
@@ -8,17 +10,23 @@ import zlib
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 from ertis_numba.capture import Session
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import Sonar
 from ertis_numba.network.keys import AllowList, KeyPair, Permission, ServerKeys
+from ertis_numba.network.log import logger
+from ertis_numba.network.processing import Options
+from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.storage import open_recording, sensor_names
+from tests.central import running
 from tests.emulated import N_SAMPLES
-from tests.journals import ENVIRONMENT
+from tests.journals import ENVIRONMENT, TINY, entries
 from tests.stand_in import StandIn
 
 ERTIS = (sys.executable, "-m", "ertis_cli")
@@ -139,7 +147,7 @@ def test_what_never_arrives_is_an_error(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
     message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
-    assert err.splitlines()[-1].startswith(f"ertis: error: {message}")
+    assert err.splitlines()[-1].startswith(f"ertis: error: {message}, where nobody answers; start 'ertis record' or ")
     assert (events[-1]["event"], events[-1]["kept"], events[-1]["unsettled"]) == ("captured", 3, 3)
 
 
@@ -238,6 +246,43 @@ def test_keys(tmp_path):
         code, _, err = run(tmp_path, *to)
         assert (code, central.taken) == (1, 2)
         assert "give --key and --server-key" in err
+        other, _ = KeyPair.new("other").save(tmp_path / "keys")
+        code, _, err = run(tmp_path, *to, "--key", other, "--server-key", theirs.public)
+        assert (code, central.taken) == (1, 2)
+        told = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
+        assert err.splitlines()[-1].startswith(f"ertis: error: {told}")
+        assert err.splitlines()[-1].endswith(": the central node does not know this key; have it listed there by "
+                                             "'ertis keys allow'")  # fmt: skip
+
+
+@pytest.mark.usefixtures("sensors")
+def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
+    publisher = Publisher(Options(publish="tcp://127.0.0.1:0"), logger("test"))
+    publisher.start()
+    try:
+        code, events, err = run(tmp_path, "--to", publisher.address, "-n", 1, "--patience", "1")
+    finally:
+        publisher.close()
+    remedy = "this address publishes images; give the one that 'ertis serve' prints first, where sensors send"
+    assert any(remedy in each.get("text", "") for each in events)
+    assert code == 1
+    assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")
+
+
+def test_nodes_that_send_one_sensor_are_told(tmp_path):
+    notes = [queue.Queue(), queue.Queue()]
+    with running(tmp_path) as central, contextlib.ExitStack() as stack:
+        for epoch, told in enumerate(notes):
+            node = stack.enter_context(SensorNode(central.address, on_note=told.put))
+            node.add_sensor("left", TINY)
+            node.append(entries(1, epoch=epoch))
+        for told in notes:
+            assert told.get(timeout=SOON_S) == (
+                "another sensor node sends sensor left, too; give each a name of its own (--name), or end one"
+            )
+        node.append(entries(1, epoch=7))
+        assert node.flush(SOON_S)
+    assert all(told.empty() for told in notes)
 
 
 @pytest.mark.usefixtures("sensors")
@@ -251,6 +296,9 @@ def test_keys(tmp_path):
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, and there are no keys", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a folder for", 1),
+        (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, and a measurement has 0.131 MB; give", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, and a", 1),
         (["--mounting", "none.toml"], "none.toml", 1),
         (["--mounting", "empty.toml"], "says nothing of sensor 'one'; add it, or call it one of sensor by --name", 1),
     ],
@@ -262,6 +310,22 @@ def test_errors_are_one_line(tmp_path, arguments, message, code):
     assert message in err.splitlines()[-1]
     assert len(err.splitlines()) == 1
     assert not list(tmp_path.glob("*.h5*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--duration", "0"], "--duration is 0; give a number above 0"),
+        (["--name", "a/b"], "sensor name 'a/b' cannot stand in a file"),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "there is no serial port 'none'"),
+    ],
+)
+def test_what_is_refused_was_not_begun(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(cli, ["capture", "--port", "none", *arguments])
+    assert done.exit_code == 1
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):

@@ -1,11 +1,6 @@
 """The central node takes measurements in once and in order, and answers whatever comes."""
 
-import os
 import random
-import select
-from collections import Counter
-from types import SimpleNamespace
-from typing import ClassVar
 
 import msgspec
 import pytest
@@ -13,9 +8,9 @@ import pytest
 from ertis_numba.errors import ArgumentError, InUseError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node import Archive, CentralNode
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.central_node._condition import Condition
 from ertis_numba.network.messages import Ack, Gap, Ping, Pong, Refused, Report, Welcome
-from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
+from ertis_numba.network.status import Status
 from ertis_numba.settings import Air, Recording
 from tests.central import Node, data_of, running, stored, wanted
 from tests.files import line
@@ -257,124 +252,6 @@ def test_nodes_that_are_silent_are_forgotten(tmp_path, monkeypatch):
         assert node.hello(first=11).settled == 10
 
 
-def keys(folder, *permissions):
-    server = KeyPair.new("server")
-    AllowList(keys=permissions).save(folder / "allow.toml")
-    return ServerKeys(server, folder / "allow.toml")
-
-
-def permission(pair, role="sensor", serials=("left",)):
-    return Permission(name=pair.name, public=pair.public, role=role, serials=serials if role == "sensor" else ())
-
-
-def test_a_key_speaks_for_its_serials_and_role_only(tmp_path):
-    pairs = [KeyPair.new(name) for name in ("node", "screen")]
-    given = keys(tmp_path, permission(pairs[0]), permission(pairs[1], "application"))
-    with running(tmp_path / "a", keys=given) as central:
-        sensor, screen = (ClientKeys(pair, given.pair.public) for pair in pairs)
-        with Node(central.address, sensor) as node, Node(central.address, screen) as listener:
-            assert node.hello("right").code == "serial"
-            assert isinstance(node.hello("left"), Welcome)
-            node.measure(*entries(1), sensor="right")
-            assert node.hear(Refused).code == "serial"
-            node.send(messages.AskStatus())
-            assert node.hear(Refused).code == "role"
-            assert listener.hello("left").code == "role"
-            listener.send(messages.AskStatus())
-            assert listener.hear() == Report()
-            node.measure(*entries(1))
-            node.hear_settled(10)
-    assert central.latest.refused["serial"] == 2
-    assert central.latest.refused["role"] == 2
-
-
-def test_a_key_that_is_removed_is_not_heard_any_more(tmp_path):
-    pair = KeyPair.new("node")
-    given = keys(tmp_path, permission(pair))
-    known = ClientKeys(pair, given.pair.public)
-    with running(tmp_path / "a", keys=given) as central, Node(central.address, known) as node:
-        node.hello()
-        node.measure(*entries(1))
-        node.hear_settled(10)
-        AllowList(keys=()).save(given.allow)
-        while not any(event["event"] == "left" for event in central.events):
-            node.socket.poll(20)
-        node.measure(*entries(1, first=11))
-        assert node.hear(Refused).code == "role"
-    assert central.latest.refused["removed key"] >= 1
-    assert len(stored(tmp_path / "a")[0]) == 1
-
-
-class Images:
-    """Stands for what makes images."""
-
-    refused: ClassVar = {}
-
-    def __init__(self):
-        self.known, self.offered = [], []
-
-    def know(self, hello, settings):
-        self.known.append((hello.sensor, settings))
-
-    def offer(self, data, words, arrived_ns):
-        self.offered.append((data.sequence, words.copy(), arrived_ns))
-
-    def counts(self, _):
-        return SimpleNamespace(published=2, dropped=Counter(late=1), in_flight=1, queue=1, latency=Percentiles())
-
-    def status(self):
-        return ProcessingStatus()
-
-    def fds(self):
-        return ()
-
-    def start(self):
-        pass
-
-    def tick(self, _):
-        pass
-
-    publish_status = close = ready = tick
-
-    def drain_dropped(self):
-        return []
-
-
-@pytest.mark.parametrize("archive", [True, False])
-def test_processing_gets_each_measurement_once(archive, tmp_path):
-    images, given = Images(), entries(3)
-    with running(tmp_path if archive else None, processing=images) as central, Node(central.address) as node:
-        welcome = node.hello()
-        assert (welcome.state, welcome.acks) == ("processing", "stored" if archive else "accepted")
-        assert welcome.settled == (-1 if archive else 9)
-        node.measure(*given, given[0])
-        assert node.hear_settled(12).status == welcome.acks
-        node.send(Ping())
-        node.hear(Pong)
-    assert [each[0] for each in images.offered] == [10, 11, 12]
-    assert all(
-        (words == entry.measurement.words).all() for (_, words, _), entry in zip(images.offered, given, strict=True)
-    )
-    assert images.known[0][0] == "left"
-    sensor = central.latest.sensors["left"]
-    assert (sensor.received, sensor.repeated, sensor.published, sensor.dropped) == (3, 1, 2, {"late": 1})
-
-
-def test_without_an_archive_a_run_is_remembered():
-    with running(processing=Images()) as central:
-        with Node(central.address) as node:
-            node.hello()
-            node.measure(*entries(3))
-            node.hear_settled(12)
-            node.send(messages.Bye())
-        with Node(central.address) as node:
-            assert node.hello(first=11).settled == 12
-            node.measure(entries(2)[1])
-            node.send(Ping())
-            assert node.hear(Ack).settled == 12
-    assert central.latest.sensors["left"].received == 3
-
-
 def test_a_central_node_needs_something_to_do():
     with pytest.raises(ArgumentError, match="neither archive nor processing"):
         CentralNode("tcp://127.0.0.1:0")
@@ -387,14 +264,6 @@ def test_it_is_run_in_a_with_statement(tmp_path):
 
 def test_a_folder_belongs_to_one_central_node(tmp_path):
     with running(tmp_path), pytest.raises(InUseError, match="in use by another central node"), running(tmp_path):
-        pass
-
-
-def test_others_cannot_reach_it_without_keys(tmp_path):
-    with (
-        pytest.raises(ArgumentError, match="there are no keys"),
-        CentralNode("tcp://0.0.0.0:0", archive=Archive(tmp_path)),
-    ):
         pass
 
 
@@ -414,56 +283,10 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
     assert [event["event"] for event in central.events].count("internal") == 1
 
 
-FAILING = ("know", "offer", "fds", "ready", "tick", "counts", "status", "publish_status", "drain_dropped", "close")
-
-
-@pytest.mark.parametrize("what", [*FAILING, "all"])
-def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
-    def fails(*_):
-        raise MemoryError("no more")
-
-    given, reads = entries(2), os.pipe()
-    for name in FAILING if what == "all" else [what]:
-        monkeypatch.setattr(Images, name, fails)
-    if what == "ready":
-        monkeypatch.setattr(Images, "fds", lambda _: reads[:1])
-        os.write(reads[1], b".")
-    monkeypatch.setattr("ertis_numba.network.central_node._node._STATUS_S", 0.0)
-    with running(tmp_path, processing=Images()) as central, Node(central.address) as node:
-        node.hello()
-        node.measure(*given)
-        node.hear_settled(11)
-        for _ in range(3):  # longer than a tick
-            node.socket.poll(100)
-    for end in reads:
-        os.close(end)
-    assert stored(tmp_path)[0] == wanted(given)
-    assert central.latest.refused["internal"] >= 1
-    told = [event["text"] for event in central.events if event["event"] == "internal"]
-    assert set(told) == {"MemoryError: no more"}
-    assert len(told) <= 2  # once a second
-    with running(tmp_path):  # the folder is free again
-        pass
-
-
-def test_what_processing_drops_is_told_to_its_node(monkeypatch):
-    drops = [[("left", EPOCH, 10, "superseded")]]
-    monkeypatch.setattr(Images, "drain_dropped", lambda _: drops.pop() if drops else [])
-    with running(processing=Images()) as central, Node(central.address) as node:
-        drops.clear()
-        node.hello()
-        drops.append([("left", EPOCH, 10, "superseded")])
-        told = ()
-        while not told:
-            node.send(Ping())
-            told = node.hear(Ack).dropped
-    assert told == ((10, "superseded"),)
-
-
 def test_a_status_is_made_once_for_all_who_ask_at_once(tmp_path, monkeypatch):
-    made, status = [], CentralNode.status
+    made, status = [], Condition.status
     with running(tmp_path) as central, Node(central.address) as node:
-        monkeypatch.setattr(CentralNode, "status", lambda central: made.append(1) or status(central))
+        monkeypatch.setattr(Condition, "status", lambda condition: made.append(1) or status(condition))
         for _ in range(20):
             node.send(messages.AskStatus())
             node.hear(Report)
@@ -483,20 +306,6 @@ def test_a_disk_that_does_not_answer_is_told(tmp_path, monkeypatch):
         while not any(event["event"] == "resumed" for event in central.events):
             node.socket.poll(10)
     assert [event["text"] for event in central.events if event["event"] == "fault"] == ["the disk does not answer"]
-
-
-def test_a_list_of_keys_that_cannot_be_used_is_told(tmp_path):
-    pair = KeyPair.new("node")
-    given = keys(tmp_path, permission(pair))
-    listed = given.allow.read_bytes()
-    with running(tmp_path / "a", keys=given) as central:
-        for number, content in enumerate((b"[", listed)):
-            given.allow.write_bytes(content)
-            while len(told := [event["text"] for event in central.events if event["event"] == "keys"]) <= number:
-                select.select([], [], [], 0.01)
-            assert central.status().keys_note == (told[0] if content == b"[" else "")
-    assert str(given.allow) in told[0]
-    assert told[1] == "the list of keys can be used again"
 
 
 def test_nodes_hear_that_it_ends(tmp_path):

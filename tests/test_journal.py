@@ -1,36 +1,22 @@
 """What a journal says it stored is there, bit by bit, whatever ends the process that stored it."""
 
 import re
-import signal
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ertis_bench import kills
 
-from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.journal import TABLES, VERSION, Gap, Journal
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
-from ertis_numba.settings import Air, Array, Recording, Settings
-from ertis_numba.storage import open_recording
-from ertis_numba.storage.sealing import seal
+from ertis_numba.settings import Array, Recording, Settings
 from tests.files import line
-from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python, same
+from tests.journals import EPOCH, TINY, both, create, entries, python, same
 
 COUNTS = Path("/proc/self/io")
-
-
-def both():
-    """Measurements of two sensors in turn, the first one in changing air."""
-    left, right = entries(), entries(2, sensor="right", first=0, seed=2)
-    warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
-    left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
-    return [left[0], right[0], left[1], left[2], right[1]]
 
 
 def test_measurements_come_back(tmp_path):
@@ -290,97 +276,6 @@ def written_bytes():
     return int(re.search(r"wchar: (\d+)", COUNTS.read_text())[1])
 
 
-OPEN = """
-import sys
-from ertis_numba.errors import InUseError
-from ertis_numba.journal import Journal
-try:
-    Journal.open(sys.argv[1])
-except InUseError as error:
-    print(error)
-"""
-
-
-def test_nobody_else_can_open_it(tmp_path):
-    message = "is in use by another process, a capture or its sealing; wait until that has ended"
-    with create(tmp_path) as journal:
-        with pytest.raises(InUseError, match=message):
-            Journal.open(journal.path)
-        assert message in python(OPEN, journal.path).stdout
-        journal.append(entries(1, first=20))
-    assert python(OPEN, journal.path).stdout == ""
-
-
-HOLD = """
-import sys, time
-from tests.journals import create
-from pathlib import Path
-journal = create(Path(sys.argv[1]))
-print("ready", flush=True)
-time.sleep(60)
-"""
-
-
-def test_a_killed_process_holds_nothing(tmp_path):
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, tmp_path], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "ready\n"
-        with pytest.raises(InUseError):
-            Journal.open(tmp_path / "rec.h5.journal")
-        process.send_signal(signal.SIGKILL)
-    with Journal.open(tmp_path / "rec.h5.journal") as journal:
-        assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
-        journal.append(entries(1, first=20))
-        assert len(journal) == 4
-
-
-@pytest.mark.parametrize("moment", ["file", "file and log", "tables"])
-def test_killed_while_it_was_made(tmp_path, moment):
-    """What there is then: an empty file; one that has become a database; one with tables and no sensor."""
-    path = tmp_path / "rec.h5.journal"
-    if moment == "tables":
-        create(tmp_path, []).close()
-    else:
-        path.touch()
-    if moment == "file and log":
-        assert not python(
-            "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('PRAGMA journal_mode = WAL')", path
-        ).stderr
-        assert path.stat().st_size
-    with Journal.open(path) as journal:
-        assert (len(journal), dict(journal.sensors), journal.target) == (0, {}, tmp_path / "rec.h5")
-        journal.add_sensor("left", TINY)
-        journal.append(entries())
-    with Journal.open(path) as journal:
-        assert len(journal) == 3
-
-
-@pytest.mark.parametrize("moment", ["between", "commit", "log"])
-def test_what_a_killed_process_leaves(tmp_path, moment):
-    path = crashed(tmp_path, moment=moment)
-    log, begin = (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal"))
-    if moment == "log":
-        assert log.stat().st_size > 2 * PAGE_BYTES
-    else:
-        assert begin.read_bytes()[:8] == (bytes(8) if moment == "between" else b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7")
-    with Journal.open(path) as journal:
-        assert len(journal) == 3
-        assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
-        journal.append(entries(1, first=20))
-        assert log.exists() == (moment == "log")
-    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5.journal"]
-    with Journal.open(path) as journal:
-        assert [key.sequence for key in journal.index()] == [10, 11, 12, 20]
-
-
-@pytest.mark.parametrize("moment", ["between", "commit", "log"])
-def test_what_a_killed_process_leaves_is_sealed(tmp_path, moment):
-    sealed = seal(crashed(tmp_path, moment=moment))
-    assert (sealed.measurements, sealed.missing, sealed.damaged) == (3, 0, 0)
-    assert [path.name for path in tmp_path.iterdir()] == ["rec.h5"]
-
-
 def test_a_target_elsewhere(tmp_path):
     elsewhere = tmp_path / "b" / "other.h5"
     with Journal.create(tmp_path / "a", target=elsewhere) as journal:
@@ -408,159 +303,6 @@ def test_closed(tmp_path):
     journal.close()
     with pytest.raises(DataError, match=r"rec.h5.journal is closed; open it again"):
         journal.append(entries(1, first=20))
-
-
-def version(path):
-    return int.from_bytes(path.read_bytes()[60:64], "big")  # as SQLite's file format says
-
-
-def test_what_others_hold_can_be_discarded(tmp_path):
-    """Of each sensor by itself, whose rows lie between those of the others."""
-    given = both()
-    with create(tmp_path, given) as journal:
-        for last, run in ((9, EPOCH), (11, EPOCH), (50, EPOCH + 1)):
-            journal.note_gap("left", 3, last, "x", epoch=run)
-        assert journal.find("left", EPOCH, 12)[1:] == ("left", EPOCH, 12)
-        assert journal.discard("left", EPOCH, 10) == 1
-        assert journal.discard("left", EPOCH, 9) == 0
-        assert len(journal) == 4
-        with pytest.raises(DataError, match="has no measurement 10 of sensor left; copy it again if you can"):
-            journal.find("left", EPOCH, 10)
-        with pytest.raises(ArgumentError, match=r"sensor 'top' is not in .*; add it first"):
-            journal.discard("top", EPOCH, 10)
-        with pytest.raises(ArgumentError, match="measurement 12 of sensor left comes after 12"):
-            journal.append(entries(1, first=12))
-    assert version(journal.path) == VERSION
-    with Journal.open(journal.path) as journal:
-        assert len(journal) == 4
-        assert [same(*pair) for pair in zip(journal.entries(), given[1:], strict=True)] == [True] * 4
-        assert [(gap.last, gap.epoch) for gap in journal.gaps] == [(11, EPOCH), (50, EPOCH + 1)]
-        journal.discard("left", EPOCH, 11)  # 12 stays, and the 0 and 1 of the right one before and after it
-        assert [key[1:] for key in journal.index()] == [("right", EPOCH, 0), ("left", EPOCH, 12), ("right", EPOCH, 1)]
-        assert journal.discard("left", EPOCH, 99) + journal.discard("right", EPOCH, 99) == 3
-        journal.append(entries(1, first=100))
-    with Journal.open(journal.path) as journal:
-        assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [100]
-
-
-def test_a_journal_of_which_nothing_was_discarded_is_one_for_older_packages(tmp_path):
-    with create(tmp_path) as journal:
-        assert version(journal.path) in (0, 1)
-    assert version(journal.path) == 1
-
-
-def test_what_is_left_is_sealed(tmp_path):
-    with create(tmp_path, both()) as journal:
-        journal.discard("left", EPOCH, 10)
-        journal.discard("right", EPOCH, 0)
-    sealed = seal(journal.path)
-    assert (sealed.measurements, sealed.missing, sealed.damaged) == (3, 0, 0)
-    assert [measurement.stamp.sequence for measurement in open_recording(sealed.recording, sensor="left")] == [11, 12]
-
-
-def test_room_that_was_discarded_is_used_again(tmp_path):
-    """What is deleted is not overwritten, and the file does not grow."""
-    settings = line(32, 32).replace(recording=Recording(n_samples=65_536))
-    given = entries(60, settings=settings)
-    with create(tmp_path, given[:10], settings=settings) as journal:
-        for number, entry in enumerate(given[10:], 10):
-            journal.append([entry])
-            journal.discard("left", EPOCH, entry.measurement.stamp.sequence - 10)
-            assert len(journal) == 10, number
-    assert journal.path.stat().st_size < 20 * 4 * 65_536
-
-
-DISCARD = """
-import sys
-from pathlib import Path
-from ertis_numba.journal import Journal
-from tests.journals import EPOCH, entries
-with Journal.open(Path(sys.argv[1])) as journal:
-    if sys.argv[3] == "once":
-        journal._database.write_once()
-    for number in range(int(sys.argv[2]), 10**9):
-        for sensor in ("left", "right"):
-            journal.append(entries(1, sensor=sensor, first=number))
-            journal.discard(sensor, EPOCH, number - 5)
-            print(sensor, number, flush=True)
-"""
-
-
-@pytest.mark.parametrize("how", ["log", "once"])
-def test_killed_while_it_discards(tmp_path, how):
-    """What was appended and not discarded is there; what was discarded never comes back."""
-    create(tmp_path, both()).close()
-    path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
-    for _ in range(6):
-        with subprocess.Popen(
-            [sys.executable, "-c", DISCARD, path, str(max(last.values()) + 2), how],
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as process:
-            for line_, _number in zip(process.stdout, range(25), strict=False):
-                sensor, number = line_.split()
-                last[sensor] = int(number)
-            process.kill()
-            for line_ in process.stdout:
-                if line_.endswith("\n"):
-                    sensor, number = line_.split()
-                    last[sensor] = int(number)
-        with Journal.open(path) as journal:
-            held = {name: [key.sequence for key in journal.index(name)] for name in last}
-            assert len(list(journal.entries())) == len(journal)
-        for sensor, numbers in held.items():
-            assert set(range(max(numbers[0], last[sensor] - 4), last[sensor] + 1)) <= set(numbers)
-            assert numbers[0] >= last[sensor] - 4
-            last[sensor] = numbers[-1]
-
-
-@pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
-def test_removing_waits_for_its_turn(tmp_path, act):
-    with create(tmp_path) as journal:
-        thread = threading.Thread(target=act, args=(journal,))
-        with journal._turn:  # noqa: SLF001  as while another thread appends
-            thread.start()
-            thread.join(0.05)
-            assert thread.is_alive()
-            assert journal.path.exists()
-            journal.append(entries(1, first=20))
-        thread.join(10)
-        assert not journal.path.exists()
-
-
-@pytest.mark.parametrize("moment", ["between", "commit", "log"])
-@pytest.mark.parametrize("aside", [False, True])
-def test_removing_takes_all_of_it_away(tmp_path, aside, moment):
-    with Journal.open(crashed(tmp_path, moment=moment)) as journal:
-        journal.append(entries(1, first=20))
-        left = [journal.set_aside().name] if aside else journal.remove() or []
-    assert [path.name for path in tmp_path.iterdir()] == left
-    if aside:
-        crashed(tmp_path, [*entries(), *entries(1, first=20)], moment=moment)
-        with Journal.open(tmp_path / "rec.h5.journal") as journal:
-            assert journal.set_aside().name == "rec.h5.journal.2.damaged"
-        assert len(list(tmp_path.iterdir())) == 2
-        for path in tmp_path.iterdir():
-            with Journal.open(path) as journal:
-                assert len(list(journal.entries())) == 4
-
-
-@pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
-def test_closing_takes_nothing_away_from_a_journal_made_since(tmp_path, monkeypatch, act):
-    """Whoever makes one of the same name while this one is about to be closed has a log of that name."""
-    with Journal.open(crashed(tmp_path, moment="between")) as journal, monkeypatch.context() as patch:
-        journal.append(entries(1, first=20))
-        log = tmp_path / "rec.h5.journal-journal"
-        patch.setattr(Journal, "close", lambda self: (log.write_text("new"), self._database.close()))
-        act(journal)
-    assert log.read_text() == "new"
-
-
-def test_processes_that_are_killed_lose_nothing(tmp_path):
-    found = kills.appending(tmp_path, seed=1, count=20)
-    assert found["told"] > 40
-    assert {name: found[name] for name in ("lost", "wrong", "unexpected")} == {"lost": 0, "wrong": 0, "unexpected": 0}
 
 
 def test_taking_measurements_in_loads_no_hdf5():

@@ -94,6 +94,7 @@ def test_only_a_literal_loopback_address_may_do_without_keys(text, loopback):
         "inproc://zeromq.zap.01",
         "udp://127.0.0.1:5601",
         "tcp://127.0.0.1:٥٦٠١",
+        5,
     ],
 )
 def test_what_is_no_address_is_refused(text):

@@ -8,9 +8,12 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_cli._heard import Heard
 from ertis_cli.main import cli
 
+from ertis_numba.network.keys import KeyPair
 from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
+from tests.central import running
 from tests.publishing import Publisher, cloud, group, image, measurement, status
 from tests.test_readme import environment
 
@@ -138,6 +141,60 @@ def test_too_few_in_its_time():
     done = heard([image(1)], "-n", 2, "--duration", 0.5)
     assert done.exit_code == 1
     assert "1 of 2 came in 0.5 s; give it more time" in done.stderr
+
+
+def test_where_nobody_answers_that_is_told_once(monkeypatch):
+    monkeypatch.setattr("ertis_cli._heard._SOON_S", 0.1)
+    text = "waiting for tcp://127.0.0.1:1: nobody answers there; is 'ertis serve' running?"
+    done = listen("tcp://127.0.0.1:1", "--duration", "0.6", "--json")
+    assert done.stderr.splitlines() == [text, "0 received, 0 dropped"]
+    waiting, _ = events(done)
+    assert waiting == {"event": "waiting", "address": "tcp://127.0.0.1:1", "text": text}
+
+
+def test_who_comes_late_is_told_of(capsys):
+    heard = Heard(as_json=False, quiet=False)
+    heard.unanswered("tcp://127.0.0.1:1", 2.0)
+    heard.unanswered("tcp://127.0.0.1:1", 4.0)
+    heard.note("connected")
+    assert [line.split()[0] for line in capsys.readouterr().err.splitlines()] == ["waiting", "connected"]
+
+
+def test_who_answers_at_once_is_not_told_of(capsys):
+    heard = Heard(as_json=False, quiet=False)
+    heard.note("connected")
+    heard.unanswered("tcp://127.0.0.1:1", 4.0)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_address_of_sensors_is_told_from_that_of_images(tmp_path):
+    with running(tmp_path) as central:
+        done = listen(central.address)
+    assert done.exit_code == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        f"{central.address}: sensors send to this address; give the one that 'ertis serve' prints as publish, where "
+        "images are"
+    )
+
+
+@pytest.mark.parametrize("product", ["energyscape", "raw"])
+@pytest.mark.parametrize("folder", ["none", "/proc"])
+def test_a_file_that_cannot_be_is_refused_at_once(product, folder):
+    done = listen("tcp://127.0.0.1:1", "--product", product, "--save", f"{folder}/x.h5")
+    assert done.exit_code == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"ertis: error: --save {folder}/x.h5: folder {folder} cannot be written (No such file or")
+
+
+def test_a_time_and_a_key_that_cannot_be(tmp_path):
+    secret, _ = KeyPair.new("me").save(tmp_path / "keys")
+    for arguments, told in (
+        (("--duration", "0"), "--duration is 0; give a number above 0"),
+        (("--key", secret, "--server-key", "abc"), "--server-key: 'abc' is neither a public key nor a file of one"),
+    ):
+        done = listen("tcp://127.0.0.1:1", *arguments)
+        assert done.exit_code == 1
+        assert told in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 import contextlib
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +16,7 @@ from ertis_cli._lines import Lines
 from ertis_cli.main import cli
 
 from ertis_numba.journal import SUFFIX
+from ertis_numba.network.keys import AllowList, KeyPair
 from ertis_numba.network.messages import Ping
 from tests.central import Node, stored, wanted
 from tests.journals import ENVIRONMENT, TINY, entries
@@ -103,6 +106,50 @@ def test_it_ends_after_its_time(tmp_path):
     assert result.exit_code == 0, result.output
     assert "info listening address=tcp://127.0.0.1:" in result.stderr
     assert "0 measurements received, 0 missing" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rotate-size", "0"], "--rotate-size is 0; give a number from 1 to 1e+09"),
+        (["--rotate-every", "0"], "--rotate-every is 0; give a number from 1 to 1e+09"),
+        (["--name", "a/b"], "--name 'a/b' cannot stand in a file; give letters"),
+        (["--duration", "0"], "--duration is 0; give a number above 0"),
+        (["--metrics", "foo"], "--metrics is 'foo'; give HOST:PORT, such as 127.0.0.1:9101"),
+        (["--listen", "{taken}"], "is taken by another program; end that or give another --listen"),
+        (["--metrics", "{taken}"], "cannot be served at"),
+    ],
+)
+def test_what_is_refused_has_left_nothing(options, message, tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        taken = f"tcp://{taken}" if "--listen" in options else taken
+        given = [option.format(taken=taken) for option in options]
+        arguments = ["record", "-o", str(tmp_path / "new"), "--listen", "tcp://127.0.0.1:0", "-q", *given]
+        result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 1
+    (line,) = result.stderr.splitlines()
+    assert message in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_was_there_stays(tmp_path):
+    result = CliRunner().invoke(cli, ["record", "-o", str(tmp_path), "--listen", "tcp://10.1.1.1:5601", "-q"])
+    assert result.exit_code == 1
+    assert tmp_path.is_dir()
+
+
+def test_where_it_listens_is_told_as_it_is(tmp_path):
+    pair = KeyPair.new("central")
+    secret, _ = pair.save(tmp_path / "keys")
+    AllowList().save(tmp_path / "keys" / "allow.toml")
+    keys = ["--key", str(secret), "--allow", str(tmp_path / "keys" / "allow.toml")]
+    arguments = ["record", "--listen", "tcp://0.0.0.0:0", "-o", str(tmp_path / "new"), "--duration", "0.1", *keys]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"info listening address=tcp://0\.0\.0\.0:[1-9]", result.stderr)
 
 
 def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):

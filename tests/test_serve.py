@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -88,6 +89,12 @@ def received(subscriber, kind):
         if isinstance(product, kind):
             return product
     raise AssertionError(f"no {kind.__name__} has come")
+
+
+def local(address):
+    """What others reach, as this machine reaches it."""
+    assert address.startswith("tcp://0.0.0.0:")
+    return address.replace("0.0.0.0", "127.0.0.1")
 
 
 def is_gone(pid):
@@ -187,12 +194,13 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
     listed.save(allow)
     keys = {name: ClientKeys(pair, pairs["central"].public) for name, pair in pairs.items()}
     options = ("--key", str(tmp_path / "keys" / "central.secret.toml"), "--allow", str(allow))
+    open_to_all = ("--listen", "tcp://0.0.0.0:0", "--publish", "tcp://0.0.0.0:0")
     notes = []
     with (
-        serving(*LOOPBACK, *options, "--workers", "1", "--device", "numpy") as served,
-        SensorNode(served.listen, keys=keys["front"]) as node,
-        Subscriber(served.publish, products=("energyscape", "status"), keys=keys["viewer"]) as subscriber,
-        Subscriber(served.publish, keys=keys["front"], on_note=notes.append) as another,
+        serving(*open_to_all, *options, "--workers", "1", "--device", "numpy") as served,
+        SensorNode(local(served.listen), keys=keys["front"]) as node,
+        Subscriber(local(served.publish), products=("energyscape", "status"), keys=keys["viewer"]) as subscriber,
+        Subscriber(local(served.publish), keys=keys["front"], on_note=notes.append) as another,
     ):
         received(subscriber, Status)
         Sensors(node, "front").measure()
@@ -208,7 +216,9 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
     [
         (("--publish", "tcp://0.0.0.0:0"), "there are no keys"),
         (("--quarantine", "missing/folder"), "missing/folder: No such file or directory; give a folder"),
-        (("--record", "missing", "--rotate-size", "0"), "size of a recording is 0"),
+        (("--record", "missing", "--rotate-size", "0"), "--rotate-size is 0; give a number from 1"),
+        (("--metrics", "foo"), "--metrics is 'foo'; give HOST:PORT"),
+        (("--duration", "0"), "--duration is 0; give a number above 0"),
         (("--deadline", "0"), "deadline is 0; give a number above 0"),
         (("--range", "5:1"), "processing.range_m runs from 5 to 1"),
     ],
@@ -220,3 +230,17 @@ def test_what_cannot_be_is_refused_in_a_line(options, told):
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert told in line
+
+
+def test_what_is_refused_has_left_nothing(tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        publish = ("--publish", f"tcp://127.0.0.1:{other.getsockname()[1]}")
+        folders = ("--record", str(tmp_path / "new"), "--quarantine", str(tmp_path / "q"))
+        command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders]
+        environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
+    assert done.returncode == 1
+    assert "is taken by another program; end that or give another --publish" in done.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())

@@ -17,8 +17,8 @@ from ertis_numba.network.sensor_node import _runs as runs
 from ertis_numba.storage import open_recording
 from ertis_numba.storage.sealing import seal
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries
+from tests.sending import IMPATIENT, KEY, SOON_S, Node, has_all, impatient, until
 from tests.stand_in import StandIn
-from tests.test_sensor_node import IMPATIENT, KEY, SOON_S, Node, has_all, impatient, until
 
 __all__ = ["impatient"]  # a fixture
 

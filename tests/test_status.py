@@ -54,7 +54,9 @@ BUSY = Status(
         ),
         "left": SensorStatus(),
     },
-    archive=ArchiveStatus(folder="/data", recording="a.h5", room_bytes=3_000_000_000, sealing_failed=1),
+    archive=ArchiveStatus(
+        folder="/data", recording="a.h5", free_bytes=12_300_000, room_bytes=3_000_000_000, sealing_failed=1
+    ),
     processing=ProcessingStatus(
         address="tcp://127.0.0.1:5602",
         choice="one each: 2.0 ms against 3.0 ms",
@@ -241,8 +243,9 @@ def test_a_table_says_all_that_somebody_should_look_at():
         "4 superseded",
         "12.2/40.0",
         "left (away)",
+        "a.h5 cannot be written to, 0 MB in its journal",
         "1 not sealed",
-        "room for 3.0 GB",
+        "disk: 12 MB free, room for 3.0 GB",
         "workers: 1, 1 busy",
         "cores: one each: 2.0 ms against 3.0 ms",
         "groups: 9 complete, 1 clock",
@@ -251,3 +254,17 @@ def test_a_table_says_all_that_somebody_should_look_at():
         assert part in text, part
     row = next(line.split() for line in text.splitlines() if line.lstrip().startswith("front"))
     assert row[1:6] == ["20.0", "41", "40", "37", "2"]
+
+
+@pytest.mark.parametrize(
+    ("recording", "fault", "told"),
+    [
+        ("", "", "no recording is begun"),
+        ("", "the disk is full", "nothing can be written"),
+        ("a.h5", "", "a.h5 is written, 0 MB in its journal"),
+    ],
+)
+def test_what_is_written_is_told_as_it_is(recording, fault, told):
+    archive = msgspec.structs.replace(BUSY.archive, recording=recording)
+    text = _printed(msgspec.structs.replace(BUSY, archive=archive, fault=fault))
+    assert f"archive /data: {told}, 0 sealed, 0 to seal" in text

@@ -95,7 +95,7 @@ def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path
 
 
 def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.processing.processing._PAUSE_S", 0.5)
+    monkeypatch.setattr("ertis_numba.network.processing.pauses._PAUSE_S", 0.5)
     with driven() as loop:
         for sensor in ("bad", "good"):
             loop.processing.know(hello(sensor), SHORT)

@@ -1,17 +1,16 @@
 """What is lost when things go wrong: faults on the wire, pulled plugs, killed processes, full disks."""
 
 import os
-import secrets
 import subprocess
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import captures, kills, machine, wire_faults
+from ertis_bench import captures, kills, wire_faults
+from ertis_bench.trials import Parts, try_parts
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
 from ertis_numba.devices.commands import LENGTH_STEP
@@ -60,17 +59,7 @@ def run(
     *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Try everything, or only some of `PARTS`, and return the report."""
-    extent = LONG if long else SHORT
-    seed = secrets.randbits(31) if seed is None else seed
-    say(f"seed {seed}")
-    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long, "only": list(only)}
-    for name, (about, part) in PARTS.items():
-        if only and name not in only:
-            continue
-        say(about.format(**asdict(extent)))
-        with tempfile.TemporaryDirectory(prefix="ertis-") as folder:
-            report[name] = part(extent, Path(folder), seed)
-    return report
+    return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only)
 
 
 def _chain(extent: Extent, folder: Path, _: int) -> dict[str, Any]:
@@ -112,7 +101,7 @@ def small_disk(folder: Path) -> Iterator[Path | None]:
             subprocess.run(["umount", str(folder)], check=True)  # noqa: S603, S607
 
 
-PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
+PARTS: Parts[Extent] = {
     "sustained": (
         "capturing at 20 Hz for {duration_s:g} s",
         lambda extent, folder, _: captures.sustained(ONE_SENSOR, folder, duration_s=extent.duration_s, rate_hz=20.0),

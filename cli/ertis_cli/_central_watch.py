@@ -6,20 +6,25 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
 from ertis_cli._lines import Lines
+from ertis_cli._watch import stopped_by_signals
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from ertis_numba.network.central_node import Archive, CentralNode
+    from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
 
-__all__ = ["CentralWatch", "most_bytes", "name", "report", "rotate_every", "rotate_size"]
+__all__ = ["CentralWatch", "archive", "most_bytes", "name", "report", "rotate_every", "rotate_size", "run", "size"]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -114,6 +119,68 @@ class CentralWatch:
             self._err.write(f"\r\x1b[K{_progress(status())}")
 
 
+def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
+    """Return what stores measurements, as options say.
+
+    Raises
+    ------
+    ArgumentError
+        One cannot be used.
+    """
+    from ertis_numba import checks
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.network.central_node import Archive
+
+    checks.between("--rotate-size", rotate_mb, 1.0, 1e9)
+    checks.between("--rotate-every", rotate_s, 1.0, 1e9)
+    try:
+        checks.sensor_name(name)
+    except ArgumentError as error:
+        raise ArgumentError(str(error).replace("sensor name", "--name", 1)) from error
+    return Archive(folder, name, rotate_bytes=1e6 * rotate_mb, rotate_s=rotate_s)
+
+
+def run(
+    node: "CentralNode",
+    watch: CentralWatch,
+    *,
+    made: list[Path],
+    metrics: "Metrics | None",
+    duration_s: float | None,
+) -> None:
+    """Be a central node until it is asked to end.
+
+    Parameters
+    ----------
+    node : CentralNode
+    watch : CentralWatch
+    made : list of Path
+        Of `ertis_cli._saving.taken_back`: folders that it makes.
+    metrics : Metrics or None
+    duration_s : float or None
+
+    Raises
+    ------
+    ErtisError
+        It cannot begin.
+    """
+    stop = threading.Event()
+    with stopped_by_signals() as signals, ExitStack() as stack:
+        stack.callback(watch.close)
+        signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
+        stack.enter_context(node)
+        if metrics is not None:
+            stack.enter_context(metrics)
+        made.clear()
+        with watch.shows(lambda: node.latest):
+            node.run(stop, duration_s)
+
+
+def size(n_bytes: float) -> str:
+    """Return how much that is, for people."""
+    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.0f} MB"
+
+
 def report(status: "Status", recordings: list[str], *, event: str, quiet: bool, as_json: bool) -> None:
     """Tell what has come of it; leave with an exit code of 1 where journals are left.
 
@@ -177,7 +244,7 @@ def _progress(status: "Status") -> str:
     if status.archive is not None:
         parts.append(f"{sum(each.stored for each in sensors)} stored")
         parts.append(f"ack p99 {status.archive.ack.p99_ms:.0f} ms")
-        parts.append(f"{status.archive.room_bytes / 1e9:.1f} GB left")
+        parts.append(f"{size(status.archive.room_bytes)} left")
     if status.processing is not None:
         parts.append(f"{sum(each.published for each in sensors)} images")
         parts.append(f"{sum(sum(each.dropped.values()) for each in sensors)} dropped")

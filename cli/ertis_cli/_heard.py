@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Heard"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
+_SOON_S = 3.0
 _STAMP = ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
@@ -46,6 +47,16 @@ class Heard:
                 }
             )
         self._said = True
+
+    def unanswered(self, address: str, since_s: float) -> None:
+        """Tell, after a while and once, that nobody has answered; where that is told, `note` tells who does then."""
+        if self._said or self._noted or since_s < _SOON_S:
+            return
+        self._noted = True
+        text = f"waiting for {address}: nobody answers there; is 'ertis serve' running?"
+        if self._as_json:
+            options.print_json({"event": "waiting", "address": address, "text": text})
+        options.say(text, quiet=self._quiet)
 
     def note(self, text: str) -> None:
         """Tell what happened to the connection, but for its beginning."""

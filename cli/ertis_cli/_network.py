@@ -8,8 +8,10 @@ import click
 
 if TYPE_CHECKING:
     from ertis_numba.network.keys import ClientKeys, ServerKeys
+    from ertis_numba.network.metrics import Metrics
+    from ertis_numba.network.status import Status
 
-__all__ = ["allow", "client_keys", "key", "server_key", "server_keys"]
+__all__ = ["allow", "client_keys", "key", "metrics", "require_duration", "server_key", "server_keys"]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -54,6 +56,7 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
     SettingsError
         They cannot be used.
     """
+    from ertis_numba.errors import SettingsError
     from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
 
     if key is None and server_key is None:
@@ -61,7 +64,46 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
     if key is None or server_key is None:
         given, other = ("--server-key", "--key") if key is None else ("--key", "--server-key")
         raise click.UsageError(f"{given} is given without {other}; give both, or none on this machine alone")
-    return ClientKeys(KeyPair.load(_file(key, "secret")), public_key(_file(server_key, "public"))[0])
+    pair = KeyPair.load(_file(key, "secret"))
+    try:
+        return ClientKeys(pair, public_key(_file(server_key, "public"))[0])
+    except SettingsError as error:
+        raise SettingsError(f"--server-key: {error}") from error
+
+
+def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | None":
+    """Return what serves metrics, to be started; None where that was not asked for.
+
+    Raises
+    ------
+    ArgumentError
+        They cannot be served there.
+    """
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.network.addresses import endpoint
+    from ertis_numba.network.metrics import Metrics
+
+    if given is None:
+        return None
+    try:
+        endpoint(f"tcp://{given}")
+    except ArgumentError as error:
+        raise ArgumentError(f"--metrics is {given!r}; give HOST:PORT, such as 127.0.0.1:9101") from error
+    return Metrics(given, latest)
+
+
+def require_duration(given: float | None) -> None:
+    """Refuse a time that cannot pass, before anything is opened.
+
+    Raises
+    ------
+    ArgumentError
+        It is not above zero.
+    """
+    from ertis_numba import checks
+
+    if given is not None:
+        checks.positive("--duration", given)
 
 
 def _file(given: str, what: str) -> str:

@@ -1,7 +1,8 @@
-"""What was received, as a file: complete when it ends, or not at all."""
+"""What is written: files that are complete when it ends, or not there, and folders that nothing came of."""
 
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -11,12 +12,33 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
     from ertis_numba.network.products import Arrival
 
-__all__ = ["PRODUCTS", "saving"]
+__all__ = ["PRODUCTS", "saving", "taken_back"]
 
 PRODUCTS = ("energyscape", "raw")
 """What there are files for."""
 
 Write = Callable[["Arrival"], None]
+
+
+@contextmanager
+def taken_back(*folders: Path | None) -> Iterator[list[Path]]:
+    """Yield those of folders that are not there yet; where the block is refused, they are not there afterwards either.
+
+    Clear the list when what is done with them has begun. A folder that holds more than a central node's own files
+    stays.
+    """
+    missing = [each for folder in folders if folder for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        yield missing
+    except BaseException:
+        for folder in missing:  # the deepest come first
+            with suppress(OSError):
+                found = list(folder.iterdir())
+                if all(path.name.startswith(".ertis-") for path in found):
+                    for path in found:
+                        path.unlink()
+                    folder.rmdir()
+        raise
 
 
 @contextmanager
@@ -31,6 +53,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
     if target is None:
         yield lambda _: None
         return
+    _require_place(target)
     if product == "energyscape":
         from ertis_numba.storage import EnergyscapeWriter
 
@@ -38,6 +61,19 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
             yield lambda arrival: writer.write(cast("Energyscape", arrival.item))  # as was asked
         return
     yield from _recording(target, overwrite=overwrite)
+
+
+def _require_place(target: Path) -> None:
+    """Refuse a file of which the folder is missing or cannot be written, before anything is waited for."""
+    from ertis_numba.errors import ArgumentError
+
+    try:
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise ArgumentError(
+            f"--save {target}: folder {target.parent} cannot be written ({error.strerror}); make it or give another"
+        ) from error
 
 
 def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:

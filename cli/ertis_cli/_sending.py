@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.network.keys import ClientKeys
     from ertis_numba.network.sensor_node import SensorNode, Settled
+    from ertis_numba.settings import Settings
 
 __all__ = ["Sending"]
 
@@ -35,11 +36,8 @@ class _Watch(Watch):
             event = {"event": "settled", "sensor": settled.sensor, "epoch": settled.epoch, "settled": settled.settled}
             self._print(event | {"status": settled.status, "dropped": [list(each) for each in settled.dropped]})
 
-    why = ""
-
     def linked(self, text: str) -> None:
         """Tell what happened between this node and the central node."""
-        self.why = text
         if self._as_json:
             self._print({"event": "note", "text": text})
         self._say(text)
@@ -56,9 +54,10 @@ class Sending:
     Parameters
     ----------
     address : str
+    settings : Settings
     spool : Path or None
-    sizes_mb : dict
-        "spool_bytes" and "ring_bytes" of a `SensorNode`; None for what it has by default.
+    spool_mb, ring_mb : float or None
+        What a `SensorNode` has by default where they are None.
     quiet, as_json : bool
 
     Attributes
@@ -69,11 +68,28 @@ class Sending:
         What became of them, for programs, once `run` has returned.
     n_lost : int
         Of what was kept, how many nobody has now.
+
+    Raises
+    ------
+    ArgumentError
+        There is no room for a single measurement.
     """
 
     def __init__(
-        self, address: str, spool: Path | None, sizes_mb: dict[str, float | None], *, quiet: bool, as_json: bool
+        self,
+        address: str,
+        settings: "Settings",
+        *,
+        spool: Path | None,
+        spool_mb: float | None,
+        ring_mb: float | None,
+        quiet: bool,
+        as_json: bool,
     ) -> None:
+        for option, size_mb in (("--spool-size", spool_mb), ("--ring", ring_mb)):
+            if size_mb is not None:
+                _require_room(option, size_mb, settings)
+        sizes_mb = {"spool_bytes": spool_mb, "ring_bytes": ring_mb}
         self.address, self._spool, self._quiet = address, spool, quiet
         self._sizes = {name: round(1e6 * size_mb) for name, size_mb in sizes_mb.items() if size_mb is not None}
         self.watch = _Watch(quiet=quiet, as_json=as_json)
@@ -138,12 +154,30 @@ class Sending:
         if self._spool and total["unsettled"]:
             self._say(f"{waiting} wait in {self._spool}; the next capture with --spool sends what is there")
         lost = sum(total[name] for name in _COUNTS) - (total["unsettled"] if self._spool else 0)
-        larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
-        remedy = f"give the spool {larger}" if self._spool else "give --spool DIR, which keeps them on the disk"
-        why = f" ({self.watch.why})" if self.watch.why else ""
         self.n_lost = lost
-        told = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}{why}"
-        return f"{told}; {remedy}" if lost else ""
+        told = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}"
+        return f"{told}{self._remedy()}" if lost else ""
+
+    def _remedy(self) -> str:
+        """Return what to do about measurements that were lost, after why they were where that is known."""
+        if self._node.refusal:  # which says what to do
+            return f": {self._node.refusal}"
+        larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
+        keep = f"give the spool {larger}" if self._spool else "give --spool DIR, which keeps them on the disk"
+        if self._node.central == "away":
+            return f", where nobody answers; start 'ertis record' or 'ertis serve' there, or {keep}"
+        return f"; {keep}"
 
     def _say(self, text: str) -> None:
         options.say(text, quiet=self._quiet)
+
+
+def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.journal import Sensor
+
+    least_mb = 1e-6 * Sensor.of("any", settings).n_bytes
+    if size_mb < least_mb:
+        raise ArgumentError(
+            f"{option} is {size_mb:g} MB, and a measurement has {least_mb:.3g} MB; give room for some, or leave it out"
+        )

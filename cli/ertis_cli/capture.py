@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from ertis_cli import _network, options
+from ertis_cli._saving import taken_back
 from ertis_cli._sending import Sending
 from ertis_cli._watch import Signals, Watch, report, stopped_by_signals
 
@@ -155,16 +156,20 @@ def capture(
     _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, key, server_key))
     if spool_mb is not None and spool is None:
         raise click.UsageError("--spool-size is given without --spool; give its folder, too")
+    _network.require_duration(duration)
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
     from ertis_numba.devices.sonar import Sonar
 
     if target is not None:
         check_target(target, overwrite=force)
-    sizes = {"spool_bytes": spool_mb, "ring_bytes": ring_mb}
-    send = None if address is None else Sending(address, spool, sizes, quiet=quiet, as_json=as_json)
-    watch = Watch(quiet=quiet, as_json=as_json) if send is None else send.watch
+    told = {"quiet": quiet, "as_json": as_json}
+    send = None
+    if address is not None:
+        send = Sending(address, settings, spool=spool, spool_mb=spool_mb, ring_mb=ring_mb, **told)
+    watch = Watch(**told) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
+        made = stack.enter_context(taken_back(spool))
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
         sonars = _named(ports, names, [stack.enter_context(Sonar.open(port, passive=listen_only)) for port in ports])
@@ -185,24 +190,16 @@ def capture(
             on_back=watch.back,
             on_tick=watch.tick,
         )
-        checks = _checks(sonars, settings, splices=refuse_splices) if check_bits else {}
-        for name, sonar in sonars.items():
-            sonar.configure(setup, bits=checks[name].check if check_bits else None)
+        checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices)
         signals.obey(session.stop)
+        made.clear()
         if send is None:
             failure = _record(session, watch, checks, target, signals=signals, stack=stack, overwrite=force)
         else:
             failure = send.run(session, checks, patience_s=patience)
         asked_to_end = list(signals.came)
-    report(
-        target if send is None else send.address,
-        session,
-        watch.took,
-        quiet=quiet,
-        as_json=as_json,
-        more=None if send is None else send.report,
-        n_lost=0 if send is None else send.n_lost,
-    )
+    sent, n_lost = (None, 0) if send is None else (send.report, send.n_lost)
+    report(address or target, session, watch.took, more=sent, n_lost=n_lost, **told)
     if failure is not None:
         raise failure
     if asked_to_end and (n is not None or duration is not None):
@@ -278,17 +275,26 @@ def _mounting(
     return {name: (known[name].path().position_at(0.0).tolist(), known[name].quaternion().tolist()) for name in sensors}
 
 
-def _checks(names: "Iterable[str]", settings: "Settings", *, splices: bool) -> "dict[str, BitCheck]":
-    """Return what looks at the words of each sensor."""
+def _configured(
+    sonars: "dict[str, Sonar]", setup: "Setup", settings: "Settings", *, check_bits: bool, splices: bool
+) -> "dict[str, BitCheck]":
+    """Tell sensors how to measure, and return what looks at the words of each."""
     import numpy as np
 
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.geometry import microphones
 
-    recording, given = settings.recording, microphones(settings.array).enabled
-    enabled = np.zeros(32, dtype=bool)
-    enabled[: len(given)] = given
-    return {name: BitCheck(recording.n_samples, recording.pdm_rate_hz, enabled, splices=splices) for name in names}
+    checks: dict[str, BitCheck] = {}
+    if check_bits:
+        recording, given = settings.recording, microphones(settings.array).enabled
+        enabled = np.zeros(32, dtype=bool)
+        enabled[: len(given)] = given
+        checks = {
+            name: BitCheck(recording.n_samples, recording.pdm_rate_hz, enabled, splices=splices) for name in sonars
+        }
+    for name, sonar in sonars.items():
+        sonar.configure(setup, bits=checks[name].check if check_bits else None)
+    return checks
 
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
@@ -306,6 +312,10 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
             raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
     if names and len(names) != len(ports):
         raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one for each")
+    from ertis_numba import checks
+
+    for name in names:
+        checks.sensor_name(name)
 
 
 def _settings(

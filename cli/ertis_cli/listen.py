@@ -70,6 +70,7 @@ def listen(
     products = tuple(dict.fromkeys(products)) or ("energyscape",)
     if target is not None and (len(products) > 1 or products[0] not in FILED):
         raise click.UsageError(f"--save makes a file of one product; give --product {' or '.join(FILED)} alone")
+    _network.require_duration(duration)
     from ertis_numba.network.subscriber import Subscriber
 
     if "energyscape" in products:  # takes half a second, in which the first images would be dropped
@@ -90,6 +91,8 @@ def listen(
             item = subscriber.receive(_LOOK_S)
             if subscriber.connected:
                 heard.subscribed(address, sensors, products)
+            else:
+                heard.unanswered(address, time.monotonic() - begun_s)
             while notes:
                 heard.note(notes.popleft())
             if item is not None and subscriber.latest is not None:

@@ -1,11 +1,11 @@
 """``ertis record``: the central node that stores what sensors send."""
 
-import threading
 from pathlib import Path
 
 import click
 
 from ertis_cli import _central_watch, _network, options
+from ertis_cli._saving import taken_back
 
 __all__ = ["record"]
 
@@ -48,15 +48,13 @@ def record(
     recordings appear there complete, one after the other, and at the end. What a crash leaves is made a recording when
     it is started again, or by 'ertis recover'. Ctrl-C ends it; with --json there is a line for each event.
     """
-    from contextlib import ExitStack
-
-    from ertis_cli._watch import stopped_by_signals
-    from ertis_numba import checks
     from ertis_numba.network.addresses import DEFAULT_LISTEN
-    from ertis_numba.network.central_node import Archive, CentralNode
+    from ertis_numba.network.central_node import CentralNode
 
+    _network.require_duration(duration)
+    served = _network.metrics(metrics, lambda: node.latest)
+    archive = _central_watch.archive(folder, name, rotate_size, rotate_every)
     watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
-    archive = Archive(folder, name, rotate_bytes=1e6 * rotate_size, rotate_s=rotate_every)
     node = CentralNode(
         listen or DEFAULT_LISTEN,
         keys=_network.server_keys(key, allow),
@@ -65,17 +63,6 @@ def record(
         on_event=watch.event,
         on_stored=watch.stored if as_json and every else None,
     )
-    stop = threading.Event()
-    if duration is not None:
-        checks.positive("--duration", duration)
-    with stopped_by_signals() as signals, ExitStack() as stack:
-        stack.callback(watch.close)
-        signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
-        stack.enter_context(node)
-        if metrics is not None:
-            from ertis_numba.network.metrics import Metrics
-
-            stack.enter_context(Metrics(metrics, lambda: node.latest))
-        with watch.shows(lambda: node.latest):
-            node.run(stop, duration)
+    with taken_back(folder) as made:
+        _central_watch.run(node, watch, made=made, metrics=served, duration_s=duration)
     _central_watch.report(node.latest, watch.recordings, event="recorded", quiet=quiet, as_json=as_json)

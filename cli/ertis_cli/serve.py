@@ -1,13 +1,12 @@
 """``ertis serve``: the central node that makes images of what sensors send."""
 
-import threading
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
 from ertis_cli import _central_watch, _network, options
+from ertis_cli._saving import taken_back
 
 __all__ = ["serve"]
 
@@ -94,65 +93,59 @@ def serve(
     take longer than measurements to come, the oldest are dropped and counted. With --record, what is acknowledged is
     durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
     """
-    from ertis_cli._watch import stopped_by_signals
-    from ertis_numba import checks
-    from ertis_numba.errors import DataError
-    from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH
-    from ertis_numba.network.central_node import Archive, CentralNode
+    from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
+    from ertis_numba.network.central_node import CentralNode
     from ertis_numba.network.processing import Options, Processing
     from ertis_numba.settings import Settings
 
+    _network.require_duration(duration)
+    served = _network.metrics(metrics, lambda: node.latest)
+    publish = publish or DEFAULT_PUBLISH
     changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
     keys = _network.server_keys(key, allow)
-    if quarantine is not None:
-        try:
-            quarantine.mkdir(exist_ok=True)
-        except OSError as error:
-            raise DataError(f"{quarantine}: {error.strerror}; give a folder that can be written") from error
-    processing = Processing(
-        Options(
-            publish=publish or DEFAULT_PUBLISH,
-            keys=keys,
-            processing={option: value for option, value in changes.items() if value is not None},
-            max_error_db=max_error_db,
-            device=device,
-            workers=workers,
-            threads=threads,
-            deadline_s=deadline,
-            dtype=dtype,
-            quarantine=quarantine,
-            expected=Settings.from_preset("default_25_50"),  # most sensors: images begin with their first measurement
-            cluster=scheduler,
+    with taken_back(folder, quarantine) as made:
+        if quarantine is not None:
+            _make(quarantine)
+        processing = Processing(
+            Options(
+                publish=publish,
+                keys=keys,
+                processing={option: value for option, value in changes.items() if value is not None},
+                max_error_db=max_error_db,
+                device=device,
+                workers=workers,
+                threads=threads,
+                deadline_s=deadline,
+                dtype=dtype,
+                quarantine=quarantine,
+                expected=Settings.from_preset("default_25_50"),  # most sensors: images begin with their first
+                cluster=scheduler,
+            )
         )
-    )
-    archive = None
-    if folder is not None:
-        archive = Archive(folder, name, rotate_bytes=1e6 * rotate_size, rotate_s=rotate_every)
-    watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
+        archive = None if folder is None else _central_watch.archive(folder, name, rotate_size, rotate_every)
+        watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
 
-    def on_event(event: dict[str, Any]) -> None:
-        watch.event(event | ({"publish": processing.address} if event["event"] == "listening" else {}))
+        def on_event(event: dict[str, Any]) -> None:
+            listening = event["event"] == "listening"
+            watch.event(event | ({"publish": at_port(publish, processing.address)} if listening else {}))
 
-    node = CentralNode(
-        listen or DEFAULT_LISTEN,
-        keys=keys,
-        archive=archive,
-        processing=processing,
-        most_bytes=most_bytes,
-        on_event=on_event,
-        on_stored=watch.stored if as_json and every else None,
-    )
-    stop = threading.Event()
-    if duration is not None:
-        checks.positive("--duration", duration)
-    with stopped_by_signals() as signals, ExitStack() as stack:
-        stack.callback(watch.close)
-        signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
-        stack.enter_context(node)
-        if metrics is not None:
-            from ertis_numba.network.metrics import Metrics
-
-            stack.enter_context(Metrics(metrics, lambda: node.latest))
-        with watch.shows(lambda: node.latest):
-            node.run(stop, duration)
+        node = CentralNode(
+            listen or DEFAULT_LISTEN,
+            keys=keys,
+            archive=archive,
+            processing=processing,
+            most_bytes=most_bytes,
+            on_event=on_event,
+            on_stored=watch.stored if as_json and every else None,
+        )
+        _central_watch.run(node, watch, made=made, metrics=served, duration_s=duration)
     _central_watch.report(node.latest, watch.recordings, event="served", quiet=quiet, as_json=as_json)
+
+
+def _make(folder: Path) -> None:
+    from ertis_numba.errors import DataError
+
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: {error.strerror}; give a folder that can be written") from error

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _network, options
+from ertis_cli._central_watch import size
 
 if TYPE_CHECKING:
     from rich.console import Group
 
     from ertis_numba.network.asking import Asking
-    from ertis_numba.network.status import Percentiles, Status
+    from ertis_numba.network.status import ArchiveStatus, Percentiles, Status
 
 __all__ = ["status"]
 
@@ -145,11 +146,11 @@ def _below(now: "Status") -> Iterator[str]:
     if archive is not None:
         failed = f", {archive.sealing_failed} not sealed" if archive.sealing_failed else ""
         yield (
-            f"archive {archive.folder}: {archive.recording or 'nothing'} is written, journal "
-            f"{archive.journal_bytes / 1e6:.0f} MB, {archive.sealed} sealed, {archive.sealing} to seal{failed}"
+            f"archive {archive.folder}: {_writing(archive, fault=bool(now.fault))}, {archive.sealed} sealed, "
+            f"{archive.sealing} to seal{failed}"
         )
         yield (
-            f"disk: {archive.free_bytes / 1e9:.1f} GB free, room for {archive.room_bytes / 1e9:.1f} GB; "
+            f"disk: {size(archive.free_bytes)} free, room for {size(archive.room_bytes)}; "
             f"commit {_times(archive.commit)} ms, ack {_times(archive.ack)} ms (p50/p99)"
         )
     if processing is not None:
@@ -166,6 +167,14 @@ def _below(now: "Status") -> Iterator[str]:
         for each in processing.subscribers:
             sensors = "all sensors" if each.sensors is None else " ".join(each.sensors)
             yield f"  {each.name}: {' '.join(each.products)} of {sensors}, {each.sent} sent, {each.dropped} dropped"
+
+
+def _writing(archive: "ArchiveStatus", *, fault: bool) -> str:
+    """Return what becomes of measurements."""
+    if not archive.recording:
+        return "nothing can be written" if fault else "no recording is begun"
+    doing = "cannot be written to" if fault else "is written"
+    return f"{archive.recording} {doing}, {size(archive.journal_bytes)} in its journal"
 
 
 def _by_reason(counts: dict[str, int]) -> str:

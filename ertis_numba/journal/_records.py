@@ -113,8 +113,8 @@ class Sensor:
             firmware=firmware,
             translation_m=tuple(place["translation_m"].tolist()),
             rotation_xyzw=tuple(place["rotation_xyzw"].tolist()),
-            shape=(settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)],
-            dtype=np.dtype(f"<u{layout.word_bits // 8}"),
+            shape=layout.words_shape(settings.recording.n_samples),
+            dtype=layout.word_type,
         )
         if made.n_bytes > _MOST_BYTES:
             raise ArgumentError(

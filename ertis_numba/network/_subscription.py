@@ -1,6 +1,5 @@
 """The connection of an application to a publisher: what is asked for, what comes, and when to begin anew."""
 
-import socket as system
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -31,6 +30,7 @@ from ertis_numba.network.messages import (
     encode,
 )
 from ertis_numba.network.products import Arrival, Header, ProductReader
+from ertis_numba.network.waker import Waker
 
 __all__ = ["SubscriberCounts", "Subscription"]
 
@@ -145,7 +145,7 @@ class Subscription:
         finally:
             self._close()
 
-    def turn(self, woken: system.socket, now_s: float) -> None:
+    def turn(self, woken: Waker, now_s: float) -> None:
         """Do what there is to do, or wait until there is; not for longer than a tenth of a second.
 
         Raises
@@ -173,7 +173,7 @@ class Subscription:
         elif since_s is None and self._socket is not None and now_s - connection.begun_s > _UNMADE_S:
             self._again("", now_s)
 
-    def _poll(self, woken: system.socket) -> list[object]:
+    def _poll(self, woken: Waker) -> list[object]:
         poller = zmq.Poller()
         poller.register(woken, zmq.POLLIN)
         for socket in (self._socket, self._monitor.socket if self._monitor else None):
@@ -313,7 +313,7 @@ class Subscription:
         self._deliver(arrival)
 
 
-def _wait(woken: system.socket, timeout_s: float) -> None:
+def _wait(woken: Waker, timeout_s: float) -> None:
     poller = zmq.Poller()
     poller.register(woken, zmq.POLLIN)
     poller.poll(max(1, round(1000 * timeout_s)))

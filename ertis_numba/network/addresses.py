@@ -6,7 +6,7 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["DEFAULT_LISTEN", "DEFAULT_PUBLISH", "endpoint", "host_of", "is_loopback", "require_keys"]
+__all__ = ["DEFAULT_LISTEN", "DEFAULT_PUBLISH", "at_port", "endpoint", "host_of", "is_loopback", "require_keys"]
 
 DEFAULT_LISTEN: Final = "tcp://127.0.0.1:5601"
 """Where sensor nodes find a central node."""
@@ -30,7 +30,7 @@ def endpoint(text: str) -> str:
     ArgumentError
         It is no such address.
     """
-    found = _ADDRESS.fullmatch(text)
+    found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
         raise ArgumentError(f"address {text!r} cannot be used; give tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
     if found[1].startswith("["):
@@ -41,6 +41,11 @@ def endpoint(text: str) -> str:
                 f"address {text!r} cannot be used ({error}); give one such as tcp://[::1]:5601"
             ) from error
     return f"tcp://{found[1]}:{'*' if found[2] == '*' else int(found[2])}"
+
+
+def at_port(given: str, bound: str) -> str:
+    """Return an address as it was given to be listened at, with the port that it has come to."""
+    return f"{given.rpartition(':')[0]}:{bound.rpartition(':')[2]}"
 
 
 def host_of(endpoint: str) -> str:

@@ -349,6 +349,11 @@ def public_key(given: str | Path) -> tuple[str, str]:
     path = Path(given)
     if path.name.endswith(".secret.toml"):
         raise SettingsError(f"{path} holds a secret key, which nobody else needs; give the file .public.toml beside it")
+    if not path.is_file():
+        raise SettingsError(
+            f"{str(given)!r} is neither a public key nor a file of one; give NAME.public.toml from 'ertis keys new', "
+            "or the 40 characters that 'ertis keys list' shows"
+        )
     read = _Public.load(path)
     try:
         _require_key(read.public)

@@ -6,12 +6,39 @@ the wire is code, and nothing in a header is as long as its sender likes.
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
 from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.network.fields import (
+    MOST_SEQUENCE,
+    Count,
+    Line,
+    Message,
+    Name,
+    Number,
+    OfMeasurement,
+    Position,
+    Quaternion,
+    Reason,
+    Settled,
+    State,
+    Uint32,
+)
+from ertis_numba.network.product_messages import (
+    PRODUCTS,
+    Description,
+    Group,
+    Image,
+    Points,
+    Product,
+    Raw,
+    Report,
+    Subscribe,
+)
+from ertis_numba.settings import Air
 
 __all__ = [
     "HEADER_BYTES",
@@ -45,27 +72,6 @@ __all__ = [
 MAGIC: Final = b"eRTN"
 VERSION: Final = 1
 HEADER_BYTES: Final = 4096
-
-Product: TypeAlias = Literal["energyscape", "points", "raw", "group", "status"]
-PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
-"""What applications can ask for."""
-
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*\Z")]
-Line = Annotated[str, Meta(max_length=512)]
-Reason = Annotated[str, Meta(min_length=1, max_length=64)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
-Number = Annotated[int, Meta(ge=0, le=MOST_SEQUENCE)]
-Settled = Annotated[int, Meta(ge=-1, le=MOST_SEQUENCE)]
-Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
-State = Literal["storage", "processing", "fault", "closing"]
-Position = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-
-
-class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
-    """The header of any message."""
 
 
 class Hello(Message, frozen=True, kw_only=True):
@@ -117,34 +123,28 @@ class Welcome(Message, frozen=True, kw_only=True):
     settled: Settled
 
 
-class Data(Message, frozen=True, kw_only=True):
+class Data(OfMeasurement, frozen=True, kw_only=True):
     """A measurement. Payload: its words, little-endian.
 
     Attributes
     ----------
-    sensor, epoch, sequence, sync_count
-        As in `ertis_numba.frames.Stamp`.
-    timestamp_ns, uncertainty_ns : int
-        When the emission began, since 1970-01-01 UTC by the sensor node's clock.
-    monotonic_ns : int
-        When all of it had arrived at the sensor node, by its clock that nobody sets.
     temperature_c, humidity_percent, pressure_pa : float
         The air.
     crc32 : int
         Of the payload.
     """
 
-    sensor: Name
-    epoch: Count
-    sequence: Number
-    sync_count: Int64
-    timestamp_ns: Int64
-    uncertainty_ns: Uint32
-    monotonic_ns: Int64
     temperature_c: float
     humidity_percent: float
     pressure_pa: float
     crc32: Uint32
+
+    @property
+    def air(self) -> Air:
+        """The air; raises an `ArgumentError` where there is none like it."""
+        return Air(
+            temperature_c=self.temperature_c, humidity_percent=self.humidity_percent, pressure_pa=self.pressure_pa
+        )
 
 
 class Gap(Message, frozen=True, kw_only=True):
@@ -213,158 +213,8 @@ class Refused(Message, frozen=True, kw_only=True):
     epoch: Count = 0
 
 
-class Subscribe(Message, frozen=True, kw_only=True):
-    """An application wants products; sent each second, and whenever it has consumed something.
-
-    Attributes
-    ----------
-    sensors : tuple of str, optional
-        All by default.
-    products : tuple of {"energyscape", "points", "raw", "group", "status"}
-    consumed : int
-        Products received since the connection was made, that the application has taken.
-    credit : int
-        How many more may be sent unasked.
-    """
-
-    sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] | None = None
-    products: Annotated[tuple[Product, ...], Meta(min_length=1, max_length=8)]
-    consumed: Count = 0
-    credit: Annotated[int, Meta(ge=1, le=64)] = 2
-
-
-class Description(Message, frozen=True, kw_only=True):
-    """What products of a sensor are about, sent before the first that refers to it.
-
-    Payloads: settings as TOML, then azimuth, elevation and range as little-endian float64, which are empty for
-    products that have no such axes.
-
-    Attributes
-    ----------
-    number : int
-        By which products refer to it, until the connection ends.
-    sensor, translation_m, rotation_xyzw
-    """
-
-    number: Count
-    sensor: Name
-    translation_m: Position = (0.0, 0.0, 0.0)
-    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
-
-
-class _OfMeasurement(Message, frozen=True, kw_only=True):
-    number: Count
-    """Of the product, among all that this subscriber has asked for since it connected, from 0; it skips what was
-    dropped."""
-    dropped: Count
-    """How many were dropped for this subscriber, for want of credit."""
-    description: Count
-    sensor: Name
-    epoch: Count
-    sequence: Number
-    sync_count: Int64
-    timestamp_ns: Int64
-    uncertainty_ns: Uint32
-    monotonic_ns: Int64
-    """As in `Data`."""
-
-
-class Image(_OfMeasurement, frozen=True, kw_only=True):
-    """An energyscape. Payloads: its energy, little-endian, cut into frames.
-
-    Attributes
-    ----------
-    shape : (direction, range)
-    dtype : {"float32", "float16"}
-    received_ns, published_ns : int
-        When the measurement reached the central node, and the image left it, by a clock there that nobody sets.
-    """
-
-    shape: tuple[Count, Count]
-    dtype: Literal["float32", "float16"]
-    received_ns: Int64
-    published_ns: Int64
-
-
-class Points(_OfMeasurement, frozen=True, kw_only=True):
-    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the energy.
-
-    Attributes
-    ----------
-    n_points : int
-    received_ns, published_ns : int
-        As in `Image`.
-    """
-
-    n_points: Count
-    received_ns: Int64
-    published_ns: Int64
-
-
-class Raw(_OfMeasurement, frozen=True, kw_only=True):
-    """A measurement as it came. Payload: its words, little-endian.
-
-    Attributes
-    ----------
-    temperature_c, humidity_percent, pressure_pa : float
-    crc32 : int
-    """
-
-    temperature_c: float
-    humidity_percent: float
-    pressure_pa: float
-    crc32: Uint32
-
-
-class Group(Message, frozen=True, kw_only=True):
-    """Measurements that were emitted together, when all have come or no more will.
-
-    Attributes
-    ----------
-    number, dropped
-        As in `Image`.
-    group : int
-        Pulse of the SYNC chain, as all sensors count it.
-    members : tuple of (sensor, epoch, sequence)
-        Those that have come.
-    missing : tuple of str
-        Those that have not.
-    spread_ns : int
-        Between the first and the last timestamp.
-    flags : tuple of {"incomplete", "clock", "pulse"}
-        What is wrong with it: sensors are missing; timestamps disagree although counters agree; a sensor has lost
-        a pulse or seen one twice.
-    """
-
-    number: Count
-    dropped: Count
-    group: Int64
-    members: Annotated[tuple[tuple[Name, Count, Number], ...], Meta(max_length=32)]
-    missing: Annotated[tuple[Name, ...], Meta(max_length=32)]
-    spread_ns: Count
-    flags: tuple[Literal["incomplete", "clock", "pulse"], ...] = ()
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of those that have come."""
-        return tuple(sensor for sensor, _, _ in self.members)
-
-
 class AskStatus(Message, frozen=True, kw_only=True):
     """Asks for a `Report`."""
-
-
-class Report(Message, frozen=True, kw_only=True):
-    """How the central node is. Payload: `ertis_numba.network.status.Status` as MessagePack.
-
-    Attributes
-    ----------
-    number, dropped
-        As in `Image`; 0 where it was asked for by `AskStatus`.
-    """
-
-    number: Count = 0
-    dropped: Count = 0
 
 
 _MESSAGES = (

@@ -136,19 +136,11 @@ class ProductReader:
         if isinstance(header, Report):
             return Status.decode(b"".join(payload))
         described = self._of(header.description)
-        stamp = Stamp(
-            sensor=header.sensor,
-            sequence=header.sequence,
-            sync_count=header.sync_count,
-            timestamp_ns=header.timestamp_ns,
-            timestamp_uncertainty_ns=header.uncertainty_ns,
-            epoch=header.epoch,
-        )
         if isinstance(header, Image):
-            return _image(header, payload, described, stamp)
+            return _image(header, payload, described, header.stamp)
         if isinstance(header, Points):
-            return _points(header, payload, described, stamp)
-        return _measurement(header, payload, described, stamp)
+            return _points(header, payload, described, header.stamp)
+        return _measurement(header, payload, described, header.stamp)
 
     def _of(self, number: int) -> _Described:
         if number not in self._described:
@@ -180,8 +172,7 @@ def _points(header: Points, payload: Payload, described: _Described, stamp: Stam
 def _measurement(header: Raw, payload: Payload, described: _Described, stamp: Stamp) -> Measurement:
     settings = described.settings
     layout = microphones(settings.array)
-    shape = (settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
-    words = _array(payload, shape, f"uint{layout.word_bits}")
+    words = _array(payload, layout.words_shape(settings.recording.n_samples), f"uint{layout.word_bits}")
     if zlib.crc32(words.data) != header.crc32:
         raise DataError(f"measurement {header.sequence} of sensor {header.sensor} has another CRC-32 than its header")
     air = settings.air.replace(

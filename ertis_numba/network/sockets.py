@@ -42,7 +42,12 @@ _ALL = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # noqa: S104  to be told from ot
 
 
 def server(
-    context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ServerKeys | None, most_bytes: int = MOST_BYTES
+    context: "zmq.Context[zmq.Socket[bytes]]",
+    endpoint: str,
+    *,
+    keys: ServerKeys | None,
+    most_bytes: int = MOST_BYTES,
+    option: str = "--listen",
 ) -> "zmq.Socket[bytes]":
     """Return a ROUTER that listens; with keys, its context needs a `ertis_numba.network.gate.Gate` made before.
 
@@ -54,6 +59,8 @@ def server(
         None on loopback only.
     most_bytes : int
         Longest frame. It also bounds what a stranger can have this node keep, so give what is needed.
+    option : str
+        By which users give the address.
 
     Raises
     ------
@@ -78,9 +85,11 @@ def server(
         made.bind(_own(endpoint))
     except (zmq.ZMQError, OSError) as error:
         made.close(linger=0)
-        raise NetworkError(
-            f"{endpoint} cannot be listened at ({error}); give another address or end what is there"
-        ) from error
+        if isinstance(error, zmq.ZMQError) and error.errno == zmq.EADDRINUSE:
+            raise NetworkError(
+                f"{endpoint} cannot be listened at, it is taken by another program; end that or give another {option}"
+            ) from error
+        raise NetworkError(f"{endpoint} cannot be listened at ({error}); give another {option}") from error
     except BaseException:
         made.close(linger=0)
         raise

@@ -1,7 +1,6 @@
 """An application node: images, points, measurements and groups as they come."""
 
 import queue
-import socket as system
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,7 @@ from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
 from ertis_numba.network.products import Arrival
+from ertis_numba.network.waker import Waker
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement, PointCloud
@@ -156,9 +156,7 @@ class Subscriber(Generic[Kind_co]):
         # A queue of this kind may be put to by a signal's handler that has come over a thread which is taking.
         self._waiting: queue.SimpleQueue[Arrival | Exception | None] = queue.SimpleQueue()
         self._closed = False
-        self._wake, self._woken = system.socketpair()
-        self._wake.settimeout(0)
-        self._woken.settimeout(0)
+        self._waker = Waker()
         self._subscription = Subscription(
             address,
             sensors=named,
@@ -218,7 +216,7 @@ class Subscriber(Generic[Kind_co]):
         self.latest = arrival
         self.counts.received += 1
         self._subscription.taken(arrival)
-        self._rouse()
+        self._waker.wake()
         return cast("Kind_co", arrival.item)
 
     def close(self) -> None:
@@ -228,13 +226,9 @@ class Subscriber(Generic[Kind_co]):
             while True:
                 self._waiting.get_nowait()
         self._waiting.put(None)
-        self._rouse()
+        self._waker.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(_STOP_S)
-
-    def _rouse(self) -> None:
-        with suppress(OSError):  # full: it is roused anyway; closed: nobody to rouse
-            self._wake.send(b"\0")
 
     def _run(self) -> None:
         """Serve the connection until this is closed."""
@@ -242,13 +236,10 @@ class Subscriber(Generic[Kind_co]):
         try:
             with self._subscription.within(context):
                 while not self._closed:
-                    self._subscription.turn(self._woken, time.monotonic())
-                    with suppress(BlockingIOError):
-                        while self._woken.recv(4096):
-                            pass
+                    self._subscription.turn(self._waker, time.monotonic())
+                    self._waker.clear()
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
             self._waiting.put(error)
         finally:
             context.destroy(linger=0)
-            self._woken.close()
-            self._wake.close()
+            self._waker.close()

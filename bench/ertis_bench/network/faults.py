@@ -1,14 +1,10 @@
 """What goes wrong in a network, and what becomes of it: killed nodes, bad disks, lost messages, strangers, overload."""
 
-import json
-import secrets
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import machine
 from ertis_bench.network import (
     faults_hosts,
     faults_keys,
@@ -19,6 +15,7 @@ from ertis_bench.network import (
     faults_processing,
 )
 from ertis_bench.reliability import small_disk
+from ertis_bench.trials import Parts, try_parts
 
 __all__ = ["LONG", "PARTS", "SHORT", "Extent", "run"]
 
@@ -74,20 +71,7 @@ def run(
     *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Try everything, or only some of `PARTS`, and return the report."""
-    extent = LONG if long else SHORT
-    seed = secrets.randbits(31) if seed is None else seed
-    say(f"seed {seed}")
-    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long, "only": list(only)}
-    for name, (about, part) in PARTS.items():
-        if only and name not in only:
-            continue
-        say(about.format(**asdict(extent)))
-        # What a part finds is told at once: hours later something else may end the program. And an error of a part is
-        # not to be hidden by that of clearing up after it.
-        with tempfile.TemporaryDirectory(prefix="ertis-", ignore_cleanup_errors=True) as folder:
-            report[name] = part(extent, Path(folder), seed)
-        say(f"  {json.dumps(report[name])}")
-    return report
+    return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only, say_found=True)
 
 
 def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
@@ -97,7 +81,7 @@ def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
         return None if mounted is None else faults_links.disk_full(folder, mounted, seed=seed)
 
 
-PARTS: dict[str, tuple[str, Callable[[Extent, Path, int], Any]]] = {
+PARTS: Parts[Extent] = {
     "centrals": (
         "{n_kills} central nodes killed",
         lambda extent, folder, seed: faults_kills.centrals(folder, seed=seed, count=extent.n_kills),

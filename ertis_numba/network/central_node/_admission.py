@@ -1,18 +1,21 @@
-"""Who is let greet for what."""
+"""Who is let greet for what, and which measurements are taken then."""
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
+import numpy as np
+
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Sensor
+from ertis_numba.frames import Measurement
+from ertis_numba.journal import Entry, Sensor
 from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.central_node._streams import SETTINGS_BYTES, Peer, Track, source_of
+from ertis_numba.network.central_node._streams import SETTINGS_BYTES, Peer, Stream, Track, source_of
 from ertis_numba.network.central_node._volumes import same
-from ertis_numba.network.messages import Hello
+from ertis_numba.network.messages import Data, Hello
 
-__all__ = ["require_room", "require_same", "source_in"]
+__all__ = ["entry_in", "require_room", "require_same", "source_in"]
 
 _STREAMS: Final = 64  # of a peer
 _SENSORS: Final = 1024
@@ -58,3 +61,19 @@ def require_same(peers: Mapping[bytes, Peer], tracks: Mapping[str, Track], peer_
                     "its own, or end the other",
                     "settings",
                 )
+
+
+def entry_in(stream: Stream, data: Data, payload: Sequence[memoryview]) -> Entry:
+    """Return the measurement of a message, or refuse what is none."""
+    source = stream.source
+    if len(payload) != 1 or len(payload[0]) != source.n_bytes:
+        sizes = ", ".join(str(len(part)) for part in payload[:4]) or "no"
+        raise Unwanted("message", f"a measurement has {sizes} bytes, its settings say {source.n_bytes}", "size")
+    if zlib.crc32(payload[0]) != data.crc32:
+        raise Unwanted("message", f"measurement {data.sequence} has another CRC-32 than it says; send again", "crc")
+    try:
+        settings = stream.settings(data)
+    except ArgumentError as error:
+        raise Unwanted("message", str(error), "message") from error
+    words = np.frombuffer(payload[0], dtype=source.dtype).reshape(source.shape)
+    return Entry(Measurement(words, settings, data.stamp), data.monotonic_ns, data.crc32)

@@ -1,7 +1,6 @@
 """Stores measurements: a thread that waits for the disk, so that nobody else does."""
 
 import collections
-import os
 import queue
 import shutil
 import threading
@@ -20,6 +19,7 @@ from ertis_numba.network.central_node._ledger import Ledger, Lock
 from ertis_numba.network.central_node._sealing import Sealing
 from ertis_numba.network.central_node._shelf import Shelf
 from ertis_numba.network.status import ArchiveStatus, Latencies
+from ertis_numba.network.waker import Waker
 
 __all__ = ["Archive"]
 
@@ -73,7 +73,7 @@ class Archive:
         self._shelf: Shelf | None = None
         self._sealing: Sealing | None = None
         self._thread: threading.Thread | None = None
-        self._wake: tuple[int, int] | None = None
+        self._waker: Waker | None = None
         self._commits = Latencies()
         self._snapshot = ArchiveStatus(folder=str(folder))
         self._busy_since_s: float | None = None
@@ -101,15 +101,13 @@ class Archive:
         except BaseException:
             self._lock.release()
             raise
-        self._wake = os.pipe()
-        for end in self._wake:
-            os.set_blocking(end, False)
+        self._waker = Waker()
         if self._seal:
             self._sealing = Sealing(self._sealed, self._not_sealed)
         self._look()
         self._thread = threading.Thread(target=self._run, args=(self._shelf,), name="archive", daemon=True)
         self._thread.start()
-        return self._wake[0]
+        return self._waker.fileno()
 
     def settled(self, run: Run) -> int:
         """Return the number up to which all of a run is stored or known to be missing; -1 if there is none."""
@@ -121,12 +119,8 @@ class Archive:
 
     def read(self) -> list[Event]:
         """Return what has happened since; returns at once."""
-        if self._wake is not None:
-            try:
-                while os.read(self._wake[0], 4096):
-                    pass
-            except BlockingIOError:
-                pass
+        if self._waker is not None:
+            self._waker.clear()
         found = []
         while self._events:
             found.append(self._events.popleft())
@@ -167,20 +161,16 @@ class Archive:
         finished = self.finish(30.0)
         if self._sealing is not None and finished:
             self._sealing.close()
-        if self._wake is not None and finished:
-            wake, self._wake = self._wake, None
-            for end in wake:
-                os.close(end)
+        if self._waker is not None and finished:
+            self._waker.close()
+            self._waker = None
         if self._lock is not None and finished:
             self._lock.release()
 
     def _tell(self, event: Event) -> None:
         self._events.append(event)
-        if self._wake is not None:
-            try:
-                os.write(self._wake[1], b".")
-            except OSError:  # full: the reader will be woken anyway; closed: nobody reads
-                return
+        if self._waker is not None:
+            self._waker.wake()
 
     def _sealed(self, sealed: Sealed) -> None:
         self._tell(SealedOne(sealed))

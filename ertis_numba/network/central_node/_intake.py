@@ -1,23 +1,20 @@
 """Takes measurements in: what comes next of each run, what is settled, and who has to hear of it."""
 
 import time
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
-import numpy as np
-
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry, Sensor
 from ertis_numba.journal import Gap as NotedGap
-from ertis_numba.network.central_node._admission import require_room, require_same, source_in
+from ertis_numba.network.central_node._acks import Acks
+from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
 from ertis_numba.network.central_node._items import Item, Run, Stored, Twin
 from ertis_numba.network.central_node._roles import Store, Unwanted, Viewer
+from ertis_numba.network.central_node._sharing import Sharing
 from ertis_numba.network.central_node._streams import Peer, Stream, Track
-from ertis_numba.network.messages import Ack, Data, Gap, Hello, Message, Refused
-from ertis_numba.network.status import Latencies
+from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
 
 __all__ = ["Intake"]
 
@@ -25,7 +22,6 @@ _LEFT_KEPT: Final = 4096  # runs that nobody sends any more
 _WAITING_BYTES: Final = 64_000_000  # of a peer
 _ALL_WAITING_BYTES: Final = 512_000_000
 _SILENT_S: Final = 4.0
-_DROPS: Final = 32  # told in an ack
 _NEVER: Final = "never reached the central node"
 
 
@@ -50,8 +46,7 @@ class Intake:
     ----------
     tracks : dict of str to Track
     peers : dict of bytes to Peer
-    acks : Latencies
-        From the arrival of a measurement to its ack.
+    acks : Acks
     """
 
     def __init__(
@@ -69,12 +64,11 @@ class Intake:
         self._most_bytes = most_bytes
         self._streams: dict[Run, Stream] = {}
         self._left: OrderedDict[Run, int] = OrderedDict()  # what was settled, or shown, where the store does not know
-        self._due: dict[Run, Stream] = {}
-        self._arrived_s: list[float] = []
         self._waiting_bytes = 0
+        self._sharing = Sharing(tell)
         self.tracks: dict[str, Track] = {}
         self.peers: dict[bytes, Peer] = {}
-        self.acks = Latencies()
+        self.acks = Acks(send, "accepted" if store is None else "stored")
 
     # What comes from nodes
 
@@ -113,9 +107,7 @@ class Intake:
         if run not in peer.streams:
             peer.streams[run] = stream
             self._tell("joined", sensor=run.sensor, epoch=run.epoch, settled=stream.settled)
-        if stream.track.peers - {peer_id} and peer_id not in stream.track.peers:
-            stream.track.shared_s = peer.heard_s
-        stream.track.peers.add(peer_id)
+        self._sharing.joins(stream.track, peer_id, peer.heard_s)
         stream.track.epoch, stream.track.settled = run.epoch, stream.settled
         self._reach(stream)
         if self._viewer is not None:
@@ -153,32 +145,13 @@ class Intake:
             It cannot be taken.
         """
         stream = self._stream(peer_id, data)
-        source = stream.source
-        if len(payload) != 1 or len(payload[0]) != source.n_bytes:
-            sizes = ", ".join(str(len(part)) for part in payload[:4]) or "no"
-            raise Unwanted("message", f"a measurement has {sizes} bytes, its settings say {source.n_bytes}", "size")
-        if zlib.crc32(payload[0]) != data.crc32:
-            raise Unwanted("message", f"measurement {data.sequence} has another CRC-32 than it says; send again", "crc")
-        try:
-            settings = stream.settings(data)
-        except ArgumentError as error:
-            raise Unwanted("message", str(error), "message") from error
-        words = np.frombuffer(payload[0], dtype=source.dtype).reshape(source.shape)
-        stamp = Stamp(
-            sensor=data.sensor,
-            sequence=data.sequence,
-            sync_count=data.sync_count,
-            timestamp_ns=data.timestamp_ns,
-            timestamp_uncertainty_ns=data.uncertainty_ns,
-            epoch=data.epoch,
-        )
-        entry = Entry(Measurement(words, settings, stamp), data.monotonic_ns, data.crc32)
+        entry, source = entry_in(stream, data, payload), stream.source
         item = Item(stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id, stream.turn)
         self._reach(stream)
         if data.sequence <= stream.taken:
             self._again(stream, item, data)
         elif data.sequence > stream.taken + 1 or not self._has_room(peer_id, item):
-            self._due[stream.run] = stream
+            self.acks.owe(stream)
         else:
             stream.remember(data.sequence, data.crc32)
             self._take(stream, item)
@@ -186,7 +159,7 @@ class Intake:
                 stream.shown = data.sequence
                 stream.track.took(source.n_bytes, item.arrived_s)
                 if self._viewer is not None:
-                    self._viewer.offer(data, words, arrived_ns)
+                    self._viewer.offer(data, entry.measurement.words, arrived_ns)
 
     def _has_room(self, peer_id: bytes, item: Item) -> bool:
         if self._store is None:
@@ -203,7 +176,7 @@ class Intake:
             if differs and self._store is None:
                 stream.track.conflicts += 1
                 self._tell("conflict", sensor=stream.run.sensor, epoch=stream.run.epoch, sequence=data.sequence)
-            self._due[stream.run] = stream
+            self.acks.owe(stream)
             return
         item.again = True
         self._wait(item, stream)
@@ -219,7 +192,7 @@ class Intake:
         stream = self._stream(peer_id, gap)
         self._reach(stream)
         if gap.last <= stream.taken or gap.first > stream.taken + 1:
-            self._due[stream.run] = stream
+            self.acks.owe(stream)
         else:
             try:
                 noted = NotedGap(gap.sensor, stream.taken + 1, gap.last, gap.reason, gap.epoch)
@@ -230,7 +203,7 @@ class Intake:
     def _take_gap(self, stream: Stream, gap: NotedGap) -> None:
         item = Item(stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner, stream.turn)
         if not self._has_room(stream.owner, item):
-            self._due[stream.run] = stream
+            self.acks.owe(stream)
             return
         self._take(stream, item)
         if self._store is None:
@@ -242,8 +215,8 @@ class Intake:
             self._wait(item, stream)
             return
         stream.settled = stream.track.settled = item.last
-        self._due[stream.run] = stream
-        self._arrived_s.append(item.arrived_s)
+        self.acks.owe(stream)
+        self.acks.settled(item.arrived_s)
 
     def _wait(self, item: Item, stream: Stream) -> None:
         if self._store is None:
@@ -260,9 +233,13 @@ class Intake:
         peer = self.peers.get(peer_id)
         if peer is not None:
             peer.heard_s = time.monotonic()
-            for run, stream in peer.streams.items():
+            for stream in peer.streams.values():
                 if stream.owner == peer_id:
-                    self._due[run] = stream
+                    self.acks.owe(stream)
+
+    def remark(self, peer_id: bytes) -> str:
+        """Return what a node should know, a line; empty where there is nothing."""
+        return self._sharing.remark(self.peers.get(peer_id))
 
     def bye(self, peer_id: bytes) -> None:
         """Forget a node."""
@@ -275,7 +252,7 @@ class Intake:
         if peer is not None:
             peer.streams.pop(stream.run, None)
         if peer is None or not any(run.sensor == stream.run.sensor for run in peer.streams):
-            stream.track.peers.discard(peer_id)
+            self._sharing.leaves(stream.track, stream.run.sensor, peer_id)
         if stream.owner == peer_id:
             stream.owner = b""
             self._tell("left", sensor=stream.run.sensor, epoch=stream.run.epoch, settled=stream.settled)
@@ -285,7 +262,7 @@ class Intake:
         """Drop what nobody will ask for."""
         if stream.owner or stream.taken != stream.settled:
             return
-        self._due.pop(stream.run, None)
+        self.acks.forget(stream)
         known = self._store is not None and stream.shown <= stream.settled
         if self._streams.pop(stream.run, None) is not None and not known:
             self._left[stream.run] = max(stream.settled, stream.shown)
@@ -299,12 +276,7 @@ class Intake:
         """Forget nodes that are silent, and tell of sensors that several send."""
         for peer_id in [peer_id for peer_id, peer in self.peers.items() if now_s - peer.heard_s > _SILENT_S]:
             self.bye(peer_id)
-        for sensor, track in self.tracks.items():
-            # One that has come back may be missed only some seconds later.
-            if track.shared_s and all(self.peers[each].heard_s > track.shared_s for each in track.peers):
-                track.shared_s = 0.0
-                if len(track.peers) > 1:
-                    self._tell("shared", sensor=sensor, text="several sensor nodes send it; give each its own name")
+        self._sharing.tick(self.tracks, self.peers)
 
     # What comes from the archive
 
@@ -315,14 +287,14 @@ class Intake:
             track = self.tracks.setdefault(item.run.sensor, Track())
             if isinstance(item.what, Entry):
                 track.stored += 1
-                self._arrived_s.append(item.arrived_s)
+                self.acks.settled(item.arrived_s)
             else:
                 track.miss(item.what.reason, item.last - item.first + 1)
             if stream is not None:
                 stream.settled = max(stream.settled, item.last)
                 stream.taken = max(stream.taken, stream.settled)
                 track.settled = stream.settled
-                self._due[stream.run] = stream
+                self.acks.owe(stream)
                 self._forget(stream)
         if self._on_stored is not None:
             self._on_stored([item for item in event.items if isinstance(item.what, Entry)])
@@ -337,7 +309,7 @@ class Intake:
             run = event.item.run
             self._tell("conflict", sensor=run.sensor, epoch=run.epoch, sequence=event.item.first)
         if stream is not None:
-            self._due[stream.run] = stream
+            self.acks.owe(stream)
 
     def forgotten(self, item: Item, reason: str) -> None:
         """Have an item sent again."""
@@ -346,7 +318,7 @@ class Intake:
             return
         if item.turn == stream.turn:  # otherwise it is on its way again
             stream.go_back()
-        self._due[stream.run] = stream
+        self.acks.owe(stream)
         if reason and stream.owner:
             run = item.run
             self._send(stream.owner, Refused(code="settings", reason=reason[:500], sensor=run.sensor, epoch=run.epoch))
@@ -372,21 +344,4 @@ class Intake:
 
     def acknowledge(self) -> None:
         """Tell nodes what is settled, where that is due."""
-        for run, stream in self._due.items():
-            if not stream.owner:
-                continue
-            dropped = tuple(stream.dropped.popleft() for _ in range(min(_DROPS, len(stream.dropped))))
-            ack = Ack(
-                sensor=run.sensor,
-                epoch=run.epoch,
-                settled=stream.settled,
-                status="accepted" if self._store is None else "stored",
-                dropped=dropped,
-            )
-            self._send(stream.owner, ack)
-        self._due.clear()
-        if self._arrived_s:
-            now_s = time.monotonic()
-            for arrived_s in self._arrived_s:
-                self.acks.add(1e3 * (now_s - arrived_s))
-            self._arrived_s.clear()
+        self.acks.send()

@@ -8,24 +8,11 @@ from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.keys import Permission
-from ertis_numba.network.messages import AskStatus, Bye, Data, Gap, Hello, Message, Ping
+from ertis_numba.network.messages import AskStatus, Bye, Data, Gap, Hello, Message, Ping, Subscribe
 
-__all__ = ["read", "receive", "require_role"]
+__all__ = ["read", "require_role"]
 
-_FRAMES: Final = 4  # of a message, that are looked at
 _TAKEN: Final = (Hello, Data, Gap, Ping, Bye, AskStatus)
-
-
-def receive(socket: "zmq.Socket[bytes]") -> list[zmq.Frame]:
-    """Return the frames of a message, the first of them if there are too many."""
-    frames = [socket.recv(zmq.NOBLOCK, copy=False)]
-    while frames[-1].more:
-        frame = socket.recv(zmq.NOBLOCK, copy=False)
-        if len(frames) < _FRAMES:
-            frames.append(frame)
-        else:
-            frames[-1] = frame
-    return frames
 
 
 def read(frames: list[zmq.Frame]) -> Message:
@@ -33,11 +20,17 @@ def read(frames: list[zmq.Frame]) -> Message:
     if len(frames) < 2:
         raise Unwanted("message", "a message is empty; send a header", "message")
     try:
-        message: Message = messages.decode(frames[1].buffer, _TAKEN)
+        message: Message = messages.decode(frames[1].buffer, (*_TAKEN, Subscribe))
     except FormatVersionError as error:
         raise Unwanted("version", str(error), "version") from error
     except DataError as error:
         raise Unwanted("message", str(error), "message") from error
+    if isinstance(message, Subscribe):
+        raise Unwanted(
+            "message",
+            "sensors send to this address; give the one that 'ertis serve' prints as publish, where images are",
+            "message",
+        )
     return message
 
 

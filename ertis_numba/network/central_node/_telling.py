@@ -6,6 +6,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
+from ertis_numba.journal import Sealed
+from ertis_numba.network.central_node._items import Item
+
 __all__ = ["Telling", "text_of"]
 
 _TOLD_S: Final = 1.0  # between two events about mistakes
@@ -18,10 +21,14 @@ class Telling:
     ----------
     on_event : callable
         Called with each event.
+    on_stored : callable, optional
+        Called with sensor, epoch, sequence and CRC-32 of measurements that are durable.
     """
 
-    def __init__(self, on_event: Callable[[dict[str, Any]], None]) -> None:
-        self._on_event = on_event
+    def __init__(
+        self, on_event: Callable[[dict[str, Any]], None], on_stored: Callable[[str, int, int, int], None] | None = None
+    ) -> None:
+        self._on_event, self._on_stored = on_event, on_stored
         self._fault = self._note = ""
         self._refused: Counter[str] = Counter()
         self._next_internal_s = 0.0
@@ -30,6 +37,23 @@ class Telling:
         """Tell of an event."""
         with suppress(OSError):  # who listened may be gone: measurements are taken all the same
             self._on_event({"event": event} | told)
+
+    def stored(self, items: list[Item]) -> None:
+        """Tell of measurements that are durable."""
+        if self._on_stored is not None:
+            with suppress(OSError):  # the same
+                for item in items:
+                    self._on_stored(item.run.sensor, item.run.epoch, item.first, getattr(item.what, "crc32", 0))
+
+    def sealed(self, sealed: Sealed) -> None:
+        """Tell of a journal that has become a recording."""
+        self.tell(
+            "sealed",
+            recording=None if sealed.recording is None else str(sealed.recording),
+            measurements=sealed.measurements,
+            missing=sealed.missing,
+            text=sealed.remark,
+        )
 
     def internal(self, error: Exception) -> None:
         """Tell of a mistake in this package, but not all the time."""

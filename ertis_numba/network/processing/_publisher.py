@@ -16,6 +16,7 @@ from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,
+    Hello,
     Image,
     Message,
     Ping,
@@ -41,7 +42,10 @@ _PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same
 _AT_ONCE: Final = 64
 _TICK_MS: Final = 200
 _TELL_S: Final = 1.0
-_HEARD_BYTES: Final = 4096  # of what applications send
+_HEARD_BYTES: Final = 16_384  # a few applications need; sensor nodes at the wrong address send settings, of 4.4 kB
+_SENSORS_ELSEWHERE: Final = (
+    "this address publishes images; give the one that 'ertis serve' prints first, where sensors send"
+)
 
 
 class _Publisher:
@@ -57,7 +61,7 @@ class _Publisher:
             keys = ServerKeys(KeyPair(begin.public, begin.secret, begin.name), Path(begin.allow))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._gate = Gate(context, keys)
-        self._socket = sockets.server(context, begin.address, keys=keys, most_bytes=_HEARD_BYTES)
+        self._socket = sockets.server(context, begin.address, keys=keys, most_bytes=_HEARD_BYTES, option="--publish")
         self._gate.watch(self._socket)
         self._subscribers = Subscribers(self._socket, with_keys=keys is not None)
         address = sockets.bound(self._socket)
@@ -163,11 +167,14 @@ class _Publisher:
                 self._subscribers.forget(frames[0].bytes)
             return
         if not permission.may_receive:
-            reason = f"{permission.name} is listed as {permission.role}; let it be listed as application"
+            reason = (
+                f"this address publishes images, and {permission.name} is listed as {permission.role}; give the "
+                "address that 'ertis serve' prints first, or have it listed as application"
+            )
             self._refuse(frames, Refused(code="role", reason=reason), "role")
             return
         if len(frames) != 2:
-            text = f"a message has {len(frames) - 1} frames; send one"
+            text = _SENSORS_ELSEWHERE if _is_greeting(frames) else f"a message has {len(frames) - 1} frames; send one"
             self._refuse(frames, Refused(code="message", reason=text), "message")
             return
         try:
@@ -201,6 +208,14 @@ class _Publisher:
             self._socket.send_multipart([frames[0].bytes, *answer], zmq.NOBLOCK)
         except zmq.ZMQError:  # it is gone, or takes nothing
             return
+
+
+def _is_greeting(frames: list[zmq.Frame]) -> bool:
+    """Whether this is what a sensor node says first."""
+    try:
+        return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello)
+    except DataError:
+        return False
 
 
 def _pieces(data: memoryview) -> list[bytes]:

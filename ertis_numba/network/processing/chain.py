@@ -41,8 +41,8 @@ class Chain:
         self.pipeline = Pipeline(Settings.from_toml(settings, "settings of a sensor"), device=device)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         layout = microphones(self.pipeline.settings.array)
-        self._dtype = np.dtype(f"<u{layout.word_bits // 8}")
-        self._words_shape = (self.pipeline.settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
+        self._dtype = layout.word_type
+        self._words_shape = layout.words_shape(self.pipeline.settings.recording.n_samples)
         self._extractor = PointExtractor(self.pipeline.settings)
 
     def image(

@@ -1,17 +1,37 @@
 """Whether a measurement gets all cores, or several get a share of them at once."""
 
 import statistics
+import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["Choice", "Mode"]
+__all__ = ["Choice", "Load", "Mode"]
 
 _BUSY: Final = 0.8  # share of the time above which the cores have to be shared better …
 _CALM: Final = 0.7  # … and below which one measurement at a time is served soonest
 _LOOK_S: Final = 3.0
 _KEPT: Final = 32
+_RATE_S: Final = 3.0  # over which the load is told
 _GAIN: Final = 1.05  # that a change has to bring, as times are never quite the same
+
+
+class Load:
+    """How often measurements arrive."""
+
+    def __init__(self) -> None:
+        self._arrivals_s: deque[float] = deque()
+        self._begun_s = time.monotonic()
+
+    def add(self, now_s: float) -> None:
+        """Count a measurement; ``now_s`` is that of `time.monotonic`."""
+        self._arrivals_s.append(now_s)
+
+    def rate_hz(self, now_s: float) -> float:
+        """Return how often they have come lately."""
+        while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_S:
+            self._arrivals_s.popleft()
+        return len(self._arrivals_s) / min(_RATE_S, max(now_s - self._begun_s, 0.5))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 import os
 import secrets
-import socket
 import threading
 import time
 from collections import deque
@@ -20,6 +19,7 @@ from ertis_numba.network.processing.options import Options
 from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, bytes_of
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.status import WorkerStatus
+from ertis_numba.network.waker import Waker
 
 # Its own annotations are partial.
 Client = Any
@@ -95,9 +95,7 @@ class Cluster:
         self._run = secrets.token_hex(4)
         self._client = _client(self._address)
         self._events: deque[tuple[Any, ...]] = deque()
-        self._ours, self._theirs = socket.socketpair()
-        for end in (self._ours, self._theirs):
-            end.setblocking(False)  # noqa: FBT003  as the library has it
+        self._waker = Waker()
         self._members: dict[str, _Member] = {}
         self._readying: dict[int, _Readying] = {}
         self._prepared: dict[int, Prepared] = {}
@@ -192,12 +190,12 @@ class Cluster:
 
     def fds(self) -> Iterable[int]:
         """See `Runner`."""
-        return [self._ours.fileno()]
+        return [self._waker.fileno()]
 
     def ready(self, fd: int) -> Sequence[Event]:
         """See `Runner`."""
-        if fd == self._ours.fileno():
-            _drain(self._ours)
+        if fd == self._waker.fileno():
+            self._waker.clear()
         return self._heard()
 
     def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  the load is the cluster's matter
@@ -232,8 +230,7 @@ class Cluster:
             slot.close()
         self._free.clear()
         self._attempts.clear()
-        for end in (self._ours, self._theirs):
-            end.close()
+        self._waker.close()
 
     def _look(self) -> None:
         """Follow which workers there are; in a thread of its own, as the scheduler may take its time."""
@@ -254,10 +251,7 @@ class Cluster:
     def _tell(self, *event: Any) -> None:
         """Hand something over to the loop; called in other threads."""
         self._events.append(event)
-        try:
-            self._theirs.send(b".")
-        except OSError:  # it is full, so that the loop wakes anyhow, or closed
-            return
+        self._waker.wake()
 
     def _heard(self) -> list[Event]:
         found: list[Event] = []
@@ -345,11 +339,3 @@ def _result_of(future: Future) -> tuple[Any, str]:
         return future.result(timeout=_CONNECT_S), ""
     except (Exception, CancelledError) as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
         return None, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-
-
-def _drain(end: socket.socket) -> None:
-    try:
-        while end.recv(4096):
-            pass
-    except OSError:
-        return

@@ -1,36 +1,31 @@
 """What makes images of measurements and has them published, without ever holding up who takes them in."""
 
-import itertools
 import time
-import zlib
-from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.geometry import microphones
-from ertis_numba.journal import Entry
 from ertis_numba.network.log import Log, logger
 from ertis_numba.network.messages import Data, Group, Hello
 from ertis_numba.network.processing import notes
+from ertis_numba.network.processing.choice import Load
 from ertis_numba.network.processing.groups import Groups
 from ertis_numba.network.processing.options import Options
+from ertis_numba.network.processing.order import Order
+from ertis_numba.network.processing.pauses import Pauses
 from ertis_numba.network.processing.publisher import Publisher
-from ertis_numba.network.processing.quarantine import Quarantine
+from ertis_numba.network.processing.quarantine import Quarantine, entry_of
 from ertis_numba.network.processing.queues import SUPERSEDED, Counts, Queues
-from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, Runner, bytes_of
+from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, Runner
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.workers import Workers
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
-from ertis_numba.settings import Air, Settings
+from ertis_numba.settings import Settings
 
 __all__ = ["Processing"]
 
-_RATE_S: Final = 3.0  # over which the load is told
 _TRIES: Final = 2
 _ENDED: Final = "the central node ended"
 _GETTING_READY: Final = "the workers were getting ready"
@@ -41,18 +36,6 @@ _CHANGED: Final = "the settings of its sensor changed"
 _UNUSABLE: Final = "its settings cannot be used"
 _UNDESCRIBED: Final = "nothing describes it"
 _PAUSED: Final = "too many of its sensor have failed"
-_IN_A_ROW: Final = 3  # measurements of a sensor that have failed twice, after which it has to pause …
-_PAUSE_S: Final = 10.0  # … for that long, and twice as long each further time
-_LONGEST_PAUSE_S: Final = 640.0
-
-
-@dataclass(slots=True)
-class _Failing:
-    """A sensor whose measurements workers fail with, which costs the others of their time."""
-
-    in_a_row: int = 0
-    pause_s: float = _PAUSE_S
-    until_s: float = 0.0
 
 
 class Processing:
@@ -84,13 +67,11 @@ class Processing:
         self._quarantine: Quarantine | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
-        self._order: dict[str, deque[Job]] = {}  # first tries under way, oldest first: they are published in order
-        self._done: set[int] = set()  # those that wait for an older one, or for the publisher
-        self._arrivals_s: deque[float] = deque()
-        self._begun_s = time.monotonic()
+        self._order = Order()
+        self._load = Load()
         self._took = Latencies()
         self._retried = self._quarantined = 0
-        self._failing: dict[str, _Failing] = {}  # by sensor
+        self._pauses = Pauses()
         self._final: ProcessingStatus | None = None
 
     @property
@@ -139,11 +120,10 @@ class Processing:
             By `time.monotonic_ns`.
         """
         now_s = time.monotonic()
-        self._arrivals_s.append(now_s)
+        self._load.add(now_s)
         kind = self._sensors.kind_of(data)
         self._tell(self._groups.add(data, arrived_ns))
-        failing = self._failing.get(data.sensor)
-        paused = failing is not None and now_s < failing.until_s
+        paused = self._pauses.holds(data.sensor, now_s)
         if kind is None or paused:
             self._queues.take_in(data)
             self._queues.drop(data, _PAUSED if paused else _UNUSABLE)
@@ -172,12 +152,12 @@ class Processing:
         """Do what time demands; ``now_s`` is that of `time.monotonic`."""
         if self._runner is None:
             return
-        self._handle(self._runner.tick(now_s, self._rate_hz(now_s)))
+        self._handle(self._runner.tick(now_s, self._load.rate_hz(now_s)))
         self._confirm(*self._publisher.tick(now_s))
         self._tell(self._groups.tick(time.monotonic_ns()))
         self._sensors.tick()
         self._tidy(self._runner)
-        for sensor in list(self._order):
+        for sensor in self._order.sensors:
             self._publish_of(sensor)
         self._dispatch()
 
@@ -236,23 +216,15 @@ class Processing:
                 counts.dropped[_ENDED] += counts.in_flight
                 counts.in_flight = 0
 
-    def _rate_hz(self, now_s: float) -> float:
-        while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_S:
-            self._arrivals_s.popleft()
-        return len(self._arrivals_s) / min(_RATE_S, max(now_s - self._begun_s, 0.5))
-
     def _prepare(self, kind: Kind) -> None:
         if self._runner is not None:
             self._runner.prepare(kind)
 
     def _tidy(self, runner: Runner) -> None:
         """Let go of kinds that no sensor has any more; of what waits of them, there are no images."""
-        for kind in self._sensors.unused(lambda kind: any(job.kind is kind for job in self._under_way())):
+        for kind in self._sensors.unused(lambda kind: any(job.kind is kind for job in self._order.jobs)):
             self._queues.drop_kind(kind.number, _CHANGED)
             runner.forget(kind)
-
-    def _under_way(self) -> Iterable[Job]:
-        return itertools.chain.from_iterable(self._order.values())
 
     def _dispatch(self) -> None:
         """Give workers what waits, as long as they take it."""
@@ -263,8 +235,7 @@ class Processing:
                 if runner.takes(job.kind):
                     self._queues.take(job)
                     job.points = self._publisher.wants_points(job.data.sensor)
-                    if not job.tries:
-                        self._order.setdefault(job.data.sensor, deque()).append(job)
+                    self._order.add(job)
                     runner.submit(job)
                     found = True
                     break
@@ -279,8 +250,8 @@ class Processing:
                     self._queues.drop_kind(kind, _UNUSABLE)
                 case Done(job=job, took_s=took_s):
                     self._took.add(1e3 * took_s)
-                    self._done.add(job.number)
-                    self._failing.pop(job.data.sensor, None)
+                    self._order.done(job)
+                    self._pauses.succeeded(job.data.sensor)
                     self._publish_of(job.data.sensor)
                     if job.tries:
                         self._publish(job)
@@ -291,7 +262,7 @@ class Processing:
         job = event.job
         about = {"sensor": job.data.sensor, "epoch": job.data.epoch, "sequence": job.data.sequence, "text": event.text}
         job.tries += 1
-        self._leave(job)
+        self._order.leave(job)
         if not event.again:
             self._log.warning("dropped", **about)
             self._queues.drop(job.data, _REFUSED)
@@ -308,50 +279,27 @@ class Processing:
 
     def _failed_twice(self, sensor: str) -> None:
         """Have a sensor pause after some in a row: each has cost workers two deadlines, and was before all others."""
-        failing = self._failing.setdefault(sensor, _Failing())
-        failing.in_a_row += 1
-        if failing.in_a_row < _IN_A_ROW:
-            return
-        failing.until_s = time.monotonic() + failing.pause_s
-        self._log.error("paused", sensor=sensor, text=f"{_PAUSED}; it is tried again in {failing.pause_s:g} s")
-        failing.pause_s = min(2 * failing.pause_s, _LONGEST_PAUSE_S)
-        self._queues.drop_sensor(sensor, _PAUSED)
+        pause_s = self._pauses.failed(sensor)
+        if pause_s:
+            self._log.error("paused", sensor=sensor, text=f"{_PAUSED}; it is tried again in {pause_s:g} s")
+            self._queues.drop_sensor(sensor, _PAUSED)
 
     def _keep(self, job: Job) -> None:
         """Put a measurement where somebody can look at it."""
         self._quarantined += 1
         if self._quarantine is None:
             return
-        data, settings = job.data, self._sensors[job.data.sensor].settings
-        air = Air(
-            temperature_c=data.temperature_c, humidity_percent=data.humidity_percent, pressure_pa=data.pressure_pa
-        )
-        settings = settings.replace(air=air)
-        layout = microphones(settings.array)
-        shape = (settings.recording.n_samples, layout.n_words)[: 1 + (layout.n_words > 1)]
-        words = np.frombuffer(bytes_of(job.words), f"<u{layout.word_bits // 8}")
-        if words.size != int(np.prod(shape)):
-            return
-        stamp = Stamp(
-            sensor=data.sensor,
-            sequence=data.sequence,
-            sync_count=data.sync_count,
-            timestamp_ns=data.timestamp_ns,
-            timestamp_uncertainty_ns=data.uncertainty_ns,
-            epoch=data.epoch,
-        )
-        measurement = Measurement(words.reshape(shape).copy(), settings, stamp)
-        self._quarantine.put(Entry(measurement, data.monotonic_ns, zlib.crc32(bytes_of(job.words))))
+        entry = entry_of(job, self._sensors[job.data.sensor].settings)
+        if entry is not None:
+            self._quarantine.put(entry)
 
     def _publish_of(self, sensor: str) -> None:
         """Publish what is done of a sensor, in the order in which it came."""
-        jobs = self._order.get(sensor, deque())
-        while jobs and jobs[0].number in self._done and self._publisher.serves:
-            self._publish(jobs.popleft())
+        while self._publisher.serves and (job := self._order.take(sensor)) is not None:
+            self._publish(job)
 
     def _publish(self, job: Job) -> None:
         sensor, slot = self._sensors[job.data.sensor], job.slot
-        self._done.discard(job.number)
         if slot is None or self._runner is None:
             return
         if not self._publisher.serves or sensor.kind is not job.kind:
@@ -374,12 +322,6 @@ class Processing:
         if not self._publisher.publish(job, note):
             self._runner.give_back(slot)
             self._queues.drop(job.data, _UNDESCRIBED)
-
-    def _leave(self, job: Job) -> None:
-        """Take a job out of the order in which others are published."""
-        jobs = self._order.get(job.data.sensor, deque())
-        if job in jobs:
-            jobs.remove(job)
 
     def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job] = ()) -> None:
         """Count what was published, or has died with the publisher, and take the slots back."""

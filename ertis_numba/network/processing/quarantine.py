@@ -2,17 +2,23 @@
 
 import queue
 import threading
+import zlib
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
 from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.network.log import Log
+from ertis_numba.network.processing.runner import Job, bytes_of
+from ertis_numba.settings import Settings
 
-__all__ = ["Quarantine"]
+__all__ = ["Quarantine", "entry_of"]
 
 _WAITING: Final = 16
 _MOST: Final = 100  # measurements that are kept: what is wrong with one sensor must not fill a disk
@@ -89,3 +95,14 @@ class Quarantine:
         if measurement.stamp.sensor not in journal.sensors:
             journal.add_sensor(measurement.stamp.sensor, measurement.settings)
         journal.append([entry])
+
+
+def entry_of(job: Job, settings: Settings) -> Entry | None:
+    """Return the measurement of a job whose sensor has such settings, None if they are not of its words."""
+    layout, data = microphones(settings.array), job.data
+    shape = layout.words_shape(settings.recording.n_samples)
+    words = np.frombuffer(bytes_of(job.words), layout.word_type)
+    if words.size != int(np.prod(shape)):
+        return None
+    measurement = Measurement(words.reshape(shape).copy(), settings.replace(air=data.air), data.stamp)
+    return Entry(measurement, data.monotonic_ns, zlib.crc32(bytes_of(job.words)))

@@ -105,7 +105,7 @@ class Sensors:
         """
         known = self._known[data.sensor]
         try:
-            came = Air(**{name: getattr(data, name) for name in _AIR_STEPS})
+            came = data.air
         except ArgumentError:
             return None
         air = _about(came, known.settings.air)

@@ -3,20 +3,18 @@
 import os
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from ertis_numba.network.log import Log
 from ertis_numba.network.processing.child import Child
-from ertis_numba.network.processing.choice import Choice, Mode
+from ertis_numba.network.processing.choice import Choice
 from ertis_numba.network.processing.notes import (
     Failed,
     Forget,
     FromWorker,
     Made,
-    Memory,
     Prepare,
     Prepared,
     Process,
@@ -26,40 +24,16 @@ from ertis_numba.network.processing.notes import (
 from ertis_numba.network.processing.options import Options
 from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, bytes_of
 from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.worker import SLOTS, Worker
 from ertis_numba.network.status import WorkerStatus
 
 __all__ = ["Workers"]
 
 _MODULE: Final = "ertis_numba.network.processing._worker"
-_SLOTS: Final = 2  # of each worker: one is processed while the publisher reads the other
 _LOADING_S: Final = 60.0
 _BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # before a worker that dies again and again is started again
 _TRIES: Final = 3  # workers that may die over getting ready for a kind for which none has ever been
 _CLOSED_S: Final = 2.0
-
-
-@dataclass(slots=True, eq=False)
-class _Worker:
-    number: int
-    child: Child[FromWorker] | None = None
-    ready: bool = False
-    slots: list[Slot] = field(default_factory=list)
-    free: list[Slot] = field(default_factory=list)
-    kinds: set[int] = field(default_factory=set)
-    preparing: Kind | None = None
-    job: Job | None = None
-    slot: Slot | None = None  # that the job is in
-    mode: Mode | None = None  # in which it runs
-    deadline_s: float = float("inf")
-    deaths: int = 0
-    start_s: float = 0.0
-    done: int = 0
-
-    @property
-    def state(self) -> Literal["starting", "idle", "busy"]:
-        if not self.ready or self.preparing is not None:
-            return "starting"
-        return "idle" if self.job is None else "busy"
 
 
 class Workers:
@@ -88,7 +62,7 @@ class Workers:
         self._kinds: dict[int, Kind] = {}
         self._prepared: dict[int, Prepared] = {}
         self._tries: dict[int, int] = {}
-        self._workers = [_Worker(number) for number in range(count)]
+        self._workers = [Worker(number) for number in range(count)]
         self._started = 1  # the others wait until the first has compiled what all need, and has found a device
         self.respawned = 0
         self._start(self._workers[0])
@@ -120,7 +94,7 @@ class Workers:
         busy = sum(worker.job is not None for worker in self._workers)
         return busy < self._chosen.mode.at_once and self._idle(kind) is not None
 
-    def _idle(self, kind: Kind) -> _Worker | None:
+    def _idle(self, kind: Kind) -> Worker | None:
         for worker in self._workers:
             if worker.state == "idle" and kind.number in worker.kinds and worker.free:
                 return worker
@@ -148,7 +122,7 @@ class Workers:
 
     def give_back(self, slot: Slot) -> None:
         """See `Runner`."""
-        worker = self._workers[slot.number // _SLOTS]
+        worker = self._workers[slot.number // SLOTS]
         if slot in worker.slots:
             worker.free.append(slot)
 
@@ -206,7 +180,7 @@ class Workers:
                 slot.close()
             worker.slots, worker.free = [], []
 
-    def _start(self, worker: _Worker) -> None:
+    def _start(self, worker: Worker) -> None:
         threads = str(self._threads)
         worker.child = Child(
             _MODULE,
@@ -221,7 +195,7 @@ class Workers:
         )
         worker.deadline_s = time.monotonic() + _LOADING_S
 
-    def _heard(self, worker: _Worker) -> list[Event]:
+    def _heard(self, worker: Worker) -> list[Event]:
         """Return what a worker has to tell."""
         found: list[Event] = []
         if worker.child is None:
@@ -247,7 +221,7 @@ class Workers:
             self._next_kind(worker)
         return found
 
-    def _loaded(self, worker: _Worker, device: str, threads: int) -> None:
+    def _loaded(self, worker: Worker, device: str, threads: int) -> None:
         worker.ready, worker.deadline_s = True, float("inf")
         if self._started == 1 and not self._kinds_known:
             if threads == 1 and self._options.workers is None and len(self._workers) > 1:
@@ -262,7 +236,7 @@ class Workers:
     def _kinds_known(self) -> bool:
         return bool(self._prepared)
 
-    def _became_ready(self, worker: _Worker, note: Prepared) -> list[Event]:
+    def _became_ready(self, worker: Worker, note: Prepared) -> list[Event]:
         kind = worker.preparing
         worker.preparing, worker.deadline_s = None, float("inf")
         if worker.child is None or kind is None:
@@ -271,7 +245,7 @@ class Workers:
             worker.child.pipe.send(Forget(kind=note.kind))
             return []
         worker.kinds.add(kind.number)
-        self._give_memory(worker, kind.words_bytes, self._image_bytes(note))
+        worker.give_memory(kind.words_bytes, self._image_bytes(note))
         self._started = len(self._workers)
         if kind.number in self._prepared:
             return []
@@ -282,26 +256,7 @@ class Workers:
     def _image_bytes(self, note: Prepared) -> int:
         return int(np.prod(note.shape)) * np.dtype(self._options.dtype).itemsize
 
-    def _give_memory(self, worker: _Worker, words_bytes: int, image_bytes: int) -> None:
-        """See to it that a worker has slots that are large enough; those that are read elsewhere are given later."""
-        if worker.child is None:
-            return
-        if not worker.slots:
-            numbers = range(_SLOTS * worker.number, _SLOTS * (worker.number + 1))
-            worker.slots = [Slot(number, words_bytes, image_bytes) for number in numbers]
-            worker.free = list(worker.slots)
-        elif not all(slot.holds(words_bytes, image_bytes) for slot in worker.slots):
-            # What the publisher reads of the old ones, it has as long as it needs it.
-            most = max(words_bytes, worker.slots[0].words_bytes), max(image_bytes, worker.slots[0].image_bytes)
-            for slot in worker.slots:
-                slot.close()
-            worker.slots = [Slot(slot.number, *most) for slot in worker.slots]
-            worker.free = list(worker.slots)
-        for slot in worker.slots:
-            note = Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
-            worker.child.pipe.send(note, files=(slot.descriptor,))
-
-    def _finished(self, worker: _Worker, note: Made | Failed) -> list[Event]:
+    def _finished(self, worker: Worker, note: Made | Failed) -> list[Event]:
         job, slot = worker.job, worker.slot
         if job is None or slot is None or note.job != job.number:
             return []
@@ -317,7 +272,7 @@ class Workers:
         job.slot, job.n_points = slot, note.n_points
         return [Done(job, note.took_s)]
 
-    def _next_kind(self, worker: _Worker) -> None:
+    def _next_kind(self, worker: Worker) -> None:
         """Let a worker that has nothing else to do get ready for a kind that it does not know."""
         if worker.child is None or worker.state != "idle":
             return
@@ -331,7 +286,7 @@ class Workers:
                 worker.child.pipe.send(Prepare(kind=number, settings=kind.settings, measure=measure))
                 return
 
-    def _died(self, worker: _Worker) -> list[Event]:
+    def _died(self, worker: Worker) -> list[Event]:
         """Clear up after a worker, and return what became of its job."""
         if worker.child is None:
             return []

@@ -1,5 +1,6 @@
 """A spool on a disk: a journal for each run, of which goes what the central node has."""
 
+import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -63,8 +64,12 @@ class DiskSpool(Spool):
         """Take up the journals that earlier nodes have left, oldest first."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self._folder):  # root may write whatever its mode says
+                pass
         except OSError as error:
-            raise NetworkError(f"{self._folder}: {error.strerror}; give a folder for the spool") from error
+            raise NetworkError(
+                f"{self._folder}: {error.strerror}; give a folder for the spool that can be written (--spool)"
+            ) from error
         for path in sorted(self._folder.glob(f"*{SUFFIX}")):
             try:
                 journal = Journal.open(path)

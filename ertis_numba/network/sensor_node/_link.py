@@ -1,6 +1,5 @@
 """The thread that speaks with the central node: greets, sends, takes acks, and begins again where it has to."""
 
-import socket as pairs
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.sensor_node._runs import Run
 from ertis_numba.network.sensor_node._spool import Spool
 from ertis_numba.network.sensor_node._wire import Frames, Settled, frames_of, greeting
+from ertis_numba.network.waker import Waker
 
 __all__ = ["Central", "Link"]
 
@@ -68,24 +68,27 @@ class Link(threading.Thread):
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: sockets.Monitor | None = None
         self._poller = zmq.Poller()
-        self._wake_in, self._wake_out = pairs.socketpair()
-        self._wake_in.setblocking(False)  # noqa: FBT003  the name of this argument is the function's
-        self._wake_out.setblocking(False)  # noqa: FBT003
+        self._waker = Waker()
         self._stopping = threading.Event()
         self._heard_s = self._ping_s = 0.0
         self._is_blocked = False
         self._was_there = False
         self._told: set[tuple[str, str]] = set()  # what it was about, and the sensor
+        self._refusals: dict[str, str] = {}  # by sensor; "" is all of them
         self._next_sensor = 0
         self._greeted: set[tuple[str, int]] = set()
         self.central: Central = "away"
         self.reconnects = 0
         self._connect()  # so that an address that cannot be used is refused where it was given
 
+    @property
+    def refusal(self) -> str:
+        """Why the central node takes nothing of some sensor, and what to do about it; empty where it takes all."""
+        return next(iter(self._refusals.copy().values()), "")
+
     def wake(self) -> None:
         """Say that there is something to send."""
-        with suppress(BlockingIOError):  # then it is awake
-            self._wake_in.send(b"\0")
+        self._waker.wake()
 
     def stop(self) -> None:
         """End, and wait for it."""
@@ -95,8 +98,7 @@ class Link(threading.Thread):
             self.join()
         self._disconnect(linger_ms=_TURN_MS)
         self._context.term()
-        self._wake_in.close()
-        self._wake_out.close()
+        self._waker.close()
 
     def run(self) -> None:
         """Speak with the central node until stopped."""
@@ -118,7 +120,7 @@ class Link(threading.Thread):
         self._socket = sockets.client(self._context, self._address, keys=self._keys)
         self._monitor = sockets.Monitor(self._socket)
         self._poller = zmq.Poller()
-        self._poller.register(self._wake_out.fileno(), zmq.POLLIN)
+        self._poller.register(self._waker.fileno(), zmq.POLLIN)
         self._poller.register(self._monitor.socket, zmq.POLLIN)
         self._is_blocked = False
         self._greeted.clear()
@@ -142,11 +144,11 @@ class Link(threading.Thread):
             return
         self._poller.register(socket, zmq.POLLIN | (zmq.POLLOUT if self._is_blocked else 0))
         events = dict(self._poller.poll(_TURN_MS))
-        if self._wake_out.fileno() in events:
-            with suppress(BlockingIOError):
-                self._wake_out.recv(4096)
+        if self._waker.fileno() in events:
+            self._waker.clear()
         if monitor.socket in events:
             for text in monitor.read():
+                self._refusals[""] = text
                 self._note(text, text)  # which are a handful
         if events.get(socket, 0) & zmq.POLLOUT:
             self._is_blocked = False
@@ -163,6 +165,8 @@ class Link(threading.Thread):
         if self.central != "away" or not self._was_there:
             text = f"the central node at {self._address} does not answer; measurements are kept meanwhile"
             self._note(text, "away")
+        if self.central != "away":  # what it has said counts no more
+            self._refusals.clear()
         self.central = "away"
         self._connect()
 
@@ -178,6 +182,7 @@ class Link(threading.Thread):
                 message = messages.decode(frames[0], _WANTED)
             except FormatVersionError as error:
                 self._heard_s = time.monotonic()
+                self._refusals[""] = str(error)
                 with self._spool.turn:
                     self._wait(list(self._spool.runs.values()), str(error), "version")
             except DataError as error:
@@ -197,6 +202,8 @@ class Link(threading.Thread):
                     run = self._spool.runs.get((message.sensor, message.epoch))
                     if run is None or run.stage != "asked":
                         return
+                    for refused in ("", message.sensor):
+                        self._refusals.pop(refused, None)
                     done = run.welcome(message.settled, message.window, time.monotonic())
                     self._spool.settle(run, done, message.acks)
                 self._see(message.state)
@@ -231,6 +238,8 @@ class Link(threading.Thread):
             with self._spool.turn:
                 for run in self._spool.runs.values():
                     run.go_back(time.monotonic())
+        if state != "fault" and text:
+            self._note(text, text)
 
     def _take_refusal(self, message: messages.Refused) -> None:
         with self._spool.turn:
@@ -246,6 +255,7 @@ class Link(threading.Thread):
             return
         if message.code == "size" and self._say_bye():
             return
+        self._refusals[message.sensor] = message.reason
         about = f" of sensor {message.sensor}" if message.sensor else ""
         text = f"the central node refuses measurements{about}: {message.reason}"
         self._wait(runs, text, f"refused {message.code}", message.sensor)

@@ -205,6 +205,11 @@ class SensorNode:
         return "away" if self._link is None else self._link.central
 
     @property
+    def refusal(self) -> str:
+        """Why the central node takes nothing of some sensor, and what to do about it; empty where it takes all."""
+        return "" if self._link is None else self._link.refusal
+
+    @property
     def reconnects(self) -> int:
         """How often the central node was away and came back."""
         return 0 if self._link is None else self._link.reconnects

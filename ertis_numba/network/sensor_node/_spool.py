@@ -104,7 +104,7 @@ class Spool:
         if sensor.n_bytes > self._most_bytes:
             raise ArgumentError(
                 f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, and the memory has room for "
-                f"{self._most_bytes}; give ring_bytes that hold some"
+                f"{self._most_bytes}; give ring_bytes (--ring) that hold some"
             )
         with self.turn:
             self._sensors[sensor.name] = sensor

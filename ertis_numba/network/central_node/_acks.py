@@ -1,0 +1,64 @@
+"""Tells nodes what is settled."""
+
+import time
+from collections.abc import Callable
+from typing import Final, Literal
+
+from ertis_numba.network.central_node._streams import Stream
+from ertis_numba.network.messages import Ack, Message
+from ertis_numba.network.status import Latencies
+
+__all__ = ["Acks"]
+
+_DROPS: Final = 32  # told in an ack
+
+
+class Acks:
+    """Acks that are due, one of each run, however much of it has settled.
+
+    Parameters
+    ----------
+    send : callable
+        Called with a peer and a message to it.
+    status : {"stored", "accepted"}
+        What is settled is on the disk, or in memory.
+
+    Attributes
+    ----------
+    latencies : Latencies
+        From the arrival of a measurement to its ack.
+    """
+
+    def __init__(self, send: Callable[[bytes, Message], None], status: Literal["stored", "accepted"]) -> None:
+        self._send: Final = send
+        self._status: Final = status
+        self._due: dict[tuple[str, int], Stream] = {}  # by sensor and epoch
+        self._arrived_s: list[float] = []
+        self.latencies = Latencies()
+
+    def owe(self, stream: Stream) -> None:
+        """Have a run acked the next time."""
+        self._due[stream.run] = stream
+
+    def settled(self, arrived_s: float) -> None:
+        """Count a measurement that the next ack is the first to tell of."""
+        self._arrived_s.append(arrived_s)
+
+    def forget(self, stream: Stream) -> None:
+        """Ack a run no more."""
+        self._due.pop(stream.run, None)
+
+    def send(self) -> None:
+        """Send those that are due."""
+        for (sensor, epoch), stream in self._due.items():
+            if not stream.owner:
+                continue
+            dropped = tuple(stream.dropped.popleft() for _ in range(min(_DROPS, len(stream.dropped))))
+            ack = Ack(sensor=sensor, epoch=epoch, settled=stream.settled, status=self._status, dropped=dropped)
+            self._send(stream.owner, ack)
+        self._due.clear()
+        if self._arrived_s:
+            now_s = time.monotonic()
+            for arrived_s in self._arrived_s:
+                self.latencies.add(1e3 * (now_s - arrived_s))
+            self._arrived_s.clear()

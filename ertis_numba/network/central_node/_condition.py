@@ -1,0 +1,114 @@
+"""How a central node is: what it does, why it cannot store anything, and its status."""
+
+import os
+import socket as names
+import time
+from collections import Counter
+from importlib.metadata import version
+from typing import Final
+
+from ertis_numba.network import addresses
+from ertis_numba.network.central_node._archive import Archive
+from ertis_numba.network.central_node._door import Door
+from ertis_numba.network.central_node._images import Guarded
+from ertis_numba.network.central_node._intake import Intake
+from ertis_numba.network.fields import State
+from ertis_numba.network.status import Status
+
+__all__ = ["Condition"]
+
+_REPORT_S: Final = 0.2  # that a status may be old which somebody asks for
+_VERSION: Final = version("ertis-numba")
+
+
+class Condition:
+    """How a central node is.
+
+    Parameters
+    ----------
+    listen : str
+        As it was given.
+    door : Door
+    intake : Intake
+    archive : Archive or None
+    images : Guarded or None
+    keys : bool
+        Whether it has any.
+
+    Attributes
+    ----------
+    begun_s : float
+        When it was opened, by `time.monotonic`.
+    fault : str
+        What the archive has told last; empty where it can store.
+    closing : bool
+    """
+
+    def __init__(
+        self, listen: str, door: Door, intake: Intake, *, archive: Archive | None, images: Guarded | None, keys: bool
+    ) -> None:
+        self._listen, self._door, self._intake = listen, door, intake
+        self._archive, self._images, self._keys = archive, images, keys
+        self._report: tuple[float, bytes] = -1.0, b""
+        self.begun_s = 0.0
+        self.fault = ""
+        self.closing = False
+
+    @property
+    def address(self) -> str:
+        """What it listens at, with its port; empty where it does not listen yet."""
+        return self._door.address and addresses.at_port(self._listen, self._door.address)
+
+    @property
+    def state(self) -> State:
+        """What it does at present."""
+        if self.closing:
+            return "closing"
+        if self.trouble:
+            return "fault"
+        return "storage" if self._images is None else "processing"
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can be stored at present; empty where it can."""
+        return self.fault or ("" if self._archive is None else self._archive.stuck)
+
+    def status(self) -> Status:
+        """Return how it is."""
+        status = Status(
+            version=_VERSION,
+            pid=os.getpid(),
+            host=names.gethostname(),
+            address=self.address,
+            state=self.state,
+            fault=self.trouble,
+            uptime_s=round(time.monotonic() - self.begun_s, 3),
+            time_ns=time.time_ns(),
+            memory_bytes=_memory_bytes(),
+            peers=len(self._intake.peers),
+            keys=self._keys,
+            keys_note=self._door.note,
+            refused=dict(self._door.refused + (Counter() if self._images is None else self._images.refused())),
+            sensors={name: track.status() for name, track in self._intake.tracks.items()},
+        )
+        if self._archive is not None:
+            status.archive = self._archive.status()
+            status.archive.ack = self._intake.acks.latencies.percentiles()
+        if self._images is not None:
+            self._images.fill(status)
+        return status
+
+    def report(self) -> bytes:
+        """Return a status as it is sent, made once for all who ask at about the same time."""
+        now_s = time.monotonic()
+        if now_s - self._report[0] > _REPORT_S:
+            self._report = now_s, self.status().encode()
+        return self._report[1]
+
+
+def _memory_bytes() -> int:
+    try:
+        with open("/proc/self/statm", "rb") as file:  # noqa: PTH123  a second, ten thousand times
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0

@@ -1,0 +1,51 @@
+"""Which sensors several nodes send, by a mistake of whoever has named them."""
+
+from collections.abc import Callable, Mapping
+
+from ertis_numba.network.central_node._streams import Peer, Track
+
+__all__ = ["Sharing"]
+
+
+class Sharing:
+    """Finds sensors that several nodes send, and tells of each once.
+
+    Parameters
+    ----------
+    tell : callable
+        Called with the name of an event and what there is to say about it.
+    """
+
+    def __init__(self, tell: Callable[..., None]) -> None:
+        self._tell = tell
+        self._sensors: set[str] = set()
+
+    @staticmethod
+    def joins(track: Track, peer_id: bytes, now_s: float) -> None:
+        """Note that a node sends a sensor."""
+        if track.peers - {peer_id} and peer_id not in track.peers:
+            track.shared_s = now_s
+        track.peers.add(peer_id)
+
+    def leaves(self, track: Track, sensor: str, peer_id: bytes) -> None:
+        """Note that a node sends a sensor no more."""
+        track.peers.discard(peer_id)
+        if len(track.peers) < 2:
+            self._sensors.discard(sensor)
+
+    def tick(self, tracks: Mapping[str, Track], peers: Mapping[bytes, Peer]) -> None:
+        """Tell of what is new."""
+        for sensor, track in tracks.items():
+            # One that has come back may be missed only some seconds later.
+            if track.shared_s and all(peers[each].heard_s > track.shared_s for each in track.peers):
+                track.shared_s = 0.0
+                if len(track.peers) > 1:
+                    self._sensors.add(sensor)
+                    self._tell("shared", sensor=sensor, text="several sensor nodes send it; give each its own name")
+
+    def remark(self, peer: Peer | None) -> str:
+        """Return what a node should know, a line; empty where there is nothing."""
+        shared = () if peer is None else sorted(self._sensors & {run.sensor for run in peer.streams})
+        if not shared:
+            return ""
+        return f"another sensor node sends sensor {shared[0]}, too; give each a name of its own (--name), or end one"

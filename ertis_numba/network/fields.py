@@ -1,0 +1,76 @@
+"""Fields of messages: how long and how large what comes over the wire may be, and those of each measurement."""
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ertis_numba.frames import Stamp
+
+__all__ = [
+    "MOST_SEQUENCE",
+    "Count",
+    "Int64",
+    "Line",
+    "Message",
+    "Name",
+    "Number",
+    "OfMeasurement",
+    "Position",
+    "Quaternion",
+    "Reason",
+    "Settled",
+    "State",
+    "Uint32",
+]
+
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*\Z")]
+Line = Annotated[str, Meta(max_length=512)]
+Reason = Annotated[str, Meta(min_length=1, max_length=64)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
+Number = Annotated[int, Meta(ge=0, le=MOST_SEQUENCE)]
+Settled = Annotated[int, Meta(ge=-1, le=MOST_SEQUENCE)]
+Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+State = Literal["storage", "processing", "fault", "closing"]
+Position = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
+    """The header of any message."""
+
+
+class OfMeasurement(Message, frozen=True, kw_only=True):
+    """What every header says that is about a measurement.
+
+    Attributes
+    ----------
+    sensor, epoch, sequence, sync_count
+        As in `ertis_numba.frames.Stamp`.
+    timestamp_ns, uncertainty_ns : int
+        When the emission began, since 1970-01-01 UTC by the sensor node's clock.
+    monotonic_ns : int
+        When all of it had arrived at the sensor node, by its clock that nobody sets.
+    """
+
+    sensor: Name
+    epoch: Count
+    sequence: Number
+    sync_count: Int64
+    timestamp_ns: Int64
+    uncertainty_ns: Uint32
+    monotonic_ns: Int64
+
+    @property
+    def stamp(self) -> Stamp:
+        """The stamp of its frame."""
+        return Stamp(
+            sensor=self.sensor,
+            sequence=self.sequence,
+            sync_count=self.sync_count,
+            timestamp_ns=self.timestamp_ns,
+            timestamp_uncertainty_ns=self.uncertainty_ns,
+            epoch=self.epoch,
+        )

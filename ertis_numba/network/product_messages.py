@@ -1,0 +1,155 @@
+"""What applications and the publisher say to each other; the other half of `ertis_numba.network.messages`."""
+
+from typing import Annotated, Final, Literal, TypeAlias, get_args
+
+from msgspec import Meta
+
+from ertis_numba.network.fields import Count, Int64, Message, Name, Number, OfMeasurement, Position, Quaternion, Uint32
+
+__all__ = ["PRODUCTS", "Description", "Group", "Image", "Points", "Product", "Raw", "Report", "Subscribe"]
+
+Product: TypeAlias = Literal["energyscape", "points", "raw", "group", "status"]
+PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
+"""What applications can ask for."""
+
+
+class Subscribe(Message, frozen=True, kw_only=True):
+    """An application wants products; sent each second, and whenever it has consumed something.
+
+    Attributes
+    ----------
+    sensors : tuple of str, optional
+        All by default.
+    products : tuple of {"energyscape", "points", "raw", "group", "status"}
+    consumed : int
+        Products received since the connection was made, that the application has taken.
+    credit : int
+        How many more may be sent unasked.
+    """
+
+    sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] | None = None
+    products: Annotated[tuple[Product, ...], Meta(min_length=1, max_length=8)]
+    consumed: Count = 0
+    credit: Annotated[int, Meta(ge=1, le=64)] = 2
+
+
+class Description(Message, frozen=True, kw_only=True):
+    """What products of a sensor are about, sent before the first that refers to it.
+
+    Payloads: settings as TOML, then azimuth, elevation and range as little-endian float64, which are empty for
+    products that have no such axes.
+
+    Attributes
+    ----------
+    number : int
+        By which products refer to it, until the connection ends.
+    sensor, translation_m, rotation_xyzw
+    """
+
+    number: Count
+    sensor: Name
+    translation_m: Position = (0.0, 0.0, 0.0)
+    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class _Product(OfMeasurement, frozen=True, kw_only=True):
+    number: Count
+    """Of the product, among all that this subscriber has asked for since it connected, from 0; it skips what was
+    dropped."""
+    dropped: Count
+    """How many were dropped for this subscriber, for want of credit."""
+    description: Count
+
+
+class Image(_Product, frozen=True, kw_only=True):
+    """An energyscape. Payloads: its energy, little-endian, cut into frames.
+
+    Attributes
+    ----------
+    shape : (direction, range)
+    dtype : {"float32", "float16"}
+    received_ns, published_ns : int
+        When the measurement reached the central node, and the image left it, by a clock there that nobody sets.
+    """
+
+    shape: tuple[Count, Count]
+    dtype: Literal["float32", "float16"]
+    received_ns: Int64
+    published_ns: Int64
+
+
+class Points(_Product, frozen=True, kw_only=True):
+    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the energy.
+
+    Attributes
+    ----------
+    n_points : int
+    received_ns, published_ns : int
+        As in `Image`.
+    """
+
+    n_points: Count
+    received_ns: Int64
+    published_ns: Int64
+
+
+class Raw(_Product, frozen=True, kw_only=True):
+    """A measurement as it came. Payload: its words, little-endian.
+
+    Attributes
+    ----------
+    temperature_c, humidity_percent, pressure_pa : float
+    crc32 : int
+    """
+
+    temperature_c: float
+    humidity_percent: float
+    pressure_pa: float
+    crc32: Uint32
+
+
+class Group(Message, frozen=True, kw_only=True):
+    """Measurements that were emitted together, when all have come or no more will.
+
+    Attributes
+    ----------
+    number, dropped
+        As in `Image`.
+    group : int
+        Pulse of the SYNC chain, as all sensors count it.
+    members : tuple of (sensor, epoch, sequence)
+        Those that have come.
+    missing : tuple of str
+        Those that have not.
+    spread_ns : int
+        Between the first and the last timestamp.
+    flags : tuple of {"incomplete", "clock", "pulse"}
+        What is wrong with it: sensors are missing; timestamps disagree although counters agree; a sensor has lost
+        a pulse or seen one twice.
+    """
+
+    number: Count
+    dropped: Count
+    group: Int64
+    members: Annotated[tuple[tuple[Name, Count, Number], ...], Meta(max_length=32)]
+    missing: Annotated[tuple[Name, ...], Meta(max_length=32)]
+    spread_ns: Count
+    flags: tuple[Literal["incomplete", "clock", "pulse"], ...] = ()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of those that have come."""
+        return tuple(sensor for sensor, _, _ in self.members)
+
+
+class Report(Message, frozen=True, kw_only=True):
+    """How the central node is. Payload: `ertis_numba.network.status.Status` as MessagePack.
+
+    Attributes
+    ----------
+    number, dropped
+        As in `Image`; 0 where it was asked for by `AskStatus`.
+    """
+
+    number: Count = 0
+    dropped: Count = 0

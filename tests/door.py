@@ -1,0 +1,109 @@
+"""A server, its gate, and clients that knock."""
+
+import random
+import time
+
+import zmq
+
+from ertis_numba.network import sockets
+from ertis_numba.network.gate import Gate
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+
+CENTRAL, ROBOT, VIEWER, DESK, STRANGER = (
+    KeyPair.new(name) for name in ("central", "robot", "viewer", "desk", "stranger")
+)
+LISTED = AllowList(
+    keys=(
+        Permission(name="robot", public=ROBOT.public, role="sensor", serials=("front", "left")),
+        Permission(name="viewer", public=VIEWER.public, role="application"),
+        Permission(name="desk", public=DESK.public, role="admin"),
+    )
+)
+LOOPBACK = "tcp://127.0.0.1:*"
+PATIENCE_S = 10.0  # of what is to happen
+MOMENT_S = 0.4  # of what is not to happen: a handshake takes a hundredth of it
+
+
+class Door:
+    """A server and its gate in one loop, as a central node has them, and clients that knock."""
+
+    def __init__(self, folder, *, with_keys=True, gate=Gate, server_gate=True, most_bytes=sockets.MOST_BYTES):
+        self.list = folder / "allow.toml"
+        LISTED.save(self.list)
+        self.keys = ServerKeys(CENTRAL, self.list) if with_keys else None
+        self.context, self.outside = zmq.Context(), zmq.Context()
+        self.gate = gate(self.context, self.keys if server_gate else None)
+        self.server = sockets.server(self.context, LOOPBACK, keys=self.keys, most_bytes=most_bytes)
+        self.gate.watch(self.server)
+        self.address = sockets.bound(self.server)
+        self.port = int(self.address.rpartition(":")[2])
+        self.changed = 0  # so often the list did
+        self.came, self._clients, self._unsaid, self.monitors = [], [], [], {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.gate.close()
+        for monitor in self.monitors.values():
+            monitor.close()
+        for client in self._clients:
+            client.close(linger=0)
+        self.server.close(linger=0)
+        self.context.destroy(linger=0)  # also what a test that failed has left open
+        self.outside.destroy(linger=0)
+
+    def turn(self):
+        """Once around the loop."""
+        poller = zmq.Poller()
+        for each in (self.server, self.gate.socket):
+            if each is not None:
+                poller.register(each, zmq.POLLIN)
+        for client, text in self._unsaid[:]:
+            if client.poll(0, zmq.POLLOUT):
+                client.send(text, zmq.NOBLOCK)
+                self._unsaid.remove((client, text))
+        poller.poll(5)
+        self.gate.serve()
+        while self.server.poll(0):
+            frames = self.server.recv_multipart(copy=False)
+            self.came.append((frames[-1].bytes, self.gate.who(frames)))
+        self.changed += self.gate.tick()
+
+    def until(self, condition, patience_s=PATIENCE_S):
+        """Serve until something is so; whether it became so."""
+        end_s = time.monotonic() + patience_s
+        while not (so := condition()) and time.monotonic() < end_s:
+            self.turn()
+        return bool(so)
+
+    def knock(self, pair, *, server=CENTRAL.public, options=(), text=b"hello"):
+        """Connect, and send when connected."""
+        keys = ClientKeys(pair, server) if pair else None
+        client = sockets.client(self.outside, self.address, keys=keys)
+        for option, value in options:
+            client.setsockopt(option, value)
+        if options:  # they count for the next connection
+            client.disconnect(self.address)
+            client.connect(self.address)
+        self.monitors[client] = sockets.Monitor(client)
+        self._clients.append(client)
+        self.say(client, text)
+        return client
+
+    def say(self, client, text):
+        """Send something as soon as a client is connected."""
+        self._unsaid.append((client, text))
+
+    def told(self, client):
+        """Wait until a client is told why it is not let in."""
+        lines = []
+        assert self.until(lambda: lines.extend(self.monitors[client].read()) or lines)
+        return lines[0]
+
+    def admits(self, pair, **options):
+        """Whether a key is let in within a moment, and as what."""
+        text = random.randbytes(8)
+        self.knock(pair, text=text, **options)
+        self.until(lambda: any(came == text for came, _ in self.came), MOMENT_S)
+        return next((who for came, who in self.came if came == text), None)

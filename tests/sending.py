@@ -1,0 +1,78 @@
+"""A sensor node whose notes and acks can be waited for, and what a stand-in of a central node got of it."""
+
+import queue
+import threading
+import time
+
+import pytest
+
+from ertis_numba.network import messages
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.network.sensor_node import _link as link
+from ertis_numba.network.sensor_node import _runs as runs
+from tests.journals import EPOCH, TINY
+
+KEY = "left", EPOCH
+SOON_S = 20.0
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """What takes seconds takes fractions of one."""
+    for module, name, value in (
+        (link, "_PING_S", 0.05),
+        (link, "_DEAD_S", 0.5),
+        (link, "_GREET_AGAIN_S", 0.1),
+        (link, "_REFUSED_S", 0.1),
+        (link, "_TURN_MS", 10),
+        (runs, "_PATIENCE_S", 0.05),
+        (runs, "_MOST_PATIENCE_S", 0.2),
+    ):
+        monkeypatch.setattr(module, name, value)
+
+
+IMPATIENT = pytest.mark.usefixtures("impatient")
+
+
+class Node(SensorNode):
+    """A sensor node of one sensor, whose notes and acks can be waited for."""
+
+    def __init__(self, address, sensors=("left",), **options):
+        self.notes, self.acks = queue.Queue(), queue.Queue()
+        super().__init__(address, on_note=self.notes.put, on_settled=self.acks.put, **options)
+        for sensor in sensors:
+            self.add_sensor(sensor, TINY, firmware="1.2.3", translation_m=(1, 2, 3))
+
+
+def until(condition):
+    """Wait until something is so."""
+    end_s = time.monotonic() + SOON_S
+    while not condition():
+        assert time.monotonic() < end_s
+        threading.Event().wait(0.005)
+
+
+def same(held, wanted):
+    """Whether a central node has what was given, with everything that belongs to it."""
+    message, words = held
+    entry, stamp, air = wanted, wanted.measurement.stamp, wanted.measurement.settings.air
+    return words == entry.measurement.words.tobytes() and message == messages.Data(
+        sensor=stamp.sensor,
+        epoch=stamp.epoch,
+        sequence=stamp.sequence,
+        sync_count=stamp.sync_count,
+        timestamp_ns=stamp.timestamp_ns,
+        uncertainty_ns=stamp.timestamp_uncertainty_ns,
+        monotonic_ns=entry.monotonic_ns,
+        temperature_c=air.temperature_c,
+        humidity_percent=air.humidity_percent,
+        pressure_pa=air.pressure_pa,
+        crc32=entry.crc32,
+    )
+
+
+def has_all(central, given, key=KEY):
+    held = central.held.get(key, {})
+    return [*held] == [entry.measurement.stamp.sequence for entry in given] and all(
+        same(*pair) for pair in zip(held.values(), given, strict=True)
+    )

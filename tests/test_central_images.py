@@ -1,0 +1,130 @@
+"""A central node and what makes images, whatever that does."""
+
+import os
+from collections import Counter
+from types import SimpleNamespace
+from typing import ClassVar
+
+import pytest
+
+from ertis_numba.network import messages
+from ertis_numba.network.messages import Ack, Ping, Pong
+from ertis_numba.network.status import Percentiles, ProcessingStatus
+from tests.central import Node, running, stored, wanted
+from tests.journals import EPOCH, entries
+
+
+class Images:
+    """Stands for what makes images."""
+
+    refused: ClassVar = {}
+
+    def __init__(self):
+        self.known, self.offered = [], []
+
+    def know(self, hello, settings):
+        self.known.append((hello.sensor, settings))
+
+    def offer(self, data, words, arrived_ns):
+        self.offered.append((data.sequence, words.copy(), arrived_ns))
+
+    def counts(self, _):
+        return SimpleNamespace(published=2, dropped=Counter(late=1), in_flight=1, queue=1, latency=Percentiles())
+
+    def status(self):
+        return ProcessingStatus()
+
+    def fds(self):
+        return ()
+
+    def start(self):
+        pass
+
+    def tick(self, _):
+        pass
+
+    publish_status = close = ready = tick
+
+    def drain_dropped(self):
+        return []
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_processing_gets_each_measurement_once(archive, tmp_path):
+    images, given = Images(), entries(3)
+    with running(tmp_path if archive else None, processing=images) as central, Node(central.address) as node:
+        welcome = node.hello()
+        assert (welcome.state, welcome.acks) == ("processing", "stored" if archive else "accepted")
+        assert welcome.settled == (-1 if archive else 9)
+        node.measure(*given, given[0])
+        assert node.hear_settled(12).status == welcome.acks
+        node.send(Ping())
+        node.hear(Pong)
+    assert [each[0] for each in images.offered] == [10, 11, 12]
+    assert all(
+        (words == entry.measurement.words).all() for (_, words, _), entry in zip(images.offered, given, strict=True)
+    )
+    assert images.known[0][0] == "left"
+    sensor = central.latest.sensors["left"]
+    assert (sensor.received, sensor.repeated, sensor.published, sensor.dropped) == (3, 1, 2, {"late": 1})
+
+
+def test_without_an_archive_a_run_is_remembered():
+    with running(processing=Images()) as central:
+        with Node(central.address) as node:
+            node.hello()
+            node.measure(*entries(3))
+            node.hear_settled(12)
+            node.send(messages.Bye())
+        with Node(central.address) as node:
+            assert node.hello(first=11).settled == 12
+            node.measure(entries(2)[1])
+            node.send(Ping())
+            assert node.hear(Ack).settled == 12
+    assert central.latest.sensors["left"].received == 3
+
+
+FAILING = ("know", "offer", "fds", "ready", "tick", "counts", "status", "publish_status", "drain_dropped", "close")
+
+
+@pytest.mark.parametrize("what", [*FAILING, "all"])
+def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
+    def fails(*_):
+        raise MemoryError("no more")
+
+    given, reads = entries(2), os.pipe()
+    for name in FAILING if what == "all" else [what]:
+        monkeypatch.setattr(Images, name, fails)
+    if what == "ready":
+        monkeypatch.setattr(Images, "fds", lambda _: reads[:1])
+        os.write(reads[1], b".")
+    monkeypatch.setattr("ertis_numba.network.central_node._node._STATUS_S", 0.0)
+    with running(tmp_path, processing=Images()) as central, Node(central.address) as node:
+        node.hello()
+        node.measure(*given)
+        node.hear_settled(11)
+        for _ in range(3):  # longer than a tick
+            node.socket.poll(100)
+    for end in reads:
+        os.close(end)
+    assert stored(tmp_path)[0] == wanted(given)
+    assert central.latest.refused["internal"] >= 1
+    told = [event["text"] for event in central.events if event["event"] == "internal"]
+    assert set(told) == {"MemoryError: no more"}
+    assert len(told) <= 2  # once a second
+    with running(tmp_path):  # the folder is free again
+        pass
+
+
+def test_what_processing_drops_is_told_to_its_node(monkeypatch):
+    drops = [[("left", EPOCH, 10, "superseded")]]
+    monkeypatch.setattr(Images, "drain_dropped", lambda _: drops.pop() if drops else [])
+    with running(processing=Images()) as central, Node(central.address) as node:
+        drops.clear()
+        node.hello()
+        drops.append([("left", EPOCH, 10, "superseded")])
+        told = ()
+        while not told:
+            node.send(Ping())
+            told = node.hear(Ack).dropped
+    assert told == ((10, "superseded"),)

@@ -1,0 +1,133 @@
+"""Servers and strangers: addresses, garbage, and more connections than anybody needs."""
+
+import random
+import resource
+import socket as raw
+import time
+
+import pytest
+import zmq
+
+from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.network import sockets
+from ertis_numba.network.keys import ClientKeys, ServerKeys
+from tests.door import CENTRAL, LISTED, LOOPBACK, MOMENT_S, ROBOT, STRANGER, VIEWER, Door
+
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(48)
+
+
+@pytest.fixture
+def door(tmp_path):
+    with Door(tmp_path) as made:
+        yield made
+
+
+# Sockets
+
+
+def test_an_address_that_others_can_reach_needs_keys_on_both_sides():
+    with zmq.Context() as context:
+        for make in (sockets.server, sockets.client):
+            with pytest.raises(ArgumentError, match="there are no keys"):
+                make(context, "tcp://192.0.2.1:5601", keys=None)
+
+
+def test_an_address_that_is_in_use_is_told(door):
+    with pytest.raises(NetworkError, match="cannot be listened at"):
+        sockets.server(door.context, door.address, keys=None)
+
+
+def test_a_server_on_all_addresses_is_told_as_one_that_can_be_connected_to(tmp_path):
+    LISTED.save(tmp_path / "allow.toml")
+    with (
+        zmq.Context() as context,
+        sockets.server(context, "tcp://*:0", keys=ServerKeys(CENTRAL, tmp_path / "allow.toml")) as server,
+    ):
+        assert sockets.bound(server).startswith("tcp://127.0.0.1:")
+
+
+def test_a_refusal_that_comes_at_once_is_told(tmp_path):
+    """Between connecting and watching, everything may have happened already."""
+    with (
+        Door(tmp_path) as door,
+        zmq.Context() as context,
+        sockets.client(context, door.address, keys=ClientKeys(STRANGER, CENTRAL.public)) as client,
+    ):
+        assert door.until(lambda: door.gate.refused["unknown key"])
+        door.until(lambda: False, MOMENT_S)
+        monitor = sockets.Monitor(client)
+        assert [line[:40] for line in monitor.read()] == ["the central node does not know this key;"]
+        monitor.close()
+
+
+# Hostile connections
+
+
+def test_a_server_has_room_for_more_connections_than_a_process_has_by_default():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
+    try:
+        with zmq.Context() as context, sockets.server(context, LOOPBACK, keys=None):
+            assert resource.getrlimit(resource.RLIMIT_NOFILE) == (min(8192, hard % 2**63), hard)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_garbage_on_the_port_harms_nobody(door):
+    """Seed 3."""
+    random_ = random.Random(3)
+    robot = door.knock(ROBOT)
+    assert door.until(lambda: door.came)
+    garbage = [b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 100, GREETING, GREETING + b"\x04\xff" * 50]
+    garbage += [GREETING.replace(b"NULL", b"CURVE")[:64] + random_.randbytes(300) for _ in range(20)]
+    garbage += [random_.randbytes(random_.randrange(1, 2000)) for _ in range(75)]
+    for text in garbage:
+        with raw.create_connection(("127.0.0.1", door.port)) as stranger:
+            stranger.sendall(text)
+        door.turn()
+    door.say(robot, b"more")
+    assert door.until(lambda: len(door.came) == 2)
+    assert door.admits(VIEWER).name == "viewer"
+    assert {who.name for _, who in door.came} == {"robot", "viewer"}
+
+
+def test_a_frame_that_is_too_long_ends_its_connection_alone(tmp_path):
+    with Door(tmp_path, with_keys=False, most_bytes=1000) as door:
+        good, bad = door.knock(None), door.knock(None, text=bytes(2000))
+        assert door.until(lambda: door.came)
+        door.say(bad, b"after")
+        good.send(bytes(1000))
+        assert door.until(lambda: any(len(text) == 1000 for text, _ in door.came))
+        assert not any(len(text) > 1000 for text, _ in door.came)
+
+
+def test_two_hundred_slow_connections_keep_nobody_out_and_are_hung_up_on(door):
+    strangers = [raw.create_connection(("127.0.0.1", door.port)) for _ in range(200)]
+    try:
+        for number, stranger in enumerate(strangers):
+            stranger.sendall(GREETING.replace(b"NULL", b"CURVE")[: number % 64])
+        began_s = time.monotonic()
+        door.knock(ROBOT)
+        assert door.until(lambda: door.came)
+        assert time.monotonic() - began_s < 2.0
+        waiting = dict.fromkeys(strangers)
+        for stranger in strangers:
+            stranger.settimeout(0)
+        assert door.until(lambda: not _still_open(waiting), 6.0)
+        assert door.until(lambda: door.gate.refused["no key"] >= 190)
+    finally:
+        for stranger in strangers:
+            stranger.close()
+
+
+def _still_open(connections):
+    for connection in list(connections):
+        try:
+            while connection.recv(4096):
+                pass
+        except BlockingIOError:
+            continue
+        except OSError:
+            pass
+        del connections[connection]
+    return connections

@@ -1,0 +1,249 @@
+"""Applications and a publisher that goes, is silent, refuses, damages what it sends, and comes back."""
+
+import contextlib
+import os
+import re
+import signal
+import time
+import zlib
+
+import numpy as np
+import pytest
+import zmq
+
+from ertis_numba.errors import RefusedError
+from ertis_numba.network import _subscription, messages
+from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, ServerKeys
+from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.pipeline import Pipeline
+from tests.publishing import (
+    ALL,
+    SETTINGS,
+    Publisher,
+    cloud,
+    consumed,
+    got,
+    image,
+    measurement,
+    subscribed,
+)
+
+WAIT_S = 10.0
+
+
+@pytest.fixture
+def publisher():
+    with Publisher() as made:
+        yield made
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    """Nobody has to wait long to see that somebody waits."""
+    for name, time_s in {"_BEAT_S": 0.1, "_DEAD_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
+        monkeypatch.setattr(_subscription, name, time_s)
+
+
+def test_a_publisher_that_comes_back_is_found_and_numbers_begin_anew(publisher):
+    notes = []
+    with Subscriber(publisher.address, on_note=notes.append) as subscriber:
+        subscribed(publisher)
+        for sequence in range(4):
+            publisher.publish(image(sequence))
+        got(publisher, subscriber)
+        got(publisher, subscriber)
+        consumed(publisher, 2)
+        publisher.publish(image(4))
+        got(publisher, subscriber)
+        publisher.__exit__()
+        # ZeroMQ connects again by itself, faster than any silence is noticed.
+        with Publisher(address=publisher.address) as other:
+            for sequence in range(50, 55):
+                other.pump(lambda: other.peers and all(peer.has_room for peer in other.peers.values()))
+                other.publish(image(sequence))
+                assert got(other, subscriber).stamp.sequence == sequence
+        counts = subscriber.counts
+        assert (counts.received, counts.dropped, counts.missed, counts.reconnects) == (8, 2, 2, 1)
+        assert notes[0] == "connected"
+
+
+@pytest.mark.usefixtures("hasty")
+def test_silence_ends_a_connection():
+    notes = []
+    with Publisher() as silent, Subscriber(silent.address, on_note=notes.append) as subscriber:
+        silent.pump(lambda: subscriber.connected)
+        silent.answers = False
+        silent.pump(lambda: len(silent.peers) == 2)
+        assert subscriber.counts.reconnects == 1
+    assert notes == ["connected", "the publisher has been silent for 0.5 s; connecting again"]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_no_images_are_no_silence_where_the_publisher_answers(publisher):
+    with Subscriber(publisher.address) as subscriber:
+        publisher.pump(lambda: sum(isinstance(message, messages.Ping) for message in publisher.heard) == 15)
+        assert len(publisher.peers) == 1
+        assert subscriber.counts.reconnects == 0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (lambda p: p.raw(b"\x00" * 40), "header begins with"),
+        (lambda p: p.raw(messages.encode(messages.Ping())), "message is 'ping'"),
+        (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), its axes"),
+        (lambda p: p.publish(image(), dtype="float16"), "31000 bytes came for float16"),
+        (lambda p: p.publish(image(), description=9), "refers to description 9, which has not come"),
+        (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes came for float32 of shape"),
+        (lambda p: p.publish(measurement(), crc32=1), "has another CRC-32 than its header"),
+        (lambda p: p.tell_all(messages.Report(), b"\xff"), "status cannot be read"),
+        (lambda p: p.tell_all(messages.Description(number=0, sensor="front")), "has 0 payloads; send settings and 3"),
+        (
+            lambda p: p.tell_all(messages.Description(number=0, sensor="front"), b"[", b"", b"", b""),
+            "description cannot be used",
+        ),
+        (
+            lambda p: p.tell_all(messages.Description(number=0, sensor="front"), b"", b"123", b"", b""),
+            "an axis has 3 bytes",
+        ),
+    ],
+)
+def test_what_is_damaged_ends_the_connection_and_not_the_application(publisher, spoil, match):
+    notes = []
+    with Subscriber(publisher.address, products=ALL, on_note=notes.append) as subscriber:
+        publisher.pump(lambda: subscriber.connected)
+        spoil(publisher)
+        publisher.pump(lambda: subscriber.counts.damaged == 1)
+        publisher.peers.clear()
+        subscribed(publisher)
+        publisher.publish(image(8))
+        assert got(publisher, subscriber).stamp.sequence == 8
+    assert any(re.search(match, note) for note in notes), notes
+
+
+def test_waits_for_a_publisher_that_is_not_there_yet():
+    with Publisher() as gone:
+        address = gone.address
+    with Subscriber(address) as subscriber:
+        assert not subscriber.connected
+        with Publisher(address=address) as late:
+            subscribed(late)
+            late.publish(image(4))
+            assert got(late, subscriber).stamp.sequence == 4
+
+
+@pytest.mark.usefixtures("hasty")
+def test_refused_from_the_start_raises(publisher):
+    def refuse():
+        publisher.tell_all(messages.Refused(code="role", reason="key 'x' is of a sensor; give one of an application"))
+        publisher.peers.clear()
+        return came()
+
+    def came():
+        try:
+            subscriber.receive(0)
+        except RefusedError as error:
+            raised.append(error)
+        return bool(raised)
+
+    raised = []
+    with Subscriber(publisher.address) as subscriber:
+        publisher.answers = False
+        publisher.pump(refuse)
+        assert f"{publisher.address}: key 'x' is of a sensor; give one of an application" in str(raised[0])
+        with pytest.raises(RefusedError):
+            subscriber.receive()
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("keys")
+    central, known, unknown = (KeyPair.new(name) for name in ("central", "known", "unknown"))
+    listed = folder / "allow.toml"
+    listed.write_text(f'[[keys]]\nname = "known"\npublic = "{known.public}"\nrole = "application"\n')
+    assert AllowList.load(listed).find(known.public)
+    return {
+        "server": ServerKeys(central, listed),
+        "known": ClientKeys(known, central.public),
+        "unknown": ClientKeys(unknown, central.public),
+        "wrong server": ClientKeys(known, unknown.public),
+        "none": None,
+    }
+
+
+def test_with_keys(keys):
+    with Publisher(keys=keys["server"]) as publisher, Subscriber(publisher.address, keys=keys["known"]) as subscriber:
+        subscribed(publisher)
+        publisher.publish(image(2))
+        assert got(publisher, subscriber).stamp.sequence == 2
+
+
+@pytest.mark.parametrize(
+    ("who", "match"),
+    [
+        ("unknown", "the central node does not know this key"),
+        ("none", "wants a key.* give --key and --server-key"),
+        ("wrong server", "server-key"),
+    ],
+)
+@pytest.mark.usefixtures("hasty")
+def test_who_is_not_let_in_is_told_so(keys, who, match):
+    with Publisher(keys=keys["server"]) as publisher, publisher.playing([image()]):
+        with Subscriber(publisher.address, keys=keys[who]) as subscriber, pytest.raises(RefusedError, match=match):
+            subscriber.receive(WAIT_S)
+        assert not publisher.peers
+
+
+def offered(processing, subscriber, sequences):
+    """Return the images of measurements that a real central node's processing is given one after the other."""
+    came = []
+    for sequence in sequences:
+        given = measurement(sequence)
+        data = messages.Data(
+            sensor="front",
+            epoch=7,
+            sequence=sequence,
+            sync_count=sequence,
+            timestamp_ns=given.stamp.timestamp_ns,
+            uncertainty_ns=900,
+            monotonic_ns=time.monotonic_ns(),
+            **{name: getattr(SETTINGS.air, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")},
+            crc32=zlib.crc32(given.words.data),
+        )
+        processing.offer(data, given.words, time.monotonic_ns())
+        turned(processing, lambda: [came.append(subscriber.receive(0)), came[-1]][-1] is not None)
+    return [item for item in came if item is not None]
+
+
+def turned(processing, until):
+    end_s = time.monotonic() + 60
+    while not until():
+        assert time.monotonic() < end_s, "it did not come to that"
+        poller = zmq.Poller()
+        for fd in processing.fds():
+            poller.register(fd, zmq.POLLIN)
+        for fd, _ in poller.poll(5):
+            processing.ready(fd)
+        processing.tick(time.monotonic())
+
+
+def test_images_of_a_real_publisher_which_dies_and_comes_back(keys):
+    processing = Processing(Options(publish="tcp://127.0.0.1:0", keys=keys["server"], device="cpu", workers=1))
+    processing.start()
+    with contextlib.closing(processing), Subscriber(processing.address, keys=keys["known"]) as subscriber:
+        processing.know(messages.Hello(sensor="front", epoch=7, next_sequence=0, settings_crc32=0), SETTINGS)
+        turned(processing, lambda: processing.status().subscribers)
+        images = offered(processing, subscriber, range(3))
+        # Whoever kills it must know it: it is nobody's business otherwise.
+        os.kill(processing._publisher._child.pid, signal.SIGKILL)  # noqa: SLF001
+        turned(processing, lambda: processing.status().publisher_respawned == 1)
+        turned(processing, lambda: processing.status().subscribers)
+        images += offered(processing, subscriber, range(3, 6))
+        assert [each.stamp.sequence for each in images] == list(range(6))
+        assert (subscriber.counts.received, subscriber.counts.missed, subscriber.counts.reconnects) == (6, 0, 1)
+    with Pipeline(SETTINGS, device="cpu") as pipeline:
+        expected = pipeline.process(measurement(5))
+    np.testing.assert_array_equal(images[5].energy, expected.energy)
+    np.testing.assert_array_equal(images[5].range_m, expected.range_m)
+    assert images[5].stamp == measurement(5).stamp
