@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import open_raw
     from ertis_numba.journal import Entry
-    from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+    from ertis_numba.network.allow_list import AllowList, Permission
+    from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
     from ertis_numba.network.sensor_node import SensorNode
     from ertis_numba.network.subscriber import Subscriber
     from ertis_numba.pipeline import Pipeline
@@ -130,7 +131,8 @@ _HOMES = {
     "geometry": ("load_layout",),
     "interop": ("open_raw",),
     "journal": ("Entry",),
-    "network.keys": ("AllowList", "ClientKeys", "KeyPair", "Permission", "ServerKeys"),
+    "network.allow_list": ("AllowList", "Permission"),
+    "network.keys": ("ClientKeys", "KeyPair", "ServerKeys"),
     "network.sensor_node": ("SensorNode",),
     "network.subscriber": ("Subscriber",),
     "pipeline": ("Pipeline",),

@@ -6,8 +6,9 @@ import time
 import zmq
 
 from ertis_numba.network import sockets
+from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.gate import Gate
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 
 CENTRAL, ROBOT, VIEWER, DESK, STRANGER = (
     KeyPair.new(name) for name in ("central", "robot", "viewer", "desk", "stranger")

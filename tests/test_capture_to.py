@@ -17,7 +17,8 @@ from ertis_numba.capture import Session
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import Sonar
-from ertis_numba.network.keys import AllowList, KeyPair, Permission, ServerKeys
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.log import logger
 from ertis_numba.network.processing import Options
 from ertis_numba.network.processing.publisher import Publisher

@@ -6,8 +6,9 @@ import pytest
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network import messages
+from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node import Archive, CentralNode
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.messages import Refused, Report, Welcome
 from tests.central import Node, running, stored
 from tests.journals import entries

@@ -6,8 +6,9 @@ import pytest
 import zmq
 
 from ertis_numba.errors import SettingsError
+from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.gate import Gate
-from ertis_numba.network.keys import Permission, ServerKeys
+from ertis_numba.network.keys import ServerKeys
 from tests.door import CENTRAL, DESK, LISTED, ROBOT, STRANGER, Door
 
 

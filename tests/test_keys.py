@@ -16,16 +16,9 @@ from hypothesis import strategies as st
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.network import addresses
+from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.gate import Gate
-from ertis_numba.network.keys import (
-    AllowList,
-    ClientKeys,
-    KeyPair,
-    Permission,
-    ServerKeys,
-    default_folder,
-    public_key,
-)
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys, default_folder, public_key
 
 PAIR = KeyPair.new("robot")
 

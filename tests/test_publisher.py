@@ -6,7 +6,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
 from ertis_numba.network.processing.subscribers import Item, Subscriber, Subscribers
 from ertis_numba.network.status import Status

@@ -16,7 +16,8 @@ from ertis_cli._lines import Lines
 from ertis_cli.main import cli
 
 from ertis_numba.journal import SUFFIX
-from ertis_numba.network.keys import AllowList, KeyPair
+from ertis_numba.network.allow_list import AllowList
+from ertis_numba.network.keys import KeyPair
 from ertis_numba.network.messages import Ping
 from tests.central import Node, stored, wanted
 from tests.journals import ENVIRONMENT, TINY, entries

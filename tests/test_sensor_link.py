@@ -6,7 +6,8 @@ import threading
 import pytest
 
 from ertis_numba.network import messages
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.sensor_node import _link as link
 from ertis_numba.network.sensor_node import _runs as runs

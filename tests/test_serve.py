@@ -16,7 +16,8 @@ import pytest
 
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.journal import Entry
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Group
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.status import Status

@@ -15,9 +15,10 @@ from ertis_cli.main import cli
 from ertis_cli.status import _drawn
 
 from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.asking import Asking
 from ertis_numba.network.central_node import Archive, CentralNode
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission, ServerKeys
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.status import (
     ArchiveStatus,
     Percentiles,

@@ -13,7 +13,8 @@ import zmq
 
 from ertis_numba.errors import RefusedError
 from ertis_numba.network import _subscription, messages
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, ServerKeys
+from ertis_numba.network.allow_list import AllowList
+from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.processing import Options, Processing
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline

@@ -39,7 +39,8 @@ def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
     SettingsError
         They cannot be used.
     """
-    from ertis_numba.network.keys import ALLOW_LIST, KeyPair, ServerKeys, default_folder
+    from ertis_numba.network.allow_list import ALLOW_LIST
+    from ertis_numba.network.keys import KeyPair, ServerKeys, default_folder
 
     if key is None:
         if allow is not None:

@@ -8,7 +8,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.network.keys import Permission
+    from ertis_numba.network.allow_list import Permission
 
 __all__ = ["keys"]
 
@@ -69,7 +69,8 @@ def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
     """Let a key in, from the next second on; what it was allowed before is replaced."""
-    from ertis_numba.network.keys import ROLES, AllowList, Permission, public_key
+    from ertis_numba.network.allow_list import ROLES, AllowList, Permission
+    from ertis_numba.network.keys import public_key
 
     public, named = public_key(key)
     if not (name or named):
@@ -88,7 +89,7 @@ def allow(
 @options.as_json
 def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
     """Let a key in no more, from the next second on, connected or not."""
-    from ertis_numba.network.keys import AllowList
+    from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
     before, after = AllowList.change(path, lambda before: before.remove(who))
@@ -104,14 +105,15 @@ def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
 @options.as_json
 def list_(*, listed: Path | None, as_json: bool) -> None:
     """Show who is let in, and as what."""
-    from ertis_numba.network.keys import AllowList
+    from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
     _print(path, list(AllowList.load(path).keys) if path.exists() else [], as_json=as_json)
 
 
 def _path(listed: Path | None) -> Path:
-    from ertis_numba.network.keys import ALLOW_LIST, default_folder
+    from ertis_numba.network.allow_list import ALLOW_LIST
+    from ertis_numba.network.keys import default_folder
 
     return listed or default_folder() / ALLOW_LIST
 

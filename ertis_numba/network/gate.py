@@ -18,7 +18,9 @@ from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
-from ertis_numba.network.keys import AllowList, Permission, ServerKeys, require_own
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ServerKeys
+from ertis_numba.network.own_files import require_own
 from ertis_numba.network.sockets import DOMAIN, Strangers, was_chosen
 
 __all__ = ["EVERYBODY", "Gate"]

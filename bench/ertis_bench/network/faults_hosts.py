@@ -15,7 +15,8 @@ from ertis_bench.network.oracle import read_diaries, read_folder
 from ertis_bench.network.processes import ERTIS, Process, survivors, until
 from ertis_bench.network.sender import Job
 from ertis_bench.reliability import ONE_SENSOR
-from ertis_numba.network.keys import AllowList, KeyPair, Permission
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import KeyPair
 
 __all__ = ["captures", "hosts"]
 

@@ -19,7 +19,8 @@ from ertis_bench.network.zmtp import Peer
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.subscriber import Subscriber
 

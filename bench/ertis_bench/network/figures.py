@@ -17,7 +17,8 @@ from ertis_bench.network.receiver import Look, read_received
 from ertis_bench.network.sender import SETTINGS, Job
 from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
 from ertis_numba.errors import DataError
-from ertis_numba.network.keys import AllowList, ClientKeys, KeyPair, Permission
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.settings import Settings
 
 __all__ = ["PARTS", "processing", "run", "storage"]

@@ -9,8 +9,9 @@ from typing import Any, Final
 import zmq
 
 from ertis_numba.network import messages, sockets
+from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.gate import Gate
-from ertis_numba.network.keys import Permission, ServerKeys
+from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.messages import Message
 
 __all__ = ["Door"]

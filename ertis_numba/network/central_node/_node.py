@@ -13,6 +13,7 @@ import zmq
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_LISTEN
+from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._condition import Condition
 from ertis_numba.network.central_node._door import Door
@@ -23,7 +24,7 @@ from ertis_numba.network.central_node._reading import read, require_role
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._telling import Telling, text_of
 from ertis_numba.network.fields import State
-from ertis_numba.network.keys import Permission, ServerKeys
+from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,

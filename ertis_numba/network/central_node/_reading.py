@@ -6,8 +6,8 @@ import zmq
 
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
+from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.keys import Permission
 from ertis_numba.network.messages import AskStatus, Bye, Data, Gap, Hello, Message, Ping, Subscribe
 
 __all__ = ["read", "require_role"]

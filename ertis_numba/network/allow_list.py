@@ -1,0 +1,157 @@
+"""Who is let in, and as what."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self, TypeAlias, get_args
+
+import msgspec
+
+from ertis_numba import checks
+from ertis_numba.documents import Document, Table
+from ertis_numba.errors import ArgumentError
+from ertis_numba.network.keys import require_key, require_name
+from ertis_numba.network.own_files import locked, require_own, write
+
+__all__ = ["ALLOW_LIST", "ROLES", "AllowList", "Permission", "Role"]
+
+Role: TypeAlias = Literal["sensor", "application", "admin"]
+ROLES: Final[tuple[Role, ...]] = get_args(Role)
+ALLOW_LIST: Final = "allow.toml"
+"""Name of the list of permissions in a folder of keys."""
+
+
+class Permission(Table, frozen=True, kw_only=True):
+    """What the owner of a key may do.
+
+    Attributes
+    ----------
+    name : str
+    public : str
+        The key, Z85.
+    role : {"sensor", "application", "admin"}
+        A sensor sends measurements of its serials, an application receives products, an admin may do both.
+    serials : tuple of str
+        Of a sensor: the names of those that it may send for, each of them.
+    """
+
+    name: str
+    public: str
+    role: Role
+    serials: Annotated[tuple[str, ...], msgspec.Meta(max_length=1024)] = ()
+
+    def __post_init__(self) -> None:
+        require_name(self.name)
+        require_key(self.public)
+        checks.choice("role", self.role, ROLES)
+        if self.role == "sensor" and not self.serials:
+            raise ArgumentError(f"{self.name} is a sensor without serials; name those that it may send for (--serial)")
+        if self.role != "sensor" and self.serials:
+            raise ArgumentError(f"{self.name} has serials and is no sensor; give serials to sensors only")
+        for serial in self.serials:
+            checks.sensor_name(serial)
+
+    def may_send(self, sensor: str) -> bool:
+        """Whether it may send measurements of a sensor."""
+        return self.role == "admin" or (self.role == "sensor" and sensor in self.serials)
+
+    @property
+    def may_receive(self) -> bool:
+        """Whether it may receive products and status."""
+        return self.role in ("application", "admin")
+
+
+class AllowList(Document, frozen=True, kw_only=True):
+    """Who is let in, and as what.
+
+    Attributes
+    ----------
+    keys : tuple of Permission
+    """
+
+    keys: tuple[Permission, ...] = ()
+
+    def __post_init__(self) -> None:
+        for what in ("name", "public"):
+            seen: set[str] = set()
+            for permission in self.keys:
+                value = getattr(permission, what)
+                if value in seen:
+                    raise ArgumentError(f"{what} {value!r} is listed twice; list each key once, by a name of its own")
+                seen.add(value)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a list.
+
+        Raises
+        ------
+        SettingsError
+            It cannot be read or used, or others on this machine may change it.
+        """
+        with suppress(OSError):  # which is told of below
+            require_own(Path(path))
+        return super().load(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the list, as a whole or not at all; only its owner can change it.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such folder.
+        """
+        write(Path(path), self.to_toml(), mode=0o644, overwrite=True)
+
+    @classmethod
+    def change(cls, path: str | Path, how: Callable[["AllowList"], "AllowList"]) -> tuple["AllowList", "AllowList"]:
+        """Change a list, which is empty before it is made; two that do so at once lose nothing of each other's.
+
+        Returns
+        -------
+        tuple of AllowList
+            Before and after.
+
+        Raises
+        ------
+        SettingsError
+            As `load`.
+        NetworkError
+            Its folder cannot be written.
+        """
+        path = Path(path)
+        with locked(path.with_name(f".{path.name}.lock")):
+            before = cls.load(path) if path.exists() else cls()
+            after = how(before)
+            after.save(path)
+        return before, after
+
+    def allow(self, permission: Permission) -> "AllowList":
+        """Return the list with a key in it, instead of what that key had before.
+
+        Raises
+        ------
+        ArgumentError
+            Another key has this name.
+        """
+        others = tuple(each for each in self.keys if each.public != permission.public)
+        if any(each.name == permission.name for each in others):
+            raise ArgumentError(f"another key is listed as {permission.name!r}; remove it first, or give --name")
+        return AllowList(keys=(*others, permission))
+
+    def remove(self, who: str) -> "AllowList":
+        """Return the list without a key, given by its name or itself.
+
+        Raises
+        ------
+        ArgumentError
+            It is not in the list.
+        """
+        others = tuple(each for each in self.keys if who not in (each.name, each.public))
+        if len(others) == len(self.keys):
+            checks.choice("key", who, (each.name for each in self.keys))
+        return AllowList(keys=others)
+
+    def find(self, public: str) -> Permission | None:
+        """Return what a key may do; None if it is not in the list."""
+        return next((each for each in self.keys if each.public == public), None)
