@@ -9,13 +9,17 @@ from typing import Any, NoReturn
 
 import click
 
+from ertis_cli import _config
+
 __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
     "capture": ("ertis_cli.capture:capture", "Take measurements of sensors into a recording."),
     "compare": ("ertis_cli.compare:compare", "Say how far an energyscape file is from the truth."),
+    "completion": ("ertis_cli.completion:completion", "Print what makes a shell complete commands and options."),
     "devices": ("ertis_cli.devices:devices", "List the eRTIS devices that are plugged in or emulated."),
+    "doctor": ("ertis_cli.doctor:doctor", "Look whether this machine has what it takes, and say what to do."),
     "emulate": (
         "ertis_cli.emulate:emulate",
         "Be the sensors of a scene or of a recording, until interrupted.",
@@ -48,6 +52,7 @@ class _Commands(click.Group):
             return None
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
         command: click.Command = getattr(importlib.import_module(module), attribute)
+        _config.add_variables(command, (cmd_name,))
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
@@ -79,7 +84,7 @@ def _told(error: Exception) -> tuple[int, str]:
     """Return the exit code of an error and the line to tell it; raise again what is a mistake in the program."""
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "ertis"
-        return _USAGE, f"{error.format_message().rstrip('.')}; see '{path} --help'"
+        return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
     if isinstance(error, click.ClickException):
         return _FAILED, error.format_message()
     if isinstance(error, click.Abort):
@@ -113,11 +118,13 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 @click.option(
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the version."
 )
+@_config.config
 def cli() -> None:
     """Imaging sonar in air: from one-bit microphones to energyscapes.
 
     Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage,
-    130 interrupted.
+    130 interrupted. Options come from the command line, then from variables such as ERTIS_PROCESS_MAX_ERROR,
+    then from the file of --config.
     """
 
 

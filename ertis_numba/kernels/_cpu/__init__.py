@@ -19,7 +19,7 @@ from ertis_numba.kernels._cpu.dot16 import HAS_INT16_DOT, RANGES
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
-__all__ = ["KERNELS"]
+__all__ = ["KERNELS", "threading_layer"]
 
 if numba.config.DISABLE_JIT:
     raise DeviceError(
@@ -30,12 +30,17 @@ _MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
 _ONE_AT_A_TIME = threading.RLock()
 
 
+def threading_layer() -> str:
+    """Return what Numba shares work among threads with: "omp", "tbb" or "workqueue"; empty until a kernel has run."""
+    try:
+        return str(numba.threading_layer())
+    except ValueError:  # no parallel kernel has run yet, so no layer is chosen
+        return ""
+
+
 def _layer_is_reentrant() -> bool:
     """Whether two Python threads may run parallel kernels at a time; unknown counts as no."""
-    try:
-        return bool(numba.threading_layer() != "workqueue")
-    except ValueError:  # no parallel kernel has run yet, so no layer is chosen
-        return False
+    return threading_layer() not in {"", "workqueue"}
 
 
 @contextlib.contextmanager

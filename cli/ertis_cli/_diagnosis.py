@@ -1,0 +1,244 @@
+"""What `ertis doctor` looks at: each function yields what it finds, and what to do about it."""
+
+import importlib.util
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["CHECKS", "Finding", "State"]
+
+State = Literal["good", "note", "bad"]
+
+_LIBRARIES: Final = ("numpy", "scipy", "numba", "h5py", "pyserial", "pyzmq", "msgspec", "matplotlib")
+_EXTRAS: Final = {"cluster": "distributed", "metrics": "prometheus_client"}
+_SENSOR_MB_S: Final = 13.1
+"""Of a sensor with 20 measurements of 655,360 bytes per second."""
+
+_COMMIT_BYTES: Final = 5_000_000
+_COMMITS: Final = 20
+_ROOM_BYTES: Final = 10e9  # a sensor fills it in a quarter of an hour
+_RUNS: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that was looked at.
+
+    Attributes
+    ----------
+    what, text : str
+    state : {"good", "note", "bad"}
+        Bad is what keeps something from working.
+    remedy : str
+        What to do; empty where nothing need be done.
+    """
+
+    what: str
+    state: State
+    text: str
+    remedy: str = ""
+
+
+def _versions(_folder: Path) -> Iterator[Finding]:
+    try:
+        own = version("ertis-numba")
+    except PackageNotFoundError:
+        yield Finding("ertis", "bad", "runs, but is not installed", "install it by 'pip install ertis-numba'")
+    else:
+        yield Finding("ertis", "good", f"{own} on Python {platform.python_version()}, {platform.system()}")
+    missing = []
+    found = []
+    for name in _LIBRARIES:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            missing.append(name)
+    yield Finding("libraries", "good", ", ".join(found))
+    if missing:
+        yield Finding("libraries", "bad", f"{', '.join(missing)} missing", f"pip install {' '.join(missing)}")
+    for extra, module in _EXTRAS.items():
+        there = importlib.util.find_spec(module) is not None
+        yield Finding(
+            f"extra {extra}",
+            "good" if there else "note",
+            "installed" if there else "not installed",
+            "" if there else f"pip install 'ertis-numba[{extra}]', if you want it",
+        )
+
+
+def _processor(_folder: Path) -> Iterator[Finding]:
+    from ertis_numba import kernels
+    from ertis_numba.frames import Measurement
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = kernels.load("cpu").max_threads
+    few = threads < cores
+    yield Finding(
+        "cores",
+        "note" if few else "good",
+        f"{cores} usable, {threads} used",
+        "unset NUMBA_NUM_THREADS to use all" if few else "",
+    )
+    settings = Settings()
+    with Pipeline(settings, device="cpu") as pipeline:
+        silence = Measurement(_silence(settings.recording.n_samples), settings)
+        times_s = []
+        for _ in range(_RUNS):
+            begun_s = time.perf_counter()
+            pipeline.process(silence)
+            times_s.append(time.perf_counter() - begun_s)
+        n_directions = len(pipeline.grid)
+    yield Finding("processing", "good", f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms")
+    layer = _threading_layer()
+    slow = layer == "workqueue"
+    yield Finding(
+        "threads",
+        "note" if slow else "good",
+        f"Numba's {layer} layer" + (", in which several images at once take turns" if slow else ""),
+        "pip install tbb, or install OpenMP (libgomp1 on Debian, libomp on macOS)" if slow else "",
+    )
+
+
+def _silence(n_samples: int) -> "NDArray[np.uint32]":
+    """Return words of which every other bit is set."""
+    import numpy as np
+
+    return np.where(np.arange(n_samples) % 2, np.uint32(0xFFFFFFFF), np.uint32(0))
+
+
+def _threading_layer() -> str:
+    from ertis_numba.kernels import _cpu
+
+    return _cpu.threading_layer()
+
+
+def _gpu(_folder: Path) -> Iterator[Finding]:
+    from ertis_numba import kernels
+    from ertis_numba.errors import DeviceError
+
+    driver = Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists()
+    wanted = importlib.util.find_spec("cupy") is not None
+    if not driver and not wanted:
+        yield Finding("GPU", "note", "no NVIDIA driver", "none is needed; for one, install ertis-numba[cu12] or [cu13]")
+        return
+    try:
+        found = kernels.load("cuda")
+    except DeviceError as error:
+        text, _, remedy = str(error).partition("; ")
+        yield Finding("GPU", "bad" if driver else "note", text, remedy)
+        return
+    yield Finding("GPU", "good", f"{found.hardware or 'simulated'}; device 'auto' uses it")
+
+
+def _serial(_folder: Path) -> Iterator[Finding]:
+    from ertis_numba.devices.ports import find_ports
+
+    ports = [port for port in find_ports() if port.may_be_sonar]
+    if not ports:
+        yield Finding(
+            "sensors", "note", "none is plugged in", "plug one in, or try 'ertis emulate examples/platform.toml'"
+        )
+    for port in ports:
+        if os.access(port.path, os.R_OK | os.W_OK):
+            yield Finding("sensors", "good", f"{port} can be opened")
+        else:
+            yield Finding("sensors", "bad", f"{port} may not be opened by you", _permission(Path(port.path)))
+
+
+def _permission(path: Path) -> str:
+    """Return how to be allowed to use a port."""
+    if sys.platform == "win32":
+        return "end the program that uses it"
+    import grp
+
+    group = grp.getgrgid(path.stat().st_gid).gr_name
+    return f"run 'sudo usermod -aG {group} $USER' and log in again"
+
+
+def _disk(folder: Path) -> Iterator[Finding]:
+    import shutil
+
+    free = shutil.disk_usage(folder).free
+    scarce = free < _ROOM_BYTES
+    yield Finding(
+        "room",
+        "note" if scarce else "good",
+        f"{free / 1e9:.0f} GB free in {folder}, {free / (60e6 * _SENSOR_MB_S):.0f} min of a sensor at 20 Hz",
+        "give another folder with more" if scarce else "",
+    )
+    try:
+        times_s = _commits_s(folder)
+    except OSError as error:
+        yield Finding(
+            "disk", "bad", f"{folder} cannot be written ({error.strerror})", "give a folder that can (--folder)"
+        )
+        return
+    speed_mb_s = 1e-6 * _COMMIT_BYTES * len(times_s) / sum(times_s)
+    sensors = int(speed_mb_s / (2 * _SENSOR_MB_S))  # each byte is written to a journal, and sealed
+    yield Finding(
+        "disk",
+        "good" if sensors else "bad",
+        f"{speed_mb_s:.0f} MB/s durably, the slowest 5 MB in {1e3 * max(times_s):.0f} ms: {_so_many(sensors)} at 20 Hz",
+        "" if sensors else "record to another disk, or at a lower rate",
+    )
+
+
+def _so_many(sensors: int) -> str:
+    return {0: "less than a sensor", 1: "a sensor"}.get(sensors, f"{sensors} sensors")
+
+
+def _commits_s(folder: Path) -> Sequence[float]:
+    """Return how long the disk took to make each of some blocks durable."""
+    block, times_s = os.urandom(_COMMIT_BYTES), []
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for _ in range(_COMMITS):
+            begun_s = time.perf_counter()
+            file.write(block)
+            file.flush()
+            getattr(os, "fdatasync", os.fsync)(file.fileno())
+            times_s.append(time.perf_counter() - begun_s)
+    return times_s
+
+
+def _keys(_folder: Path) -> Iterator[Finding]:
+    from ertis_numba.errors import SettingsError
+    from ertis_numba.network.keys import KeyPair, default_folder
+
+    folder = default_folder()
+    found = sorted(folder.glob("*.secret.toml")) if folder.is_dir() else []
+    if not found:
+        yield Finding(
+            "keys", "note", f"none in {folder}", "make some by 'ertis keys new', if other machines are to connect"
+        )
+    for path in found:
+        try:
+            KeyPair.load(path)
+        except SettingsError as error:
+            text, _, remedy = str(error).partition("; ")
+            yield Finding("keys", "bad", text, remedy)
+        else:
+            yield Finding("keys", "good", f"{path} is yours alone")
+
+
+CHECKS: Final[dict[str, Callable[[Path], Iterator[Finding]]]] = {
+    "versions": _versions,
+    "processor": _processor,
+    "gpu": _gpu,
+    "sensors": _serial,
+    "disk": _disk,
+    "keys": _keys,
+}
+"""What is looked at, in this order; each is given the folder that recordings go to."""

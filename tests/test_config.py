@@ -1,0 +1,150 @@
+"""Options that are not given come from variables, then from a file, then from their defaults."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+REFLECTORS = ROOT / "data" / "synthetic" / "reflectors.h5"
+
+
+def ertis(*arguments, folder, **variables):
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("ERTIS_")}
+    return subprocess.run(
+        [sys.executable, "-m", "ertis_cli", *map(str, arguments)],
+        cwd=folder,
+        env=clean | {"PYTHONPATH": os.pathsep.join(str(ROOT / each) for each in (".", "cli", "bench"))} | variables,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """An energyscape file of few directions, in a folder with a configuration."""
+    folder = tmp_path_factory.mktemp("config")
+    (folder / "ertis.toml").write_text('[process]\ndirections = "2d:31"\nrange = "0.5:4"\nquiet = true\n')
+    done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "img.h5", "--json", folder=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder, json.loads(done.stdout)
+
+
+def test_a_file_gives_what_is_not_given(images):
+    assert images[1]["directions"] == 31
+
+
+def test_what_comes_first(images):
+    folder, _ = images
+    (folder / "peaks.toml").write_text("[peaks]\ntop = 1\n")
+
+    def number(*options, **variables):
+        done = ertis(*options, folder=folder, **variables)
+        assert done.returncode == 0, done.stderr
+        return len(json.loads(done.stdout)["peaks"])
+
+    plain = number("peaks", "img.h5", "--json")
+    assert plain > 3
+    assert number("--config", "peaks.toml", "peaks", "img.h5", "--json") == 1
+    assert number("peaks", "img.h5", "--json", ERTIS_CONFIG="peaks.toml") == 1
+    assert number("--config", "peaks.toml", "peaks", "img.h5", "--json", ERTIS_PEAKS_TOP="2") == 2
+    given = ("--config", "peaks.toml", "peaks", "img.h5", "--json", "--top", "3")
+    assert number(*given, ERTIS_PEAKS_TOP="2") == 3
+
+
+def test_some_variables_are_of_all_commands(images):
+    folder, _ = images
+    done = ertis("info", "img.h5", folder=folder, ERTIS_THREADS="x")
+    assert done.returncode == 0  # which has no such option
+    done = ertis("process", REFLECTORS, "-o", "b.h5", folder=folder, ERTIS_THREADS="x")
+    assert done.returncode == 2
+    assert "'x' is not a valid integer (from the variable ERTIS_THREADS); see 'ertis process --help'" in done.stderr
+    done = ertis("process", REFLECTORS, "-o", "b.h5", folder=folder, ERTIS_THREADS="1", ERTIS_PROCESS_THREADS="y")
+    assert "'y' is not a valid integer (from the variable ERTIS_PROCESS_THREADS)" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[proces]\n", "'proces' is no command; did you mean 'process'?"),
+        ("[process]\nmax_errors = 1\n", "process has no option 'max_errors'; did you mean 'max-error'?"),
+        ("[keys.new]\nfoo = 1\n", "keys new has no option 'foo'; there are "),
+        ("process = 3\n", "process is 3; give a table of options, as in [process]"),
+        ("[process]\nthreads = 'x'\n", "'x' is not a valid integer (from ertis.toml)"),
+        ("[process\n", "give a readable TOML file (--config)"),
+    ],
+    ids=["command", "option", "of a group", "no table", "value", "no TOML"],
+)
+def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, text, message):
+    (tmp_path / "ertis.toml").write_text(text)
+    done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "a.h5", folder=tmp_path)
+    assert done.returncode in {1, 2}
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == [tmp_path / "ertis.toml"]
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    done = ertis("--config", "none.toml", "info", REFLECTORS, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (
+        1,
+        "ertis: error: none.toml: No such file or directory; give a readable TOML file (--config)\n",
+    )
+
+
+def test_the_page_says_how(tmp_path):
+    """Its file and its commands, word by word."""
+    page = (ROOT / "docs" / "command-line.md").read_text("utf-8")
+    (tmp_path / "ertis.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    counts = []
+    for variables, line in re.findall(r"^\$ ((?:\w+=\S+ )?)ertis (--config.*)$", page, re.MULTILINE):
+        given = dict(each.split("=") for each in variables.split())
+        done = ertis(*line.split(), "--json", folder=tmp_path, **given)
+        assert done.returncode == 0, done.stderr
+        counts.append(json.loads(done.stdout)["directions"])
+    assert counts == [3000, 90]
+    assert "Numba's" in ertis("doctor", folder=tmp_path).stdout
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"), [("ertis proc", "process"), ("ertis process --max", "--max-error"), ("ertis keys n", "new")]
+)
+def test_a_shell_completes(tmp_path, line, wanted):
+    """In a real one."""
+    words = " ".join(f"'{word}'" for word in line.split())
+    command = tmp_path / "ertis"
+    command.write_text(f"#!/bin/sh\nexec '{sys.executable}' -m ertis_cli \"$@\"\n")
+    command.chmod(0o755)
+    script = (
+        'eval "$(ertis completion bash)"\n'
+        f"COMP_WORDS=({words}); COMP_CWORD={len(line.split()) - 1}\n"
+        "_ertis_completion ertis; printf '%s\\n' \"${COMPREPLY[@]}\""
+    )
+    variables = {
+        "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": os.pathsep.join(str(ROOT / each) for each in (".", "cli", "bench")),
+    }
+    done = subprocess.run(
+        ["bash", "-c", script],
+        cwd=tmp_path,
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert wanted in done.stdout.split(), done.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_for_each_shell(tmp_path, shell):
+    done = ertis("completion", shell, folder=tmp_path)
+    assert done.returncode == 0
+    assert "_ERTIS_COMPLETE" in done.stdout
