@@ -2,19 +2,16 @@
 
 import contextlib
 import importlib.metadata
-import os
 import re
 import shutil
-import signal
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
-from ertis_cli.main import COMMANDS, cli
+from ertis_cli.main import COMMANDS
 
 from ertis_numba.storage import open_recording
+from tests.pages import commands_in, in_background, run, run_here
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -46,42 +43,10 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def environment(place):
-    paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench"))
-    return os.environ | {"PYTHONPATH": paths, "MPLCONFIGDIR": str(place)}
-
-
-def run(place, *command):
-    return subprocess.run(command, cwd=place, env=environment(place), capture_output=True, text=True, check=True)
-
-
-@contextlib.contextmanager
-def in_background(place, command):
-    """Run a command that ends with ``&`` until the block ends; it has told its ports when the block begins."""
-    words = [sys.executable, "-m", "ertis_cli.main", *command.removesuffix("&").split()]
-    with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline().startswith("/dev/")
-        yield
-        process.send_signal(signal.SIGTERM)
-        process.communicate()
-
-
 def test_python_lines(place):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     run(place, sys.executable, "-W", "error", "-c", code)
     assert (place / "image.png").stat().st_size > 10_000
-
-
-def run_here(place, command):
-    """Run a command in this process, which takes less to start."""
-    with contextlib.chdir(place):
-        done = CliRunner().invoke(cli, command.split())
-    assert done.exit_code == 0, (command, done.stderr, done.exception)
-    return done.stdout
-
-
-def commands_in(page):
-    return re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
 
 
 def test_commands(place):
@@ -99,7 +64,11 @@ def test_commands(place):
             else:
                 run(place, sys.executable, "-m", "ertis_cli.main", name, *arguments)
             started.add(name)
-    assert started == {*COMMANDS} - {"bench", "keys", "listen", "record", "serve", "status"}  # test_network_page.py
+    elsewhere = {"keys", "listen", "record", "serve", "status"} | {
+        "completion",
+        "doctor",
+    }  # test_network_page, test_config
+    assert started == {*COMMANDS} - elsewhere - {"bench"}
     assert (place / "picture.png").stat().st_size > 10_000
     assert (place / "shelf.png").stat().st_size > 10_000
 

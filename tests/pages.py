@@ -1,0 +1,48 @@
+"""Running what pages say."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+__all__ = ["commands_in", "environment", "in_background", "run", "run_here"]
+
+ROOT = Path(__file__).parents[1]
+
+
+def environment(place):
+    paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench"))
+    return os.environ | {"PYTHONPATH": paths, "MPLCONFIGDIR": str(place)}
+
+
+def run(place, *command):
+    return subprocess.run(command, cwd=place, env=environment(place), capture_output=True, text=True, check=True)
+
+
+@contextlib.contextmanager
+def in_background(place, command):
+    """Run a command that ends with ``&`` until the block ends; it has told its ports when the block begins."""
+    words = [sys.executable, "-m", "ertis_cli.main", *command.removesuffix("&").split()]
+    with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith("/dev/")
+        yield
+        process.send_signal(signal.SIGTERM)
+        process.communicate()
+
+
+def run_here(place, command):
+    """Run a command in this process, which takes less to start."""
+    with contextlib.chdir(place):
+        done = CliRunner().invoke(cli, command.split())
+    assert done.exit_code == 0, (command, done.stderr, done.exception)
+    return done.stdout
+
+
+def commands_in(page):
+    return re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
