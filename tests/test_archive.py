@@ -21,10 +21,11 @@ from ertis_numba.network.central_node._items import (
     Stored,
     Twin,
 )
+from ertis_numba.storage import open_recording, sensor_names
 from tests.central import stored, wanted
 from tests.journals import EPOCH, TINY, create, entries
 
-SOURCE = Sensor.of("left", TINY)
+SOURCE, RIGHT = Sensor.of("left", TINY), Sensor.of("right", TINY)
 RUN = Run("left", EPOCH)
 WAIT_S = 20.0
 
@@ -318,6 +319,56 @@ def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
         assert opened.archive.settled(RUN) == 2
         opened.until(SealedOne)
     assert stored(left)[0] == wanted(given)
+
+
+def gaps_in(folder):
+    """What recordings say to be missing: first, last and reason."""
+    found = set()
+    for path in sorted(folder.glob("*.h5")):
+        for sensor in sensor_names(path):
+            with open_recording(path, sensor=sensor) as recording:
+                found |= {(sensor, gap.first, gap.last, gap.reason) for gap in recording.gaps}
+    return found
+
+
+@pytest.mark.parametrize("how", ["ends", "killed"])
+def test_a_gap_before_any_measurement_is_told_by_the_recording_of_those(tmp_path, how):
+    """Although the journal that had it was sealed to nothing, as nothing had been measured."""
+    with Opened(tmp_path, seal=how == "ends") as opened:
+        opened.give(gap_of(0, 4, "ring overflow"))
+        opened.until_stored(4)
+        if how == "killed":
+            for path in tmp_path.iterdir():
+                shutil.copy(path, tmp_path / f"{path.name}.left")
+    for path in tmp_path.glob("*.left"):  # as it was before the ledger said that the journal is complete
+        path.replace(path.with_suffix(""))
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, from_zero(2, 5)))
+        opened.until_stored(6)
+    assert not list(tmp_path.glob(f"*{SUFFIX}"))
+    assert gaps_in(tmp_path) == {("left", 0, 4, "ring overflow")}
+    with Opened(tmp_path, seal=True) as opened:  # and once told, not again
+        opened.give(*map(item_of, from_zero(1, 7)))
+        opened.until_stored(7)
+    recordings = sorted(tmp_path.glob("*.h5"))
+    assert len(recordings) == 2
+    with open_recording(recordings[-1], sensor="left") as recording:
+        assert not recording.gaps
+
+
+def test_a_gap_of_a_sensor_beside_another_is_told_later(tmp_path):
+    with Opened(tmp_path, seal=True) as opened:
+        right = Item(Run("right", EPOCH), 0, 4, Gap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b"")
+        opened.give(right, *map(item_of, from_zero(2)))
+        opened.until_stored(1)
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, from_zero(1, 2)))
+        opened.until_stored(2)
+    assert ("right", 0, 4, "ring overflow") not in gaps_in(tmp_path)
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(item_of(*from_zero(1, 5, sensor="right"), RIGHT))
+        opened.until(Stored)
+    assert ("right", 0, 4, "ring overflow") in gaps_in(tmp_path)
 
 
 def test_a_folder_without_a_ledger_is_read(tmp_path):

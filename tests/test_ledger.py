@@ -5,7 +5,7 @@ import json
 import pytest
 
 from ertis_numba.errors import DataError, InUseError
-from ertis_numba.journal import seal_apart
+from ertis_numba.journal import Gap, seal_apart
 from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.central_node._ledger import Ledger, Lock, look
 from tests.journals import EPOCH, create, entries
@@ -15,9 +15,19 @@ def test_what_is_saved_is_read(tmp_path):
     settled = {Run("left", 2**62): 7, Run("left", 3): -1, Run("right", 3): 2**62}
     ledger = Ledger(tmp_path)
     assert (ledger.is_new, ledger.settled, ledger.open, ledger.unsealed) == (True, {}, [], [])
-    ledger.save(settled, open_=["a"], unsealed=["b", "c"])
+    gaps = [Gap("left", 0, 2**62, "ring overflow", 2**63 - 1)]
+    ledger.save(settled, open_=["a"], unsealed=["b", "c"], gaps=gaps)
     read = Ledger(tmp_path)
     assert (read.is_new, read.settled, read.open, read.unsealed) == (False, settled, ["a"], ["b", "c"])
+    assert read.gaps == ledger.gaps == gaps
+
+
+def test_a_ledger_of_version_1_is_read(tmp_path):
+    (tmp_path / ".ertis-ledger").write_text(
+        '{"version": 1, "settled": {"left": {"3": 7}}, "open": ["a"], "unsealed": []}'
+    )
+    read = Ledger(tmp_path)
+    assert (read.settled, read.open, read.gaps) == ({Run("left", 3): 7}, ["a"], [])
 
 
 @pytest.mark.parametrize(
@@ -25,7 +35,7 @@ def test_what_is_saved_is_read(tmp_path):
     [
         ("{", "is damaged"),
         ('{"settled": 1}', "is damaged"),
-        ('{"version": 2, "news": 1}', "has version 2"),
+        ('{"version": 3, "news": 1}', "has version 3"),
         ("", "is damaged"),
     ],
 )

@@ -4,7 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +12,7 @@ import msgspec
 
 from ertis_numba.atomic import replacing
 from ertis_numba.errors import DataError, FormatVersionError, InUseError
+from ertis_numba.journal import Gap
 from ertis_numba.network.central_node._items import Run
 
 if sys.platform == "win32":
@@ -23,20 +24,22 @@ __all__ = ["Ledger", "Lock", "look"]
 
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
-_VERSION: Final = 1
+_VERSION: Final = 2  # 1 had no gaps
 
 
 class _Content(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """What is in the file, as JSON.
 
     ``settled`` holds the highest settled number by sensor and epoch (in decimal); ``open`` the journals that may hold
-    more; ``unsealed`` journals that are to become recordings.
+    more; ``unsealed`` journals that are to become recordings; ``gaps`` what is missing, and no recording tells yet:
+    sensor, epoch (in decimal), first, last, reason.
     """
 
     version: int = _VERSION
     settled: dict[str, dict[str, int]] = {}
     open: list[str] = []
     unsealed: list[str] = []
+    gaps: list[tuple[str, str, int, int, str]] = []
 
 
 class _Version(msgspec.Struct):
@@ -59,6 +62,8 @@ class Ledger:
     settled : dict of Run to int
     open, unsealed : list of str
         Names of journals that may hold more than is in ``settled``, and of those that are to be sealed.
+    gaps : list of Gap
+        What is missing, and no recording tells yet.
 
     Raises
     ------
@@ -74,12 +79,13 @@ class Ledger:
             Run(sensor, int(epoch)): last for sensor, runs in content.settled.items() for epoch, last in runs.items()
         }
         self.open, self.unsealed = content.open, content.unsealed
+        self.gaps = [Gap(sensor, first, last, why, int(epoch)) for sensor, epoch, first, last, why in content.gaps]
 
     def _read(self) -> _Content:
         try:
             text = self._path.read_bytes()
             version = msgspec.json.decode(text, type=_Version).version
-            if version != _VERSION:
+            if version not in range(1, _VERSION + 1):
                 raise FormatVersionError(
                     f"{self._path} has version {version}, this package reads {_VERSION}; update ertis-numba"
                 )
@@ -92,7 +98,9 @@ class Ledger:
             ) from error
         return content
 
-    def save(self, settled: Mapping[Run, int], *, open_: Iterable[str], unsealed: Iterable[str]) -> None:
+    def save(
+        self, settled: Mapping[Run, int], *, open_: Iterable[str], unsealed: Iterable[str], gaps: Sequence[Gap] = ()
+    ) -> None:
         """Replace what is in the file; when this returns, it is durable.
 
         Raises
@@ -103,10 +111,12 @@ class Ledger:
         runs: dict[str, dict[str, int]] = {}
         for run, last in settled.items():
             runs.setdefault(run.sensor, {})[str(run.epoch)] = last
-        content = _Content(settled=runs, open=list(open_), unsealed=list(unsealed))
+        told = [(gap.sensor, str(gap.epoch), gap.first, gap.last, gap.reason) for gap in gaps]
+        content = _Content(settled=runs, open=list(open_), unsealed=list(unsealed), gaps=told)
         with replacing(self._path, overwrite=True, token="new") as part:  # noqa: S106  who has the lock writes alone
             part.write_bytes(msgspec.json.encode(content))
         self.settled, self.open, self.unsealed = dict(settled), content.open, content.unsealed
+        self.gaps = list(gaps)
 
 
 class Lock:

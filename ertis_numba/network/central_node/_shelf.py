@@ -11,6 +11,7 @@ from ertis_numba.errors import ArgumentError, DataError, InUseError
 from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.network.central_node._items import Event, Forgotten, Item, Run, Stored, Twin
 from ertis_numba.network.central_node._ledger import Ledger, look
+from ertis_numba.network.central_node._untold import Untold
 from ertis_numba.network.central_node._volumes import Volume, journal_name, runs_of
 
 __all__ = ["Shelf"]
@@ -59,6 +60,7 @@ class Shelf:
         self._twins: Volume | None = None
         self._known_twins: dict[tuple[Run, int, int], None] = {}
         self._unsealed: set[str] = set(ledger.unsealed)
+        self._untold = Untold(ledger.gaps)
         self._doubtful: Path | None = None
         self._failures = 0
         self._is_saved = False  # whether the ledger has what journals hold that are to be handed on
@@ -84,6 +86,7 @@ class Shelf:
         if path.exists():
             with Journal.open(path) as journal:
                 self._settle(runs_of(journal))
+                self._untold.learn(journal)
         elif recording.exists():
             self._settle(look([recording]))
 
@@ -169,6 +172,11 @@ class Shelf:
                     self._send_back(item)
             return
         self._tell_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
+        if isinstance(batch[0].what, Entry):
+            untold = self._untold.of(item.run.sensor for item in batch)
+            if untold:
+                self.volume.journal.note_gaps(untold)
+                self._untold.told(untold)
 
     def _tell_stored(self, items: list[Item], took_ms: float) -> None:
         for item in items:
@@ -206,7 +214,8 @@ class Shelf:
 
     def _save(self, *, open_: list[str], also: Iterable[str] = ()) -> None:
         self._unsealed = {name for name in self._unsealed if (self._folder / name).exists()}
-        self._ledger.save(self.settled, open_=open_, unsealed=sorted({*self._unsealed, *also}))
+        unsealed = sorted({*self._unsealed, *also})
+        self._ledger.save(self.settled, open_=open_, unsealed=unsealed, gaps=self._untold.gaps)
         self._unsealed.update(also)
         self._is_saved = True
 
@@ -227,6 +236,8 @@ class Shelf:
     def _retire_volume(self, volume: Volume) -> None:
         self._retire(volume.path)
         with suppress(DataError):  # what was committed is there, whatever happens now
+            self._untold.learn(volume.journal)
+        with suppress(DataError):
             volume.close()
 
     def _retire(self, path: Path) -> None:
