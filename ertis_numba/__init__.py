@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ertis_numba.figures import plot
     from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
-    from ertis_numba.interop import open_raw
+    from ertis_numba.interop import export, open_raw, open_rtis_folder
     from ertis_numba.journal import Entry
     from ertis_numba.network.allow_list import AllowList, Permission
     from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
@@ -53,9 +53,11 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
     from ertis_numba.simulation.render import Simulator, render
     from ertis_numba.simulation.scene import Scene, load_scene
+    from ertis_numba.stages.cfar import cfar_peaks
     from ertis_numba.stages.compare import compare
     from ertis_numba.stages.detect import find_peaks
     from ertis_numba.stages.health import health
+    from ertis_numba.stages.points import PointExtractor
     from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 
     __version__: str
@@ -80,6 +82,7 @@ __all__ = [
     "Permission",
     "Pipeline",
     "PointCloud",
+    "PointExtractor",
     "Reflector",
     "RefusedError",
     "Scene",
@@ -94,7 +97,9 @@ __all__ = [
     "SonarGoneError",
     "Stamp",
     "Subscriber",
+    "cfar_peaks",
     "compare",
+    "export",
     "find_peaks",
     "health",
     "load_layout",
@@ -102,6 +107,7 @@ __all__ = [
     "open_energyscapes",
     "open_raw",
     "open_recording",
+    "open_rtis_folder",
     "plot",
     "render",
     "write_energyscapes",
@@ -129,7 +135,7 @@ _HOMES = {
     "figures": ("plot",),
     "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
-    "interop": ("open_raw",),
+    "interop": ("export", "open_raw", "open_rtis_folder"),
     "journal": ("Entry",),
     "network.allow_list": ("AllowList", "Permission"),
     "network.keys": ("ClientKeys", "KeyPair", "ServerKeys"),
@@ -139,9 +145,11 @@ _HOMES = {
     "settings": ("Settings",),
     "simulation.render": ("Simulator", "render"),
     "simulation.scene": ("Scene", "load_scene"),
+    "stages.cfar": ("cfar_peaks",),
     "stages.compare": ("compare",),
     "stages.detect": ("find_peaks",),
     "stages.health": ("health",),
+    "stages.points": ("PointExtractor",),
     "storage": ("open_energyscapes", "open_recording", "write_energyscapes", "write_recording"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

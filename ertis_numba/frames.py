@@ -96,7 +96,7 @@ class PointCloud:
     Attributes
     ----------
     position_m : (point, axis) float32
-        Sensor frame: x forward, y left, z up; the strongest point first.
+        Sensor frame: x forward, y left, z up, in metres and right-handed, as REP-103 has it; the strongest point first.
     energy : (point,) float32
         Envelope amplitude, as in `Energyscape`.
     settings : Settings
@@ -105,6 +105,9 @@ class PointCloud:
         Where the sensor is on its platform.
     rotation_xyzw : (x, y, z, w)
         The unit quaternion that turns the sensor frame into the platform's.
+    uncertainty_m : (point, 2) float32, optional
+        Standard deviations of the position along range and across it, as `PointExtractor` tells them; None where they
+        are not known, as of what came over the network, which does not carry them.
     """
 
     position_m: NDArray[np.float32]
@@ -113,6 +116,7 @@ class PointCloud:
     stamp: Stamp = Stamp()
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    uncertainty_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.energy)

@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
+from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import PointCloud
+from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import direction_grid, unit_vectors
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.simulation import Point, Scene, Sensor
+from ertis_numba.stages import planner
 from ertis_numba.stages.detect import _interpolate, find_peaks, neighbours_of
+from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.points import PointExtractor
+from tests.scenes import heard
 from tests.test_detect import image_of
 
 
@@ -55,6 +60,8 @@ def test_is_the_reference(directions, min_level_db):
     assert cloud.position_m.dtype == cloud.energy.dtype == np.float32
     assert cloud.settings is image.settings
     assert cloud.stamp is image.stamp
+    assert cloud.uncertainty_m.shape == (len(cloud), 2)
+    assert cloud.uncertainty_m.dtype == np.float32
 
 
 def test_of_much_noise_the_strongest_are_found():
@@ -108,6 +115,7 @@ def test_silence_and_short_images_have_no_points(n_ranges):
     extractor = PointExtractor(image.settings)
     cloud = extractor(short)
     assert cloud.position_m.shape == (0, 3)
+    assert cloud.uncertainty_m.shape == (0, 2)
     assert len(cloud) == 0
     ramp = np.broadcast_to(np.arange(1, n_ranges + 1, dtype=np.float32), (5, n_ranges)).copy()
     assert len(extractor(short.replace(energy=ramp))) == 0  # highest at an end, of which nothing is known
@@ -131,6 +139,7 @@ def test_platform_frame_turns_then_shifts():
         rotation_xyzw=(0.0, 0.0, half, half),  # a quarter turn to the left
     )
     np.testing.assert_allclose(cloud.on_platform_m(), [[10, 22, 30], [9, 20, 33]], atol=1e-5)
+    assert cloud.uncertainty_m is None  # as of what came over the network
     np.testing.assert_array_equal(cloud.replace(rotation_xyzw=(0, 0, 0, 1)).on_platform_m()[0], [12, 20, 30])
 
 
@@ -148,3 +157,81 @@ def test_refuses_an_image_of_another_grid():
     assert len(direction_grid(other.processing)) == 7
     with pytest.raises(ArgumentError, match="energy has shape"):
         PointExtractor(other)(noise("2d:9"))
+
+
+@pytest.mark.parametrize("directions", ["2d:61", "3d:500"])
+def test_uncertainty_is_the_spread_of_noisy_repetitions(directions):
+    """40 times the same echo with other noise, 30 dB below it: within a factor of 1.5, of which chance is 1.25."""
+    sensor = Sensor(
+        recording=Recording(n_samples=40_960),
+        processing=Processing(
+            directions=directions,
+            azimuth_limits_deg=(-10.0, 40.0),
+            elevation_limits_deg=(-20.0, 25.0),
+            range_m=(0.6, 1.1),
+        ),
+    )
+    scene = Scene(seed=1, sensors=(sensor,), points=(Point(azimuth_deg=14.3, elevation_deg=0.0, range_m=0.903),))
+    quiet = heard(scene, "spreading")
+    settings = planner.complete(sensor.settings(), kernels.load("cpu"), threads=2)
+    chain, extractor = FastChain(settings, kernels.load("cpu"), threads=2), PointExtractor(settings)
+    grid, rng = direction_grid(settings.processing), np.random.default_rng(2)
+    loudness = 8 * np.abs(quiet).max()
+    positions, predicted = [], []
+    for _ in range(40):
+        energy = chain.new_image()
+        chain.process_signals(quiet + loudness * rng.standard_normal(quiet.shape, dtype=np.float32), energy)
+        cloud = extractor(Energyscape(energy, grid.azimuth_rad, grid.elevation_rad, chain.range_m, settings))
+        positions.append(cloud.position_m[0].astype(float))
+        predicted.append(cloud.uncertainty_m[0])
+    positions, (along_m, across_m) = np.array(positions), np.mean(predicted, axis=0)
+    middle = positions.mean(axis=0)
+    assert middle == pytest.approx(position_m(14.3, 0.0, 0.903), abs=0.01)
+    forward = middle / np.linalg.norm(middle)
+    found_along_m = np.std(positions @ forward, ddof=1)
+    sideways = positions - np.outer(positions @ forward, forward)
+    found_across_m = np.sqrt(np.linalg.eigvalsh(np.cov(sideways.T))[-1])  # in the direction in which it is greatest
+    assert 1 / 1.5 < found_along_m / along_m < 1.5
+    assert 1 / 1.5 < found_across_m / across_m < 1.5
+    assert 2e-5 < along_m < 5e-4 < across_m < 1e-2
+
+
+def test_uncertainty_goes_with_range_level_and_noise():
+    image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
+    extractor = PointExtractor(image.settings, min_level_db=-8.0)
+    first, second, *_ = extractor(image).uncertainty_m
+    assert second[0] == pytest.approx(2 * first[0], rel=0.05)  # half the level
+    # It goes with the distance as well, and the aperture is foreshortened.
+    ratio = 2 * 1.2 * np.cos(np.radians(12.3)) / np.cos(np.radians(33.3))
+    assert second[1] == pytest.approx(ratio * first[1], rel=0.05)
+    louder = image.replace(energy=np.where(image.energy < 0.1, 2 * image.energy, image.energy))
+    assert np.median(image.energy) < 0.1
+    assert extractor(louder).uncertainty_m[0] == pytest.approx(2 * first, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("positions_m", "directions", "is_finite"),
+    [
+        (((0.0, 0.0, 0.0),), "2d:31", False),
+        (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.02, 0.0)), "2d:31", True),
+        (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.02, 0.0)), "3d:99", False),
+        (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.02)), "3d:99", True),
+    ],
+)
+def test_what_an_array_cannot_tell_is_infinite(positions_m, directions, is_finite):
+    image = noise(directions)
+    settings = image.settings.replace(array=Array(layout="few", positions_m=positions_m, word_bits=8))
+    cloud = PointExtractor(settings)(image.replace(settings=settings))
+    uncertainty_m = cloud.uncertainty_m[cloud.position_m[:, 0] > 0.1]  # from the side an array has no width
+    assert len(uncertainty_m) > 2
+    assert np.isfinite(uncertainty_m[:, 0]).all()
+    assert np.isfinite(uncertainty_m[:, 1]).all() == is_finite
+
+
+def test_known_positions_in_the_frame_of_rep_103():
+    """x is forward, y is left, z is up: azimuth turns to the left."""
+    reflectors = [(0.0, 0.0, 1.0, 1.0), (60.0, 0.0, 1.1, 1.0), (0.0, 45.0, 1.2, 1.0)]
+    image = image_of(reflectors, directions="3000", range_m=(0.9, 1.3))
+    found = PointExtractor(image.settings)(image).position_m
+    for wanted in ([1, 0, 0], [0.55, 0.953, 0], [0.849, 0, 0.849]):
+        assert np.min(np.linalg.norm(found - wanted, axis=1)) < 0.02

@@ -23,10 +23,12 @@ PAGES = (
     "docs/accuracy.md",
     "docs/beamformers.md",
     "docs/devices.md",
+    "docs/export.md",
     "docs/formats.md",
     "docs/gallery.md",
     "docs/health.md",
     "docs/network.md",
+    "docs/plots.md",
     "docs/reliability.md",
     "docs/simulation.md",
 )

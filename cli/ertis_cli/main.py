@@ -24,6 +24,7 @@ COMMANDS = {
         "ertis_cli.emulate:emulate",
         "Be the sensors of a scene or of a recording, until interrupted.",
     ),
+    "export": ("ertis_cli.export:export", "Write a file for other programs."),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
@@ -37,6 +38,7 @@ COMMANDS = {
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
     "status": ("ertis_cli.status:status", "Show how the central node at ADDRESS is, live on a terminal."),
     "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),
+    "view": ("ertis_cli.view:view", "Show what sensors see on a page in the browser."),
 }
 """Where each command is, and what its help says first: commands are imported when they are run."""
 

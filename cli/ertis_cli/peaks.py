@@ -1,21 +1,24 @@
 """``ertis peaks``: the reflectors in an energyscape file."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Peak
+    from ertis_numba.frames import Energyscape, Peak
     from ertis_numba.stages.compare import Comparison, Match
 
 __all__ = ["peaks"]
 
 _TOP = 10
+_MIN_LEVEL_DB = -30.0
+_FALSE_ALARM = 1e-4
 _HEAD = "  measurement  azimuth_deg  elevation_deg  range_m  level_db"
 _ROW = "  {measurement:11d}  {azimuth_deg:+11.2f}  {elevation_deg:+13.2f}  {range_m:7.3f}  {level_db:8.1f}"
 _ERROR_HEAD = "  angle_error_deg  range_error_m  level_error_db  reflector"
@@ -30,8 +33,26 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
 @click.option(
     "--top", type=int, metavar="N", help=f"At most so many per measurement; {_TOP} by default, all with --truth."
 )
-@options.min_level("Leave out what is weaker, below the strongest.")
+@click.option(
+    "--min-level",
+    type=float,
+    metavar="DB",
+    help=f"Leave out what is weaker, below the strongest; {_MIN_LEVEL_DB:g} by default, no limit with cfar.",
+)
 @options.measurement("One measurement only, counted from 0.")
+@click.option(
+    "--detector",
+    type=click.Choice(["peaks", "cfar"]),
+    default="peaks",
+    show_default=True,
+    help="What tells reflectors: their level, or that they stand out of the noise.",
+)
+@click.option(
+    "--false-alarm",
+    type=float,
+    metavar="P",
+    help=f"Probability per bin that noise stands out, with cfar; {_FALSE_ALARM:g} by default.",
+)
 @click.option("--truth", is_flag=True, help="Compare with the truth, which the file of a simulated recording holds.")
 @options.as_json
 def peaks(
@@ -39,14 +60,19 @@ def peaks(
     path: Path,
     sensor: str | None,
     top: int | None,
-    min_level: float,
+    min_level: float | None,
     measurement: int | None,
+    detector: Literal["peaks", "cfar"],
+    false_alarm: float | None,
     truth: bool,
     as_json: bool,
 ) -> None:
     """List the reflectors in an energyscape file.
 
     One entry per reflector, the strongest of each measurement first; levels are in dB below it.
+
+    With --detector cfar, reflectors are what stands out of the noise around them in range, however weak
+    they are, and is at most 10 dB below the strongest of its range (see 'docs/plots.md').
 
     With --truth, each true reflector comes first, with the errors of the peak that shows it or as
     missed; then come the peaks that no reflector explains, as false, and those of reflectors that do
@@ -55,13 +81,19 @@ def peaks(
     """
     if truth and top is not None:
         raise click.UsageError("--top leaves out what --truth asks for; give one of them", click.get_current_context())
+    if detector == "cfar" and truth:
+        raise click.UsageError("--truth compares with --detector peaks; leave out one", click.get_current_context())
+    if detector != "cfar" and false_alarm is not None:
+        raise click.UsageError("--false-alarm is for --detector cfar; give both", click.get_current_context())
     sensors = options.sensors_of(path, sensor)
     width = max(map(len, (*sensors, "sensor")))
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
             ({"sensor": name, "measurement": index}, comparison)
             for name in sensors
-            for index, comparison in options.comparisons(path, name, min_level, measurement=measurement)
+            for index, comparison in options.comparisons(
+                path, name, _MIN_LEVEL_DB if min_level is None else min_level, measurement=measurement
+            )
         ]
         report = {
             "peaks": [row for place, comparison in compared for row in _compared(place, comparison)],
@@ -72,9 +104,8 @@ def peaks(
         )
         head = _HEAD + _ERROR_HEAD
     else:
-        rows = [
-            row for name in sensors for row in _found(path, name, _TOP if top is None else top, min_level, measurement)
-        ]
+        find = _finder(detector, _TOP if top is None else top, min_level, false_alarm)
+        rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
         lines = (row["sensor"].ljust(width) + _ROW.format(**row) for row in rows)
         head = _HEAD
@@ -86,16 +117,31 @@ def peaks(
         click.echo(line)
 
 
-def _found(path: Path, sensor: str, top: int, min_level: float, measurement: int | None) -> list[dict[str, Any]]:
-    """Return a row for each peak of a sensor."""
+def _finder(
+    detector: str, top: int, min_level: float | None, false_alarm: float | None
+) -> "Callable[[Energyscape], list[Peak]]":
+    """Return what finds the reflectors of an image."""
+    if detector == "cfar":
+        from ertis_numba.stages.cfar import cfar_peaks
+
+        found = partial(cfar_peaks, top=top, false_alarm=_FALSE_ALARM if false_alarm is None else false_alarm)
+        return found if min_level is None else partial(found, min_level_db=min_level)
     from ertis_numba.stages.detect import find_peaks
+
+    return partial(find_peaks, top=top, min_level_db=_MIN_LEVEL_DB if min_level is None else min_level)
+
+
+def _found(
+    path: Path, sensor: str, find: "Callable[[Energyscape], list[Peak]]", measurement: int | None
+) -> list[dict[str, Any]]:
+    """Return a row for each peak of a sensor."""
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
         return [
             {"sensor": sensor, "measurement": index, **_rounded(peak)}
             for index in options.places(measurement, len(images))
-            for peak in find_peaks(images[index], top=top, min_level_db=min_level)
+            for peak in find(images[index])
         ]
 
 

@@ -1,75 +1,218 @@
-"""``ertis plot``: a picture of a measurement."""
+"""``ertis plot``: pictures of a measurement, of its image, or of an array."""
 
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Energyscape
+    from matplotlib.figure import Figure
+
+    from ertis_numba.frames import Energyscape, Measurement, Peak
+    from ertis_numba.settings import Settings
 
 __all__ = ["plot"]
 
 _FORMATS = (".pdf", ".png", ".svg")
+_KINDS = {
+    "image": "what suits the image: a sector, a map and a sector, or a curve",
+    "polar": "a sector in metres",
+    "projection": "azimuth and elevation, the strongest over range",
+    "slices": "cuts in metres, a level and an upright one",
+    "signals": "traces of the microphones and their spectrogram",
+    "matched-filter": "what the matched filter leaves of each microphone",
+    "array": "layout and beam pattern",
+}
+_OF_IMAGES = ("image", "polar", "projection", "slices")
+_OF_RECORDINGS = ("signals", "matched-filter")
+_ONLY = {
+    "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, "array"),
+    "measurement": (*_OF_IMAGES, *_OF_RECORDINGS),
+    "peaks": _OF_IMAGES,
+    "height": ("slices",),
+    "left": ("slices",),
+    "microphone": _OF_RECORDINGS,
+    "frequency": ("array",),
+    "steer": ("array",),
+}
+"""Options that not all kinds have, and which have them."""
 
 
-@click.command()
-@options.input_file("IMG.h5|REC.h5")
+@click.command(epilog="Kinds: " + "; ".join(f"{name}: {about}" for name, about in _KINDS.items()) + ".")
+@options.input_file("IMG.h5|REC.h5|SETTINGS.toml|LAYOUT")
+@click.option(
+    "--kind",
+    type=click.Choice(list(_KINDS)),
+    default="image",
+    show_default=True,
+    help="What to draw; array takes settings, a layout file or a layout's name as well.",
+)
 @options.output("Picture to write: .png, .svg or .pdf; a .png beside the file by default.")
 @options.sensor("Whose measurement; needed where the file holds several sensors.")
 @options.measurement("Which one, counted from 0; the first by default.")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
-@click.option("--theme", type=click.Choice(["dark", "light"]), default="dark", show_default=True, help="Colours.")
 @click.option(
-    "--peaks", "top", type=click.IntRange(min=0), default=5, show_default=True, metavar="N", help="Reflectors to mark."
+    "--theme",
+    type=click.Choice(["dark", "light", "paper"]),
+    default="dark",
+    show_default=True,
+    help="Colours; paper is white, with letters of the size of print.",
 )
+@click.option("--columns", type=click.IntRange(1, 2), help="Width of paper: 85 mm for 1, 170 mm for 2, the default.")
+@click.option("--font", type=click.Choice(["sans", "serif"]), default="sans", show_default=True, help="Letters.")
+@click.option("--peaks", "top", type=click.IntRange(min=0), metavar="N", help="Reflectors to mark; 5 by default.")
+@click.option("--height", type=float, metavar="M", help="Of the level plane of slices; 0 by default.")
+@click.option("--left", type=float, metavar="M", help="Where the upright plane of slices is; 0 by default.")
+@click.option("--microphone", type=int, metavar="BIT", help="One only, of signals and of the matched filter's output.")
+@click.option(
+    "--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Of beam patterns; up to five times."
+)
+@click.option("--steer", type=options.INTERVAL, metavar="AZ:EL", help="Where beam patterns look to, in degrees.")
 @options.force
 @options.quiet
 @options.as_json
 def plot(
     *,
     path: Path,
+    kind: str,
     target: Path | None,
     sensor: str | None,
     measurement: int | None,
     dynamic_range: float,
-    theme: Literal["dark", "light"],
-    top: int,
+    theme: Literal["dark", "light", "paper"],
+    columns: Literal[1, 2] | None,
+    font: Literal["sans", "serif"],
+    top: int | None,
+    height: float | None,
+    left: float | None,
+    microphone: int | None,
+    frequencies: tuple[float, ...],
+    steer: tuple[float, float] | None,
     force: bool,
     quiet: bool,
     as_json: bool,
 ) -> None:
     """Draw a measurement.
 
-    A recording is processed with its own settings first.
+    A recording is processed with its own settings first, where an image is drawn.
     """
     from ertis_numba import checks, figures
-    from ertis_numba.stages.detect import find_peaks
     from ertis_numba.storage import check_target, replacing
 
+    given: dict[str, object] = {
+        "sensor": sensor,
+        "measurement": measurement,
+        "peaks": top,
+        "height": height,
+        "left": left,
+    }
+    given |= {"microphone": microphone, "frequency": frequencies or None, "steer": steer}
+    for name, value in given.items():
+        if value is not None and kind not in _ONLY[name]:
+            raise click.UsageError(
+                f"--{name} is for --kind {', '.join(_ONLY[name])}; leave it out with {kind}",
+                click.get_current_context(),
+            )
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)
-    image = _image(path, sensor, measurement or 0, quiet=quiet)
-    found = find_peaks(image, top=top) if top else []
-    figure = figures.plot(image, dynamic_range_db=dynamic_range, theme=theme, peaks=found)
+    look: dict[str, Any] = {
+        "dynamic_range_db": dynamic_range,
+        "theme": theme,
+        "columns": columns,
+        "font": font,
+    }
+    report: dict[str, object] = {"output": str(target), "kind": kind}
+    if kind == "array":
+        azimuth_deg, elevation_deg = steer or (0.0, 0.0)
+        figure = figures.array(
+            _settings(path, sensor),
+            frequencies_hz=frequencies or None,
+            azimuth_deg=azimuth_deg,
+            elevation_deg=elevation_deg,
+            **look,
+        )
+        told = f"array of {path}"
+    else:
+        index = measurement or 0
+        if kind in _OF_RECORDINGS:
+            heard = _measurement(path, sensor, index)
+            draw = figures.signals if kind == "signals" else figures.matched_filter
+            figure, name = draw(heard, microphone=microphone, **look), heard.stamp.sensor
+        else:
+            image = _image(path, sensor, index, quiet=quiet)
+            places = {"height_m": height, "left_m": left}
+            look |= {name: value for name, value in places.items() if value is not None}
+            figure, name = _drawn(kind, image, _reflectors(image, 5 if top is None else top), look), image.stamp.sensor
+        report |= {"sensor": name, "measurement": index}
+        told = f"measurement {index} of {path}"
     with replacing(target, overwrite=force) as part:
-        figure.savefig(part, format=target.suffix.lower().lstrip("."))
-    options.say(f"{target}: measurement {measurement or 0} of {path}", quiet=quiet)
+        figures.save(figure, part, format=target.suffix.lower().lstrip("."))
+    options.say(f"{target}: {told}", quiet=quiet)
     if as_json:
-        options.print_json({"output": str(target), "sensor": image.stamp.sensor, "measurement": measurement or 0})
+        options.print_json(report)
+
+
+def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak]", look: dict[str, Any]) -> "Figure":
+    from ertis_numba import figures
+
+    draw = {"image": figures.plot, "polar": figures.polar, "projection": figures.projection, "slices": figures.slices}
+    return draw[kind](image, peaks=peaks, **look)
+
+
+def _reflectors(image: "Energyscape", top: int) -> "list[Peak]":
+    from ertis_numba.stages.detect import find_peaks
+
+    return find_peaks(image, top=top) if top else []
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":
-    from ertis_numba.storage import file_kind, open_energyscapes, open_recording
+    from ertis_numba.storage import file_kind, open_energyscapes
 
     if file_kind(path) == "energyscape":
         with open_energyscapes(path, sensor=sensor) as images:
             return images[options.place(index, len(images))]
-    with open_recording(path, sensor=sensor) as recording:
-        measurement = recording[options.place(index, len(recording))]
+    measurement = _measurement(path, sensor, index)
     return options.pipeline(measurement.settings, quiet=quiet).process(measurement)
+
+
+def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":
+    from ertis_numba.storage import open_recording
+
+    with open_recording(path, sensor=sensor) as recording:
+        return recording[options.place(index, len(recording))]
+
+
+def _settings(path: Path, sensor: str | None) -> "Settings":
+    """Return the settings of a file, or those of an array that a file or a name is the layout of."""
+    from ertis_numba.geometry import layout_names
+    from ertis_numba.settings import Array, Settings
+    from ertis_numba.storage import file_kind, open_energyscapes, open_recording
+
+    suffix = path.suffix.lower()
+    is_layout = str(path) in layout_names() or suffix == ".csv" or (suffix == ".toml" and _is_layout(path))
+    if sensor is not None and (is_layout or suffix == ".toml"):
+        raise click.UsageError(
+            "--sensor is for files that hold several; leave it out with settings or a layout",
+            click.get_current_context(),
+        )
+    if is_layout:
+        return Settings(array=Array(layout=str(path)))
+    if suffix == ".toml":
+        return Settings.load(path)
+    opened = open_energyscapes if file_kind(path) == "energyscape" else open_recording
+    with opened(path, sensor=sensor) as reader:
+        return reader.settings
+
+
+def _is_layout(path: Path) -> bool:
+    """Whether a TOML file holds positions at its top, rather than the sections of settings."""
+    try:
+        return bool(re.search(r"^\s*positions_mm\s*=", path.read_text("utf-8"), re.MULTILINE))
+    except (OSError, UnicodeDecodeError):
+        return False  # reading it as settings tells what is wrong

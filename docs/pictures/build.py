@@ -1,4 +1,4 @@
-"""Draw the pictures of the README and of the page on beamformers: `make pictures`.
+"""Draw the pictures of the README and of the pages on beamformers and on pictures: `make pictures`.
 
 The real measurement comes with the package rtisdev; its code is not imported.
 """
@@ -11,6 +11,7 @@ from typing import Any
 from PIL import Image
 
 import ertis_numba as ertis
+from ertis_numba import figures
 
 HERE = Path(__file__).parent
 BEAMFORMERS: dict[str, dict[str, Any]] = {
@@ -54,6 +55,33 @@ def beamformers() -> None:
     sheet.save(HERE / "beamformers.png", optimize=True)
 
 
+def kinds() -> None:
+    """Draw each kind of picture of the synthetic reflectors on a sheet."""
+    takes = {}
+    for name in ("reflectors", "reflectors_3d"):
+        with ertis.open_recording(HERE.parents[1] / "data" / "synthetic" / f"{name}.h5") as recording:
+            takes[name] = recording[0]
+    solid = ertis.Pipeline(takes["reflectors_3d"].settings).process(takes["reflectors_3d"])
+    drawn = (
+        figures.plot(solid, peaks=ertis.find_peaks(solid, top=5)),
+        figures.slices(solid, height_m=0.3, left_m=0.4),
+        figures.signals(takes["reflectors"]),
+        figures.array(takes["reflectors"].settings),
+    )
+    parts = []
+    for figure in drawn:
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=1000 / figure.get_figwidth())  # all 1000 wide
+        parts.append(Image.open(file).convert("RGB"))
+    heights = [max(part.height for part in parts[row : row + 2]) for row in (0, 2)]
+    sheet = Image.new("RGB", (2000, sum(heights)), parts[0].getpixel((0, 0)))
+    for number, part in enumerate(parts):
+        row, column = divmod(number, 2)
+        sheet.paste(part, (1000 * column, sum(heights[:row])))
+    sheet.quantize(256, dither=Image.Dither.NONE).save(HERE / "kinds.png", optimize=True)
+
+
 if __name__ == "__main__":
     real()
     beamformers()
+    kinds()

@@ -1,53 +1,46 @@
-"""Pictures of energyscapes, and of what exactness costs. The only door to Matplotlib.
+"""Pictures of energyscapes and of what they are made from, and of what exactness costs. The only door to Matplotlib.
 
-They are drawn without pyplot, so that no global state and no window system is needed. As x is
-forward, y left and z up in the sensor frame, positive azimuth is on the left: a sector is seen from
-above, a map out of the sensor's eyes.
+They are drawn without pyplot, so that no global state and no window system is needed. As x is forward, y left and z up
+in the sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array out of
+the sensor's eyes. Each function returns a figure; `save` writes it to a file.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from pathlib import Path
+from typing import IO, Unpack
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from ertis_numba import checks
-from ertis_numba.figures import _curve, _front, _sector, _sphere
-from ertis_numba.figures._canvas import THEMES, Canvas
+from ertis_numba.figures import _array, _curve, _echoes, _front, _sector, _signals, _slices, _sphere
+from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
-from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.figures._style import Look, style_of
+from ertis_numba.frames import Energyscape, Measurement, Peak
+from ertis_numba.settings import Settings
 
-__all__ = ["Rated", "front", "plot"]
-
-
-def front(points: Sequence[Rated], *, title: str, note: str = "", theme: Literal["dark", "light"] = "dark") -> Figure:
-    """Draw error and time of plans; those that no other one beats are joined by a line.
-
-    Parameters
-    ----------
-    points : sequence of Rated
-    title, note : str
-        Heading, and the line below it.
-    theme : {"dark", "light"}
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ArgumentError
-        The theme is unknown.
-    """
-    checks.choice("theme", theme, THEMES)
-    return _front.draw(Canvas(THEMES[theme], 1.0, ()), points, title=title, note=note)
+__all__ = [
+    "Look",
+    "Rated",
+    "array",
+    "front",
+    "matched_filter",
+    "plot",
+    "polar",
+    "projection",
+    "save",
+    "signals",
+    "slices",
+]
 
 
 def plot(
     image: Energyscape,
     *,
     dynamic_range_db: float = 40.0,
-    theme: Literal["dark", "light"] = "dark",
     peaks: Sequence[Peak] | None = None,
+    **look: Unpack[Look],
 ) -> Figure:
     """Draw an energyscape.
 
@@ -60,25 +53,203 @@ def plot(
     image : Energyscape
     dynamic_range_db : float
         What lies further below the strongest has the colour of silence.
-    theme : {"dark", "light"}
     peaks : sequence of Peak, optional
         Reflectors to mark and list, as `find_peaks` returns them.
+    **look
+        ``theme``, ``columns`` and ``font``: see `Look`.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Save it with ``savefig("image.png")``, or as .svg or .pdf.
+        Save it with `save`, or with ``savefig("image.png")``.
 
     Raises
     ------
     ArgumentError
         The dynamic range is not positive, or the theme is unknown.
     """
-    checks.positive("dynamic_range_db", dynamic_range_db)
-    checks.choice("theme", theme, THEMES)
-    canvas = Canvas(THEMES[theme], dynamic_range_db, tuple(peaks or ()))
+    canvas = _canvas(dynamic_range_db, look, peaks)
     if len(image.azimuth_rad) == 1:
         return _curve.draw(canvas, image)
     if image.is_planar:
         return _sector.draw(canvas, image)
     return _sphere.draw(canvas, image)
+
+
+def polar(
+    image: Energyscape,
+    *,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw an energyscape as a sector in metres, of several elevations the strongest; arguments are those of `plot`."""
+    return _sector.draw(_canvas(dynamic_range_db, look, peaks), image)
+
+
+def projection(
+    image: Energyscape,
+    *,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
+    return _sphere.draw_map(_canvas(dynamic_range_db, look, peaks), image)
+
+
+def slices(
+    image: Energyscape,
+    *,
+    height_m: float = 0.0,
+    left_m: float = 0.0,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw cuts through an energyscape in metres: a level plane, and an upright one that runs forward.
+
+    A planar image has the level one only. Reflectors are marked in the planes that they lie in.
+
+    Parameters
+    ----------
+    image : Energyscape
+    height_m : float
+        Of the level plane: its z.
+    left_m : float
+        Where the upright plane is: its y.
+    dynamic_range_db, peaks, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument cannot be used, or a plane lies outside of the image.
+    """
+    checks.finite("height_m", height_m)
+    checks.finite("left_m", left_m)
+    return _slices.draw(_canvas(dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m)
+
+
+def signals(
+    measurement: Measurement,
+    *,
+    microphone: int | None = None,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw the signals of the microphones over time, and their spectrogram.
+
+    Signals are what the low pass of the decimation leaves of the bits. The spectrogram is the mean over the
+    microphones.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    microphone : int, optional
+        Only this one, by its bit in the words.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument cannot be used, or there is no such microphone.
+    """
+    return _signals.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
+
+
+def matched_filter(
+    measurement: Measurement,
+    *,
+    microphone: int | None = None,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw what the matched filter leaves of each microphone, over range.
+
+    Arguments are those of `signals`.
+    """
+    return _echoes.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
+
+
+def array(
+    settings: Settings,
+    *,
+    frequencies_hz: Sequence[float] | None = None,
+    azimuth_deg: float = 0.0,
+    elevation_deg: float = 0.0,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[Look],
+) -> Figure:
+    """Draw the layout of an array, and its beam pattern along azimuth and along elevation.
+
+    Parameters
+    ----------
+    settings : Settings
+        Their array, call and air.
+    frequencies_hz : sequence of float, optional
+        1 to 5; the ends of the call's band and the mean power over it by default.
+    azimuth_deg, elevation_deg : float
+        Where the beam is steered to, -90 to 90.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument cannot be used.
+    """
+    checks.positive("dynamic_range_db", dynamic_range_db)
+    return _array.draw(
+        style_of(**look),
+        settings,
+        dynamic_range_db=dynamic_range_db,
+        frequencies_hz=frequencies_hz,
+        azimuth_deg=checks.between("azimuth_deg", azimuth_deg, -90.0, 90.0),
+        elevation_deg=checks.between("elevation_deg", elevation_deg, -90.0, 90.0),
+    )
+
+
+def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[Look]) -> Figure:
+    """Draw error and time of plans; those that no other one beats are joined by a line.
+
+    Parameters
+    ----------
+    points : sequence of Rated
+    title, note : str
+        Heading, and the line below it.
+    **look
+        As for `plot`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ArgumentError
+        The theme is unknown.
+    """
+    return _front.draw(style_of(**look), points, title=title, note=note)
+
+
+def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig
+    """Write a figure as .png, .svg or .pdf, the same bytes each time; letters of a .pdf can be searched and edited.
+
+    Parameters
+    ----------
+    figure : Figure
+    target : str, Path or binary file
+    format : {"png", "svg", "pdf"}, optional
+        By default what the name ends in.
+    """
+    kind = format or Path(str(target)).suffix.lower().lstrip(".")
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with mpl.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
+        figure.savefig(target, format=kind, metadata=undated)
+
+
+def _canvas(dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None = None) -> Canvas:
+    checks.positive("dynamic_range_db", dynamic_range_db)
+    return Canvas(style_of(**look), dynamic_range_db, tuple(peaks or ()))

@@ -1,61 +1,50 @@
-"""What all pictures share: colours, levels, the words around the image and the marks in it."""
+"""What pictures of levels share: the raster, its scale of colours, the reflectors in it and their list."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.figures._marks import name_points
+from ertis_numba.figures._page import Box, Page, lay_out
+from ertis_numba.figures._style import MONOSPACE, Style, text_width_pt
+from ertis_numba.figures._words import Heading, minus
+from ertis_numba.frames import Peak
 
-__all__ = ["THEMES", "Canvas", "Theme", "angle"]
+__all__ = ["Canvas"]
 
-_DPI = 160
-
-
-@dataclass(frozen=True, slots=True)
-class Theme:
-    """Colours of a picture; ``colours`` is a perceptually uniform map of Matplotlib."""
-
-    page: str
-    ink: str
-    faint: str
-    mark: str
-    colours: str
-
-
-THEMES = {
-    "dark": Theme(page="#0b0d12", ink="#e8eaf0", faint="#9aa0b0", mark="#7fe7ff", colours="inferno"),
-    "light": Theme(page="#ffffff", ink="#1b1e26", faint="#5f6573", mark="#00617d", colours="magma_r"),
-}
+_RING_PT = 5.0
+_ROW = 1.6  # height of a row of the list, by the size of its letters
+_MOST_ROWS = 24  # below a picture
 
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """The choices of one `plot`."""
+    """The choices of one picture."""
 
-    theme: Theme
+    style: Style
     dynamic_range_db: float
-    peaks: tuple[Peak, ...]
+    peaks: tuple[Peak, ...] = ()
 
-    def figure(self, image: Energyscape, *, width_in: float, height_in: float) -> Figure:
-        """Return an empty page under a heading that says what is seen, and with which settings."""
-        title = f"Energyscape · {image.stamp.sensor} · measurement {image.stamp.sequence}"
-        return self.page(title, _settings_line(image), width_in=width_in, height_in=height_in)
-
-    def page(self, title: str, line: str, *, width_in: float, height_in: float) -> Figure:
-        """Return an empty page under a heading of two lines."""
-        figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor=self.theme.page)
-        FigureCanvasAgg(figure)
-        left, top = 0.42 / width_in, 1 - 0.42 / height_in
-        figure.text(left, top, title, color=self.theme.ink, fontsize=14, fontweight="bold")
-        figure.text(left, top - 0.27 / height_in, line, color=self.theme.faint, fontsize=9)
-        return figure
+    def lay_out(
+        self, heading: Heading, panels: Sequence[Callable[[float], float]], *, width_pt: float
+    ) -> tuple[Page, list[Box], Box]:
+        """Return a page with boxes for pictures, and the box of their scale and of the list of reflectors."""
+        style, rows = self.style, self._rows()
+        widest_pt = max((text_width_pt(row, style.list_pt, MONOSPACE) for row in rows), default=0.0)
+        return lay_out(
+            style,
+            heading,
+            panels,
+            width_pt=width_pt,
+            side_pt=max(widest_pt + 3 * style.em_pt, 7 * style.em_pt),
+            below_pt=6 * style.em_pt + _ROW * style.list_pt * min(len(rows), _MOST_ROWS),
+        )
 
     def level_db(self, energy: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the level below the strongest, cut at the dynamic range; silence is all floor."""
@@ -71,95 +60,86 @@ class Canvas:
             level_db,
             extent=extent,
             origin="lower",
-            aspect="equal",
-            cmap=self.theme.colours,
+            aspect="auto",
+            cmap=self.style.colours,
             vmin=-self.dynamic_range_db,
             vmax=0.0,
             interpolation="antialiased",
         )
 
-    def style(self, axes: Axes) -> None:
-        """Give the axes the colours of the theme."""
-        axes.set_facecolor(self.theme.page)
-        axes.tick_params(colors=self.theme.faint, labelsize=8.5)
-        axes.xaxis.label.set_color(self.theme.faint)
-        axes.yaxis.label.set_color(self.theme.faint)
-        for spine in axes.spines.values():
-            spine.set_color(self.theme.faint)
+    def grid(self, axes: Axes) -> None:
+        """Draw thin lines from the ticks."""
+        axes.grid(color=self.style.faint, alpha=0.3, linewidth=0.6 * self.style.line_pt)
 
-    def mark_peaks(self, axes: Axes, place: Callable[[Peak], tuple[float, float]]) -> None:
-        """Ring and number the reflectors where ``place`` says, the strongest on top."""
-        for number, peak in reversed(list(enumerate(self.peaks, 1))):
-            self._mark(axes, number, *place(peak))
-
-    def _mark(self, axes: Axes, number: int, x: float, y: float) -> None:
-        outline = [withStroke(linewidth=2.5, foreground=self.theme.page)]
-        (ring,) = axes.plot(x, y, "o", markersize=10, markerfacecolor="none", markeredgecolor=self.theme.mark)
-        ring.set_path_effects([withStroke(linewidth=2.0, foreground=self.theme.page)])
-        axes.annotate(
-            str(number),
-            (x, y),
-            xytext=(8, 6),
-            textcoords="offset points",
-            color=self.theme.mark,
-            fontsize=9,
-            fontweight="bold",
-            path_effects=outline,
+    def mark_peaks(self, axes: Axes, place: Callable[[Peak], tuple[float, float] | None]) -> None:
+        """Ring the reflectors where ``place`` says and number them, the strongest on top; the limits must be final."""
+        style = self.style
+        frame = axes.bbox.padded(1.0)
+        places = [(number, at) for number, peak in enumerate(self.peaks, 1) if (at := place(peak)) is not None]
+        seen = [(number, at) for number, at in places if frame.contains(*axes.transData.transform(at))]
+        for _, (x, y) in reversed(seen):
+            (ring,) = axes.plot(
+                x,
+                y,
+                "o",
+                markersize=2 * _RING_PT * style.line_pt,
+                markerfacecolor="none",
+                markeredgecolor=style.mark,
+                markeredgewidth=style.line_pt,
+                scalex=False,
+                scaley=False,
+            )
+            ring.set_path_effects([withStroke(linewidth=2.0 * style.line_pt, foreground=style.page)])
+        name_points(
+            axes,
+            style,
+            [at for _, at in seen],
+            [str(number) for number, _ in seen],
+            ring_pt=_RING_PT * style.line_pt,
+            colour=style.mark,
+            bold=True,
         )
 
-    def side(self, figure: Figure, shown: AxesImage, *, left: float) -> None:
-        """Put the scale of colours beside the image, and the list of reflectors under it."""
-        bottom, height = (0.52, 0.28) if self.peaks else (0.16, 0.64)
-        axes = figure.add_axes((left, bottom, 0.16 / figure.get_figwidth(), height))
-        self.style(axes)
-        figure.colorbar(shown, cax=axes)
-        axes.set_ylabel("dB below the strongest", color=self.theme.faint, fontsize=8.5)
+    def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB below the strongest") -> Figure:
+        """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
+        style, em_pt = self.style, self.style.em_pt
+        upright = box.height > 8 * em_pt and box.width < 30 * em_pt
+        if upright:
+            height_pt = min(16 * em_pt, (0.45 if self.peaks else 0.8) * box.height)
+            bar = Box(box.left + em_pt, box.bottom + box.height - height_pt - 2 * em_pt, 1.3 * em_pt, height_pt)
+            axes = page.axes(bar, y=label)
+        else:
+            bar = Box(box.left + 0.1 * box.width, box.bottom + box.height - 2.2 * em_pt, 0.8 * box.width, em_pt)
+            axes = page.axes(bar, x=label)
+        names = axes.get_xlabel(), axes.get_ylabel()
+        page.figure.colorbar(shown, cax=axes, orientation="vertical" if upright else "horizontal")
+        axes.set_xlabel(names[0])
+        axes.set_ylabel(names[1])
+        for solid in axes.collections:
+            solid.set_rasterized(True)  # hundreds of colours are one picture in a file of vectors
+        top_pt = bar.bottom - (2.0 if upright else 3.6) * em_pt
+        fitting = int((top_pt - box.bottom) / (_ROW * style.list_pt))
+        rows = self._rows()
+        if len(rows) > fitting:
+            rows = [*rows[: max(fitting - 1, 0)], f"and {len(rows) - max(fitting - 1, 1)} more"]
+        if rows and fitting > 1:
+            page.text("\n".join(rows), box.left + (em_pt if upright else 0), top_pt, style.list_pt, font=MONOSPACE)
+        return page.figure
+
+    def _rows(self) -> list[str]:
+        """Return the list of reflectors, its heading first."""
         if not self.peaks:
-            return
+            return []
         spatial = any(abs(peak.elevation_deg) >= 0.05 for peak in self.peaks)
-        rows = [_row(number, peak, spatial=spatial) for number, peak in enumerate(self.peaks, 1)]
-        heading = f" #  azimuth {'elevat. ' if spatial else ''}  range    dB"
-        figure.text(
-            left,
-            bottom - 0.06,
-            "\n".join([heading, *rows][: _rows_that_fit(figure)]),
-            color=self.theme.ink,
-            fontsize=7.5,
-            family="monospace",
-            linespacing=1.6,
-            va="top",
-        )
+        rows = [f" #  azimuth {'elevat. ' if spatial else ''}  range    dB"]
+        for number, peak in enumerate(self.peaks, 1):
+            angles = (peak.azimuth_deg, peak.elevation_deg) if spatial else (peak.azimuth_deg,)
+            directions = " ".join(f"{_tenth(angle_deg):+6.1f}°" for angle_deg in angles)
+            row = f"{number:>2}  {directions}  {peak.range_m:5.2f} m {_tenth(peak.level_db):5.1f}"
+            rows.append(minus(row))
+        return rows
 
 
-def _settings_line(image: Energyscape) -> str:
-    settings = image.settings
-    directions = f"{len(image.azimuth_rad)} directions"
-    if len(image.azimuth_rad) == 1:
-        azimuth_deg, elevation_deg = np.degrees([image.azimuth_rad[0], image.elevation_rad[0]])
-        directions = f"azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
-    return "  ·  ".join(
-        (
-            settings.array.layout,
-            f"call {settings.call.low_frequency_hz / 1e3:g}–{settings.call.high_frequency_hz / 1e3:g} kHz",
-            directions,
-            f"{len(image.range_m)} ranges",
-            f"method {settings.processing.method}",
-            f"{settings.air.temperature_c:g} °C",
-        )
-    )
-
-
-def _rows_that_fit(figure: Figure) -> int:
-    return int(0.42 * figure.get_figheight() * 72 / (7.5 * 1.6))
-
-
-def _row(number: int, peak: Peak, *, spatial: bool) -> str:
-    elevation = f" {peak.elevation_deg:+6.1f}°" if spatial else ""
-    row = f"{number:>2}  {peak.azimuth_deg:+6.1f}°{elevation}  {peak.range_m:5.2f} m {peak.level_db:5.1f}"
-    return row.replace("-", "−")
-
-
-def angle(degrees: float) -> str:
-    """Return an angle with its sign, as the axes write it."""
-    text = f"{degrees:+.1f}".removesuffix(".0").replace("-", "−")
-    return "0°" if text in {"+0", "−0"} else f"{text}°"
+def _tenth(value: float) -> float:
+    """Return a number to one digit, 0 without a sign."""
+    return round(value, 1) + 0.0

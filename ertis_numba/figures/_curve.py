@@ -2,22 +2,36 @@
 
 from matplotlib.figure import Figure
 
+from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._page import lay_out
 from ertis_numba.frames import Energyscape
 
 __all__ = ["draw"]
 
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 5.0, 1.5, 4.0, 1.0
+_RATIO = 0.42
+
 
 def draw(canvas: Canvas, image: Energyscape) -> Figure:
     """Draw level over range."""
-    figure = canvas.figure(image, width_in=10.0, height_in=5.0)
-    axes = figure.add_axes((0.08, 0.12, 0.88, 0.70))
-    canvas.style(axes)
-    axes.plot(image.range_m, canvas.level_db(image.energy)[0], color=canvas.theme.mark, linewidth=1.0)
+    style, em_pt = canvas.style, canvas.style.em_pt
+    page, (box,), _ = lay_out(
+        style,
+        _words.of_image(image),
+        [lambda width_pt: _RATIO * width_pt + _FLOOR_EMS * em_pt],
+        width_pt=720.0,
+        side_pt=0.0,
+        below_pt=0.0,
+    )
+    inner = box.inset(
+        left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
+    )
+    axes = page.axes(inner, x="range (m)", y="dB below the strongest")
+    axes.plot(image.range_m, canvas.level_db(image.energy)[0], color=style.mark, linewidth=style.line_pt)
     axes.margins(x=0.01)
     axes.set_ylim(-canvas.dynamic_range_db, 3.0)
-    axes.set_xlabel("range (m)")
-    axes.set_ylabel("dB below the strongest")
-    axes.grid(color=canvas.theme.faint, alpha=0.3, linewidth=0.6)
+    canvas.grid(axes)
+    axes.set_xlim(axes.get_xlim())
     canvas.mark_peaks(axes, lambda peak: (peak.range_m, peak.level_db))
-    return figure
+    return page.figure

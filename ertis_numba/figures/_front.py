@@ -9,7 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._page import lay_out
+from ertis_numba.figures._style import Style
+from ertis_numba.figures._words import Heading
 
 __all__ = ["Rated", "draw"]
 
@@ -38,44 +40,60 @@ class Rated:
     label: str = ""
 
 
-def draw(canvas: Canvas, points: Sequence[Rated], *, title: str, note: str) -> Figure:
+def draw(style: Style, points: Sequence[Rated], *, title: str, note: str) -> Figure:
     """Draw the points of each series in its colour, and a line through its front."""
-    figure = canvas.page(title, note, width_in=10.0, height_in=5.6)
-    axes = figure.add_axes((0.08, 0.12, 0.88, 0.72))
-    canvas.style(axes)
+    em_pt = style.em_pt
+    page, (box,), _ = lay_out(
+        style,
+        Heading((title,), (note,) if note else ()),
+        [lambda width_pt: 0.48 * width_pt],
+        width_pt=720.0,
+        side_pt=0.0,
+        below_pt=0.0,
+    )
+    axes = page.axes(
+        box.inset(left=5.0 * em_pt, right=1.5 * em_pt, bottom=4.0 * em_pt, top=em_pt),
+        x="error of the image (dB)",
+        y="time of a measurement (ms)",
+    )
     axes.set_yscale("log")
-    shades = mpl.colormaps[canvas.theme.colours]
+    shades = mpl.colormaps[style.colours]
     for number, series in enumerate(dict.fromkeys(point.series for point in points)):
-        colour = shades(_COLOURS[(number - 1) % len(_COLOURS)]) if number else canvas.theme.mark
-        _draw_series(axes, [point for point in points if point.series == series], series, colour)
+        colour = shades(_COLOURS[(number - 1) % len(_COLOURS)]) if number else style.mark
+        _draw_series(axes, style, [point for point in points if point.series == series], series, colour)
     for point in points:
         if point.label:
             axes.annotate(
                 point.label,
                 (point.error_db, point.time_ms),
-                xytext=(0, -14),
+                xytext=(0, -1.5 * em_pt),
                 textcoords="offset points",
                 ha="center",
-                color=canvas.theme.ink,
-                fontsize=9,
-                path_effects=[withStroke(linewidth=2.5, foreground=canvas.theme.page)],
+                color=style.ink,
+                fontsize=style.label_pt,
+                family=style.font,
+                path_effects=[withStroke(linewidth=2.5 * style.line_pt, foreground=style.page)],
             )
     axes.margins(x=0.05, y=0.1)
-    axes.set_xlabel("error of the image (dB)")
-    axes.set_ylabel("time of a measurement (ms)")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(color=canvas.theme.faint, alpha=0.3, linewidth=0.6)
-    axes.legend(facecolor=canvas.theme.page, edgecolor=canvas.theme.faint, labelcolor=canvas.theme.ink, fontsize=9)
-    return figure
+    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
+    axes.legend(
+        facecolor=style.page,
+        edgecolor=style.faint,
+        labelcolor=style.ink,
+        prop={"family": style.font, "size": style.label_pt},
+    )
+    return page.figure
 
 
-def _draw_series(axes: Axes, points: Sequence[Rated], name: str, colour: object) -> None:
+def _draw_series(axes: Axes, style: Style, points: Sequence[Rated], name: str, colour: object) -> None:
     front = sorted((point for point in points if point.on_front), key=lambda point: point.error_db)
     others = [point for point in points if not point.on_front]
-    axes.plot(*_places(others), "o", color=colour, markersize=4, alpha=0.5, markeredgewidth=0)
-    axes.plot(*_places(front), "o-", color=colour, markersize=6, linewidth=1.4, label=name)
+    width = style.line_pt
+    axes.plot(*_places(others), "o", color=colour, markersize=4 * width, alpha=0.5, markeredgewidth=0)
+    axes.plot(*_places(front), "o-", color=colour, markersize=6 * width, linewidth=1.4 * width, label=name)
 
 
 def _places(points: Sequence[Rated]) -> tuple[list[float], list[float]]:

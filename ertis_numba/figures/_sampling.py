@@ -6,19 +6,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["PIXELS", "join_ranges", "maximum_over_elevation", "polar_raster", "spacing_rad", "sphere_raster"]
+__all__ = [
+    "PIXELS",
+    "flattened",
+    "join_ranges",
+    "maximum_over_elevation",
+    "polar_raster",
+    "spacing_rad",
+    "sphere_raster",
+    "volume_raster",
+]
 
 PIXELS = 1000  # along the longer side of a raster
 _RADIAL_BINS = 500
+_NEAREST = 4  # directions that a place between them is interpolated from
+_FAR = 1.3  # spacings from the nearest direction, beyond which nothing is known
 
 
 def join_ranges(
-    range_m: NDArray[np.float64], level_db: NDArray[np.float32]
+    range_m: NDArray[np.float64], level_db: NDArray[np.float32], *, most: int = _RADIAL_BINS
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Join ranges finer than a pixel to their maximum, so that no reflector falls between pixels."""
-    step = -(-len(range_m) // _RADIAL_BINS)
+    step = -(-len(range_m) // most)
     if step == 1:
         return range_m, level_db
     starts = np.arange(0, len(range_m), step)
@@ -89,14 +101,58 @@ def sphere_raster(
     azimuth_rad : (column,) float64
     elevation_rad : (row,) float64
     """
-    nearest = min(4, len(directions))
     looks = unit_vectors(*(grid.ravel() for grid in np.meshgrid(azimuth_rad, elevation_rad)))
+    place, weight = _around(directions, looks)
+    levels = np.sum(weight * level_db[place], axis=1)
+    return np.asarray(levels, dtype=np.float32).reshape(len(elevation_rad), len(azimuth_rad))
+
+
+def volume_raster(
+    level_db: NDArray[np.float32],
+    directions: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    *,
+    points_m: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return levels at points of space: (row, column), NaN outside of the image.
+
+    Linear between ranges, else as `sphere_raster`.
+
+    Parameters
+    ----------
+    level_db : (direction, range) float32
+    directions : (direction, axis) float64
+        Unit vectors.
+    range_m : (range,) float64
+        Rising.
+    points_m : (row, column, axis) float64
+    """
+    flat_m = points_m.reshape(-1, 3)
+    radius_m = np.linalg.norm(flat_m, axis=1)
+    column = np.interp(radius_m, range_m, np.arange(len(range_m)), left=np.nan, right=np.nan)
+    inside = np.isfinite(column) & (radius_m > 0)
+    raster = np.full(len(flat_m), np.nan, dtype=np.float32)
+    place, weight = _around(directions, flat_m[inside] / radius_m[inside, None])
+    first = np.floor(column[inside]).astype(np.intp)
+    after = np.minimum(first + 1, len(range_m) - 1)
+    share = (column[inside] - first).astype(np.float32)
+    near = np.sum(weight * level_db[place, first[:, None]], axis=1)
+    raster[inside] = near * (1 - share) + np.sum(weight * level_db[place, after[:, None]], axis=1) * share
+    return raster.reshape(points_m.shape[:2])
+
+
+def _around(
+    directions: NDArray[np.float64], looks: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the nearest directions of each look and their weights, NaN where none is near: both (look, nearest)."""
+    nearest = min(_NEAREST, len(directions))
     distance, place = cKDTree(directions).query(looks, k=nearest)
-    weight = 1 / np.maximum(distance.reshape(-1, nearest), 1e-6) ** 2
-    levels = np.sum(weight * level_db[place.reshape(-1, nearest)], axis=1) / weight.sum(axis=1)
-    far = distance.reshape(-1, nearest)[:, 0] > 1.3 * spacing_rad(directions)
-    raster = np.where(far, np.nan, levels).reshape(len(elevation_rad), len(azimuth_rad))
-    return np.asarray(raster, dtype=np.float32)
+    distance = distance.reshape(-1, nearest)
+    weight = 1 / np.maximum(distance, 1e-6) ** 2
+    weight /= weight.sum(axis=1, keepdims=True)
+    if len(directions) > 1:
+        weight[distance[:, 0] > _FAR * spacing_rad(directions)] = np.nan
+    return place.reshape(-1, nearest), weight.astype(np.float32)
 
 
 def spacing_rad(directions: NDArray[np.float64]) -> float:
@@ -122,3 +178,11 @@ def maximum_over_elevation(
     order = np.argsort(bins, kind="stable")
     filled, starts = np.unique(bins[order], return_index=True)
     return first + filled * spacing_rad, np.maximum.reduceat(level_db[order], starts, axis=0)
+
+
+def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return azimuths and their levels, (direction, range): the strongest where there are several elevations."""
+    if image.is_planar or len(image.azimuth_rad) == 1:
+        return image.azimuth_rad, level_db
+    spacing = spacing_rad(unit_vectors(image.azimuth_rad, image.elevation_rad))
+    return maximum_over_elevation(level_db, image.azimuth_rad, spacing_rad=spacing)

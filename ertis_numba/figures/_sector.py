@@ -1,6 +1,8 @@
 """The sector: azimuth and range as a plan in metres."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,36 +11,58 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from ertis_numba.figures._canvas import Canvas, angle
-from ertis_numba.figures._sampling import PIXELS, join_ranges, polar_raster
-from ertis_numba.frames import Energyscape
+from ertis_numba.figures import _words
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._sampling import PIXELS, flattened, join_ranges, polar_raster
+from ertis_numba.frames import Energyscape, Peak
 
-__all__ = ["draw", "draw_into"]
+__all__ = ["draw", "draw_into", "height_of"]
+
+_SIDE_EMS, _ROOF_EMS, _FLOOR_EMS = 3.6, 3.0, 2.0  # what names take around the sector
+_LEAST_RATIO, _MOST_RATIO = 0.3, 0.95  # of height to width
 
 
 def draw(canvas: Canvas, image: Energyscape) -> Figure:
-    """Draw a planar image."""
-    left, right, bottom, top = _extent(np.sort(image.azimuth_rad), image.range_m)
-    height_in = 1.7 + 6.2 * min(0.9, max(0.3, (top - bottom) / (right - left or 1.0)))
-    figure = canvas.figure(image, width_in=10.0, height_in=height_in)
-    axes = figure.add_axes((0.02, 0.02, 0.74, 1 - 0.85 / height_in))
-    shown = draw_into(canvas, axes, image.azimuth_rad, image.range_m, canvas.level_db(image.energy))
-    canvas.side(figure, shown, left=0.775)
-    return figure
+    """Draw an image; of several elevations the strongest."""
+    azimuth_rad, level_db = flattened(image, canvas.level_db(image.energy))
+    page, (box,), side = canvas.lay_out(
+        _words.of_image(image), [height_of(canvas, azimuth_rad, image.range_m)], width_pt=720.0
+    )
+    title = "" if image.is_planar else "strongest over elevation"
+    shown = draw_into(canvas, page, box, azimuth_rad, image.range_m, level_db, title=title)
+    return canvas.side(page, side, shown)
+
+
+def height_of(
+    canvas: Canvas, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]
+) -> Callable[[float], float]:
+    """Return the function from the width of a sector to its height, both with the names around it, in points."""
+    left, right, bottom, top = _extent(_ends(azimuth_rad), range_m)
+    ratio = min(_MOST_RATIO, max(_LEAST_RATIO, (top - bottom) / (right - left)))
+    em_pt = canvas.style.em_pt
+    return lambda width_pt: (width_pt - 2 * _SIDE_EMS * em_pt) * ratio + (_ROOF_EMS + _FLOOR_EMS) * em_pt
 
 
 def draw_into(
     canvas: Canvas,
-    axes: Axes,
+    page: Page,
+    box: Box,
     azimuth_rad: NDArray[np.float64],
     range_m: NDArray[np.float64],
     level_db: NDArray[np.float32],
+    *,
+    title: str = "",
 ) -> AxesImage:
     """Draw levels (direction, range) as a sector with rings, rays and the reflectors."""
     order = np.argsort(azimuth_rad, kind="stable")
     azimuth_rad, level_db = _fan(azimuth_rad[order], level_db[order])
     extent = _extent(azimuth_rad, range_m)
     left, right, bottom, top = extent
+    em_pt = canvas.style.em_pt
+    inner = box.inset(left=_SIDE_EMS * em_pt, right=_SIDE_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
+    axes = page.axes(inner.fitted((top - bottom) / (right - left)))
+    page.caption(box, title)
     step_m = max(right - left, top - bottom) / PIXELS
     rings_m, levels_db = join_ranges(range_m, level_db)
     raster = polar_raster(
@@ -49,25 +73,37 @@ def draw_into(
         ahead_m=_centres(bottom, top, step_m),
     )
     shown = canvas.show(axes, raster, extent=extent)
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    axes.set_axis_off()
     _rings(canvas, axes, azimuth_rad, range_m)
     _rays(canvas, axes, azimuth_rad, range_m)
-    axes.plot(0, 0, marker="^", markersize=8, color=canvas.theme.ink)
-    canvas.mark_peaks(axes, lambda peak: _place(math.radians(peak.azimuth_deg), peak.range_m))
-    margin_m = 0.08 * range_m[-1]
-    axes.set_xlim(left - margin_m, right + margin_m)
-    axes.set_ylim(bottom - margin_m, top + margin_m)
-    axes.set_axis_off()
+    triangle: dict[str, Any] = {"marker": "^", "markersize": 0.9 * em_pt, "color": canvas.style.ink}
+    axes.plot(0, 0, **triangle, clip_on=False, scalex=False, scaley=False)
+    canvas.mark_peaks(axes, _place_of)
     return shown
+
+
+def _place_of(peak: Peak) -> tuple[float, float]:
+    return _place(math.radians(peak.azimuth_deg), peak.range_m)
 
 
 def _fan(
     azimuth_rad: NDArray[np.float64], level_db: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return the directions and levels to draw: what is too thin to be seen becomes two degrees wide."""
-    middle, half_rad = (azimuth_rad[0] + azimuth_rad[-1]) / 2, math.radians(1.0)
-    if azimuth_rad[-1] - azimuth_rad[0] >= half_rad:
+    ends_rad = _ends(azimuth_rad)
+    if ends_rad[0] == azimuth_rad[0]:
         return azimuth_rad, level_db
-    return np.array([middle - half_rad, middle + half_rad]), np.repeat(level_db.max(axis=0)[None], 2, axis=0)
+    return ends_rad, np.repeat(level_db.max(axis=0)[None], 2, axis=0)
+
+
+def _ends(azimuth_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the first and the last azimuth to draw."""
+    first, last, half_rad = float(azimuth_rad.min()), float(azimuth_rad.max()), math.radians(1.0)
+    if last - first < half_rad:
+        return (first + last) / 2 + np.array([-half_rad, half_rad])
+    return np.array([first, last])
 
 
 def _place(azimuth_rad: float, range_m: float) -> tuple[float, float]:
@@ -88,52 +124,79 @@ def _extent(azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> t
 
 
 def _rings(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> None:
-    last_m = range_m[-1]
+    last_m, size_pt = range_m[-1], canvas.style.tick_pt
     arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
     # Names stand beside the eastern edge, or under it where that edge runs level.
     level = abs(math.degrees(azimuth_rad[0]) + 90) < 20
-    offset, align = ((0, -9), "center") if level else ((7, -4), "left")
+    offset, align = (
+        ((0.0, -1.4 * size_pt), "center")
+        if level
+        else ((0.8 * size_pt, math.copysign(0.8 * size_pt, -math.cos(azimuth_rad[0]))), "left")
+    )
     for ring_m in MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(0.0, last_m):
         if not 0 < ring_m <= last_m * (1 + 1e-9):
             continue
         if ring_m >= range_m[0]:
             _line(canvas, axes, -ring_m * np.sin(arc), ring_m * np.cos(arc))
-        _name(canvas, axes, azimuth_rad[0], ring_m, f"{ring_m:g} m", offset=offset, align=align)
+        _name(canvas, axes, _place(azimuth_rad[0], ring_m), f"{ring_m:g} m", offset=offset, align=(align, "center"))
 
 
 def _rays(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> None:
     first_deg, last_deg = np.degrees(azimuth_rad[[0, -1]])
     spacing_deg = 15 if last_deg - first_deg < 100 else 30
+    gap_pt = 0.5 * canvas.style.tick_pt
     for ray_deg in range(-180, 181, spacing_deg):
-        if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6:
+        if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6 or (ray_deg == -180 and last_deg > 180 - 1e-6):
             continue
         ray = math.radians(ray_deg)
-        ends_m = range_m[[0, -1]]
-        _line(canvas, axes, -ends_m * math.sin(ray), ends_m * math.cos(ray))
-        _name(canvas, axes, ray, range_m[-1] * 1.045, angle(ray_deg))
+        across, ahead = _place(ray, 1.0)
+        _line(canvas, axes, range_m[[0, -1]] * across, range_m[[0, -1]] * ahead)
+        _name(
+            canvas,
+            axes,
+            _place(ray, range_m[-1]),
+            _words.angle(ray_deg),
+            offset=(gap_pt * across, gap_pt * ahead),
+            align=(_side(across, "right", "left"), _side(ahead, "top", "bottom")),
+        )
+
+
+def _side(towards: float, before: str, behind: str) -> str:
+    """Return on which side of its point a name stands, so that it goes outwards."""
+    return "center" if abs(towards) < 0.3 else behind if towards > 0 else before
 
 
 def _line(canvas: Canvas, axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
-    axes.plot(x, y, color=canvas.theme.faint, alpha=0.35, linewidth=0.7)
+    axes.plot(
+        x,
+        y,
+        color=canvas.style.faint,
+        alpha=0.35,
+        linewidth=0.7 * canvas.style.line_pt,
+        clip_on=False,
+        scalex=False,
+        scaley=False,
+    )
 
 
 def _name(
     canvas: Canvas,
     axes: Axes,
-    azimuth_rad: float,
-    range_m: float,
+    place: tuple[float, float],
     text: str,
     *,
-    offset: tuple[int, int] = (0, 0),
-    align: str = "center",
+    offset: tuple[float, float],
+    align: tuple[str, str],
 ) -> None:
     axes.annotate(
         text,
-        _place(azimuth_rad, range_m),
+        place,
         xytext=offset,
         textcoords="offset points",
-        color=canvas.theme.faint,
-        fontsize=8.5,
-        ha=align,
-        va="center",
+        color=canvas.style.faint,
+        fontsize=canvas.style.tick_pt,
+        family=canvas.style.font,
+        ha=align[0],
+        va=align[1],
+        annotation_clip=False,
     )

@@ -5,55 +5,91 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from ertis_numba.figures import _sector
+from ertis_numba.figures import _sector, _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._sampling import PIXELS, maximum_over_elevation, spacing_rad, sphere_raster
+from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._sampling import PIXELS, flattened, spacing_rad, sphere_raster
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["draw"]
+__all__ = ["draw", "draw_map"]
+
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8  # what ticks and names take around the map
+_LEAST_RATIO, _MOST_RATIO = 0.1, 1.05
 
 
 def draw(canvas: Canvas, image: Energyscape) -> Figure:
     """Draw the maximum over range as a map, and the maximum over elevation as a sector."""
-    figure = canvas.figure(image, width_in=14.0, height_in=6.0)
     level_db = canvas.level_db(image.energy)
-    axes = figure.add_axes((0.055, 0.10, 0.34, 0.72))
-    _map(canvas, axes, image, level_db.max(axis=1))
-    axes.set_title("strongest over range", color=canvas.theme.faint, fontsize=9)
-    spacing = spacing_rad(unit_vectors(image.azimuth_rad, image.elevation_rad))
-    azimuth_rad, highest_db = maximum_over_elevation(level_db, image.azimuth_rad, spacing_rad=spacing)
-    axes = figure.add_axes((0.405, 0.02, 0.42, 0.80))
-    shown = _sector.draw_into(canvas, axes, azimuth_rad, image.range_m, highest_db)
-    axes.set_title("strongest over elevation", color=canvas.theme.faint, fontsize=9)
-    canvas.side(figure, shown, left=0.835)
-    return figure
-
-
-def _map(canvas: Canvas, axes: Axes, image: Energyscape, level_db: NDArray[np.float32]) -> None:
-    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    half_deg = math.degrees(spacing_rad(directions)) / 2
-    azimuth_deg, elevation_deg = np.degrees(image.azimuth_rad), np.degrees(image.elevation_rad)
-    west, east = azimuth_deg.max() + half_deg, azimuth_deg.min() - half_deg
-    low, high = max(-90.0, elevation_deg.min() - half_deg), min(90.0, elevation_deg.max() + half_deg)
-    step_deg = max(west - east, high - low) / (PIXELS / 2)
-    raster = sphere_raster(
-        level_db,
-        directions,
-        azimuth_rad=np.radians(np.arange(west - step_deg / 2, east, -step_deg)),
-        elevation_rad=np.radians(np.arange(low + step_deg / 2, high, step_deg)),
+    azimuth_rad, highest_db = flattened(image, level_db)
+    panels = [_Map(canvas, image).height, _sector.height_of(canvas, azimuth_rad, image.range_m)]
+    page, boxes, side = canvas.lay_out(_words.of_image(image), panels, width_pt=1008.0)
+    _Map(canvas, image).draw_into(page, boxes[0], level_db.max(axis=1))
+    shown = _sector.draw_into(
+        canvas, page, boxes[1], azimuth_rad, image.range_m, highest_db, title="strongest over elevation"
     )
-    canvas.style(axes)
-    canvas.show(axes, raster, extent=(west, east, low, high))
-    axes.set_xlabel("azimuth (°)")
-    axes.set_ylabel("elevation (°)")
-    spacing_deg = 15 if max(west - east, high - low) < 100 else 30
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MultipleLocator(spacing_deg))
-    axes.grid(color=canvas.theme.faint, alpha=0.3, linewidth=0.6)
-    canvas.mark_peaks(axes, lambda peak: (peak.azimuth_deg, peak.elevation_deg))
-    axes.set_xlim(west, east)
-    axes.set_ylim(low, high)
+    return canvas.side(page, side, shown)
+
+
+def draw_map(canvas: Canvas, image: Energyscape) -> Figure:
+    """Draw the maximum over range as a map."""
+    projection = _Map(canvas, image)
+    page, (box,), side = canvas.lay_out(_words.of_image(image), [projection.height], width_pt=720.0)
+    shown = projection.draw_into(page, box, canvas.level_db(image.energy).max(axis=1))
+    return canvas.side(page, side, shown)
+
+
+class _Map:
+    """Azimuth, to the left, and elevation of an image, in degrees."""
+
+    def __init__(self, canvas: Canvas, image: Energyscape) -> None:
+        self._canvas, self._em_pt = canvas, canvas.style.em_pt
+        self._directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+        half_deg = math.degrees(spacing_rad(self._directions)) / 2 if len(self._directions) > 1 else 1.0
+        azimuth_deg, elevation_deg = np.degrees(image.azimuth_rad), np.degrees(image.elevation_rad)
+        self._west, self._east = float(azimuth_deg.max() + half_deg), float(azimuth_deg.min() - half_deg)
+        self._low = max(-90.0, float(elevation_deg.min() - half_deg))
+        self._high = min(90.0, float(elevation_deg.max() + half_deg))
+        ratio = (self._high - self._low) / (self._west - self._east)
+        self._ratio = min(_MOST_RATIO, max(_LEAST_RATIO, ratio))
+
+    def height(self, width_pt: float) -> float:
+        """Return the height that suits a width, both with what is around the map, in points."""
+        across_pt = width_pt - (_LEFT_EMS + _RIGHT_EMS) * self._em_pt
+        return across_pt * self._ratio + (_FLOOR_EMS + _ROOF_EMS) * self._em_pt
+
+    def draw_into(self, page: Page, box: Box, level_db: NDArray[np.float32]) -> AxesImage:
+        """Draw the level of each direction."""
+        em_pt, canvas = self._em_pt, self._canvas
+        inner = box.inset(
+            left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
+        )
+        page.caption(Box(inner.left, box.bottom, inner.width, box.height), "strongest over range")
+        axes = page.axes(inner.fitted(self._ratio), x="azimuth (°)", y="elevation (°)")
+        west, east, low, high = self._west, self._east, self._low, self._high
+        step_deg = max(west - east, high - low) / (PIXELS / 2)
+        raster = sphere_raster(
+            level_db,
+            self._directions,
+            azimuth_rad=np.radians(np.arange(west - step_deg / 2, east, -step_deg)),
+            elevation_rad=np.radians(np.arange(low + step_deg / 2, high, step_deg)),
+        )
+        shown = canvas.show(axes, raster, extent=(west, east, low, high))
+        axes.set_xlim(west, east)
+        axes.set_ylim(low, high)
+        self._ticks(axes, inner.width)
+        canvas.grid(axes)
+        canvas.mark_peaks(axes, lambda peak: (peak.azimuth_deg, peak.elevation_deg))
+        return shown
+
+    def _ticks(self, axes: Axes, width_pt: float) -> None:
+        spans = self._west - self._east, self._high - self._low
+        spacing_deg = 15.0 if max(spans) < 100 else 30.0
+        while spans[0] / spacing_deg * 3.5 * self._em_pt > width_pt:
+            spacing_deg *= 2
+        for axis, span in ((axes.xaxis, spans[0]), (axes.yaxis, spans[1])):
+            axis.set_major_locator(MultipleLocator(spacing_deg if span > spacing_deg else max(1.0, round(span / 2))))

@@ -1,5 +1,7 @@
 """Foreign formats."""
 
+from ertis_numba.interop._export import FORMATS, TOPICS, export, files_of, format_of
 from ertis_numba.interop.rtis import RawReader, open_raw
+from ertis_numba.interop.rtis_folder import open_rtis_folder
 
-__all__ = ["RawReader", "open_raw"]
+__all__ = ["FORMATS", "TOPICS", "RawReader", "export", "files_of", "format_of", "open_raw", "open_rtis_folder"]

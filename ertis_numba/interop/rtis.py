@@ -16,7 +16,7 @@ __all__ = ["RawReader", "open_raw"]
 class RawReader:
     """The measurements of raw files, one after the other.
 
-    Time and SYNC count are not in such files: they are 0 and the place in the order of the files.
+    Time and SYNC count are not in such files: they are 0 and the number of the measurement.
 
     Parameters
     ----------
@@ -25,9 +25,18 @@ class RawReader:
     settings : Settings
         What the files do not say: array, call and length of a measurement.
     sensor : str
+    first : sequence of int, optional
+        Sequence number of the first measurement of each file, rising; by default they are counted from 0.
+
+    Raises
+    ------
+    DataError
+        A file is missing, empty, holds no whole measurements, or more than there are numbers for.
     """
 
-    def __init__(self, paths: Sequence[Path], settings: Settings, *, sensor: str = "sensor") -> None:
+    def __init__(
+        self, paths: Sequence[Path], settings: Settings, *, sensor: str = "sensor", first: Sequence[int] | None = None
+    ) -> None:
         layout = microphones(settings.array)
         self.settings = settings
         self._sensor = sensor
@@ -35,25 +44,32 @@ class RawReader:
         n_samples = settings.recording.n_samples
         self._shape = (n_samples,) if layout.n_words == 1 else (n_samples, layout.n_words)
         self._n_bytes = n_samples * layout.n_words * self._dtype.itemsize
-        self._files = [(path, self._count(path)) for path in paths]
-        if not self._files:
+        counts = [self._count(path) for path in paths]
+        if not counts:
             raise ArgumentError("no raw file is given; give at least one")
+        ends = np.cumsum(counts).tolist()
+        starts = [0, *ends[:-1]] if first is None else list(first)
+        for path, count, start, following in zip(paths, counts, starts, starts[1:], strict=False):
+            if start + count > following:
+                raise DataError(
+                    f"{path} holds {count} measurements, and the next file is number {following}; give the files "
+                    "themselves in their order"
+                )
+        self._files = list(zip(paths, counts, starts, strict=True))
 
     def __len__(self) -> int:
-        return sum(count for _, count in self._files)
+        return sum(count for _, count, _ in self._files)
 
     def __iter__(self) -> Iterator[Measurement]:
-        sequence = 0
-        for path, count in self._files:
+        for path, count, start in self._files:
             with path.open("rb") as file:
-                for _ in range(count):
+                for sequence in range(start, start + count):
                     block = file.read(self._n_bytes)
                     if len(block) != self._n_bytes:
                         raise DataError(f"{path} became shorter while it was read; copy it again")
                     words = np.frombuffer(block, self._dtype).reshape(self._shape)
                     stamp = Stamp(sensor=self._sensor, sequence=sequence, sync_count=sequence)
                     yield Measurement(words, self.settings, stamp)
-                    sequence += 1
 
     def _count(self, path: Path) -> int:
         """Return how many measurements a file holds; refuse one that does not hold whole ones."""

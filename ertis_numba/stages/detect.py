@@ -18,12 +18,18 @@ __all__ = ["ONE_SIDED", "PULSE_M", "find_peaks", "neighbours_of"]
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
 PULSE_M = 0.04
-"""Length of a compressed pulse down to -40 dB."""
+"""How far off a compressed pulse of 25 kHz bandwidth is 26 dB down, and 40 dB at 2.5 times as far."""
 ONE_SIDED = 0.25
 """Mean offset of neighbours, by their reach, that tells the edge of a grid."""
 
 
-def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float = -30.0) -> list[Peak]:
+def find_peaks(
+    image: Energyscape,
+    *,
+    top: int | None = 10,
+    min_level_db: float = -30.0,
+    where: NDArray[np.bool_] | None = None,
+) -> list[Peak]:
     """Return the reflectors of an image, strongest first.
 
     A reflector is a local maximum over directions and ranges that rises above what the side lobes of
@@ -38,18 +44,22 @@ def find_peaks(image: Energyscape, *, top: int | None = 10, min_level_db: float 
         At most so many; None for all.
     min_level_db : float
         Level below the strongest reflector at which to stop.
+    where : (direction, range) bool, optional
+        Bins that may be the maximum of a reflector; all by default.
 
     Raises
     ------
     ArgumentError
-        ``top`` is below 1, or ``min_level_db`` is above 0.
+        ``top`` is below 1, ``min_level_db`` is above 0, or ``where`` has another shape than the image.
     """
     top = image.energy.size if top is None else checks.whole("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
     floor = float(np.max(image.energy, initial=0.0)) * 10 ** (min_level_db / 20)
-    places = _local_maxima(image.energy, neighbours, floor)
+    if where is not None:
+        checks.shape("where", where.shape, image.energy.shape)
+    places = _local_maxima(image.energy, neighbours, floor, where)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
     spread = _PointSpread(image.settings)
     found: list[tuple[NDArray[np.float64], float, float]] = []
@@ -98,7 +108,9 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)
 
 
-def _local_maxima(energy: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float) -> NDArray[np.int64]:
+def _local_maxima(
+    energy: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float, where: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
     """Return (peak, [direction, range]) of what is above ``floor`` and not below any neighbour.
 
     The first and the last range are no maxima: what rises towards them lies outside of the image.
@@ -107,6 +119,8 @@ def _local_maxima(energy: NDArray[np.float32], neighbours: NDArray[np.int64], fl
     start = inner.start or 0
     here = energy[:, inner]
     is_peak = (here >= floor) & (here > 0)
+    if where is not None:
+        is_peak &= where[:, inner]
     if start:
         is_peak &= (here >= energy[:, :-2]) & (here > energy[:, 2:])
     # Only what is left is compared over directions; that is few.

@@ -1,5 +1,6 @@
 """From energyscapes to point clouds, fast enough to do so with every image."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,10 +8,12 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.stages.detect import ONE_SIDED, PULSE_M, neighbours_of
+from ertis_numba.waveform import matched_spectrum
 
 __all__ = ["PointExtractor"]
 
@@ -22,7 +25,10 @@ Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that dif
 _BINS_OF_POINT = 64
 """Of noise alone, so many bins are looked at for each point that is wanted, and not a third of the image."""
 _THINNED = 16  # ranges of which one is looked at to tell how strong those are
+_WAVES = 64  # of the call's band, which its widths are told from
+_SAMPLE = 16_384  # bins that tell the noise, to a hundredth
 _LINE = 0.2  # of the widths of a direction's neighbours, below which they lie in a line
+_FLAT = 1e-12  # of the variance of an array, below which it has none
 
 
 class PointExtractor:
@@ -32,6 +38,20 @@ class PointExtractor:
     reflector of about the same range can be. Position and energy are interpolated by parabolas through the logarithm
     of the energy, as `ertis_numba.find_peaks` does. That is slower and predicts side lobes from the array: it shows
     weak reflectors beside strong ones of the same range, which are left out here.
+
+    Each point has the standard deviations that noise alone gives to its position, along range and across: the
+    Cramér-Rao bounds of a single echo in white noise
+
+    ``σ_range = c / (4π β √(2ρ))`` and ``σ_across = r / (k √(λ 2ρ))``,
+
+    ρ being the power of the point over the mean power of the noise; β the root-mean-square width of the call's spectrum
+    about its centre (P. M. Woodward, Probability and Information Theory, 1953, for the range ``cτ / 2``); k the
+    root mean square of its wave numbers; and λ the variance of the microphones' positions along the direction, across
+    the line of sight, in which it is least (H. L. Van Trees, Optimum Array Processing, 2002, section 8.4). An image
+    of one elevation has the azimuth to go across only. The noise is told from the median of the image, which of a
+    Rayleigh variable is √ln 2 of the root mean square; where echoes fill an image it counts them as noise. Infinite
+    is what the array cannot tell. Errors of layout, temperature and near-field curvature come on top, and so does what
+    echoes at the same place do to each other.
 
     Parameters
     ----------
@@ -59,6 +79,7 @@ class PointExtractor:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
         self._fits = _Fits.of(self._directions, self._neighbours)
+        self._spread = _Spread.of(settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0))
 
     def __call__(self, image: Energyscape) -> PointCloud:
         """Return the points of an image.
@@ -73,7 +94,10 @@ class PointExtractor:
         directions, ranges = self._maxima(energy, image.range_m)
         position_m, levels = self._interpolated(image, directions, ranges)
         order = np.argsort(-levels, kind="stable")
-        return PointCloud(position_m[order], levels[order], image.settings, image.stamp)
+        uncertainty_m = self._spread(image, position_m, levels)
+        return PointCloud(
+            position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
+        )
 
     def _maxima(
         self, energy: NDArray[np.float32], range_m: NDArray[np.float64]
@@ -204,3 +228,71 @@ class _Fits:
         x, y = np.where(is_near, x, 0.0), np.where(is_near, y, 0.0)
         offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
         return offset, 0.5 * (slope_x * x + slope_y * y)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spread:
+    """What noise does to positions: see `PointExtractor`.
+
+    Attributes
+    ----------
+    width_hz : float
+        Of the call's spectrum, root mean square about its centre.
+    frequency_hz : float
+        Root mean square.
+    covariance_m2 : (axis, axis) float64
+        Of the microphones' positions.
+    is_planar : bool
+        Whether all directions have one elevation.
+    """
+
+    width_hz: float
+    frequency_hz: float
+    covariance_m2: NDArray[np.float64]
+    is_planar: bool
+
+    @classmethod
+    def of(cls, settings: Settings, *, is_planar: bool) -> "_Spread":
+        """Return that of an array and its call."""
+        frequency_hz, power = matched_spectrum(settings.call, n_waves=_WAVES)
+        mean_square = float(power @ frequency_hz**2)
+        positions_m = microphones(settings.array).enabled_positions_m
+        return cls(
+            width_hz=math.sqrt(mean_square - float(power @ frequency_hz) ** 2),
+            frequency_hz=math.sqrt(mean_square),
+            covariance_m2=positions_m.T @ positions_m / len(positions_m),
+            is_planar=is_planar,
+        )
+
+    def __call__(
+        self, image: Energyscape, position_m: NDArray[np.float32], levels: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return standard deviations along range and across: (point, 2) float32, in metres."""
+        some = image.energy[:, ::_THINNED]
+        some = some[:: max(1, some.size // _SAMPLE)]
+        noise = float(np.median(some)) / math.sqrt(math.log(2)) if len(levels) else 0.0
+        relative = noise / (math.sqrt(2) * levels.astype(np.float64))
+        speed_m_s = sound_speed_m_s(image.settings.air)
+        along_m = speed_m_s / (4 * math.pi * self.width_hz) * relative
+        reach_m = np.sqrt(self._least_variance_m2(position_m.astype(np.float64)))
+        wave_1_m = 2 * math.pi * self.frequency_hz / speed_m_s
+        range_m = np.linalg.norm(position_m, axis=1)
+        across_m = np.full(len(levels), np.inf)
+        np.divide(range_m * relative / wave_1_m, reach_m, out=across_m, where=reach_m > 0)
+        return np.stack([along_m, across_m], axis=1).astype(np.float32)
+
+    def _least_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least variance of the array across the lines of sight: (point,) float64."""
+        azimuth_rad = np.arctan2(position_m[:, 1], position_m[:, 0])
+        level_m = np.hypot(position_m[:, 0], position_m[:, 1])
+        elevation_rad = np.arctan2(position_m[:, 2], level_m)
+        sideways = unit_vectors(azimuth_rad + math.pi / 2, np.zeros_like(azimuth_rad))
+        aa: NDArray[np.float64] = np.einsum("pi,ij,pj->p", sideways, self.covariance_m2, sideways)
+        if self.is_planar:
+            return np.maximum(aa, 0.0)
+        upwards = unit_vectors(azimuth_rad, elevation_rad + math.pi / 2)
+        ab = np.einsum("pi,ij,pj->p", sideways, self.covariance_m2, upwards)
+        bb = np.einsum("pi,ij,pj->p", upwards, self.covariance_m2, upwards)
+        least = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
+        # What is left of rounding is no aperture.
+        return np.asarray(np.where(least > _FLAT * (aa + bb), least, 0.0))

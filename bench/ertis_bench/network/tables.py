@@ -25,7 +25,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "0 acked lost, 0 twice",
         "{kills:,} kills, {before a line:,} of them before a random line of code: {acked:,} acked, "
         + _STORED
-        + ", {left_over} files left over",
+        + ", {left_over} files left over; {missing:,} told to be missing, as the sensor node's memory ran over",
     ),
     "nodes": (
         "kill -9 of sensor nodes, mid-stream",

@@ -1,0 +1,180 @@
+"""``ertis export``: energyscapes and signals for other programs."""
+
+import itertools
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from ertis_numba.frames import Energyscape, Measurement
+    from ertis_numba.storage import EnergyscapeReader, RecordingReader
+
+__all__ = ["export"]
+
+FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular")
+TOPICS = ("points", "image", "sonar_image")
+
+
+class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    name = "I|A:B"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        first, colon, last = str(value).partition(":")
+        with suppress(ValueError):
+            return int(first), int(last if colon else first)
+        return self.fail(f"{value!r} is no measurement, give a number, or two as in 2:5", param, ctx)
+
+
+@click.command()
+@options.input_file("REC.h5|IMG.h5")
+@click.option(
+    "--output",
+    "-o",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    required=True,
+    help="File to write: .mcap, .ply, .pcd, .csv, .npz, or .h5 for Acoular, with an .xml beside it.",
+)
+@click.option(
+    "--format", "file_format", type=click.Choice(FORMATS), help="What to write; by the ending of OUT by default."
+)
+@options.sensor("One sensor only; all of the file by default.")
+@click.option(
+    "--measurement",
+    "-m",
+    "places",
+    type=_Places(),
+    metavar="I|A:B",
+    help="One measurement, counted from 0, or those from A to B; all by default.",
+)
+@click.option(
+    "--topic",
+    "topics",
+    type=click.Choice(TOPICS),
+    multiple=True,
+    help="What of a sensor goes into MCAP, may be given several times; all by default.",
+)
+@click.option(
+    "--top", type=int, default=256, show_default=True, metavar="N", help="At most so many points of an image."
+)
+@click.option(
+    "--min-level",
+    type=float,
+    default=-20.0,
+    show_default=True,
+    metavar="DB",
+    help="Leave out points that are weaker, below the strongest.",
+)
+@click.option("--ascii", "text", is_flag=True, help="PLY and PCD as text.")
+@options.force
+@options.quiet
+@options.as_json
+def export(
+    *,
+    path: Path,
+    target: Path,
+    file_format: str | None,
+    sensor: str | None,
+    places: tuple[int, int] | None,
+    topics: tuple[str, ...],
+    top: int,
+    min_level: float,
+    text: bool,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Write a file for other programs.
+
+    MCAP holds ROS 2 messages; PLY, PCD and CSV the points of images; NPZ the images of one sensor; the
+    files for Acoular the microphone signals of one measurement. A recording is processed with its own
+    settings first, but for Acoular.
+    """
+    from ertis_numba.interop import export as write
+    from ertis_numba.interop import files_of, format_of
+    from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
+
+    name = format_of(target, file_format)
+    for file in files_of(target, name):
+        check_target(file, overwrite=force, sources=[path])
+    with ExitStack() as stack:
+        recorded = name == "acoular" or file_kind(path) == "recording"
+        open_file: Callable[..., Any] = open_recording if recorded else open_energyscapes
+        readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
+        items = _Items(readers, places, process=recorded and name != "acoular", quiet=quiet)
+        written = write(
+            target,
+            items,
+            file_format=name,
+            mounting={each.sensor: (each.translation_m, each.rotation_xyzw) for each in readers} if recorded else None,
+            topics=topics or TOPICS,
+            top=top,
+            min_level_db=min_level,
+            text=text,
+            overwrite=force,
+        )
+    measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
+    options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
+    if as_json:
+        options.print_json(
+            {
+                "output": str(target),
+                "format": name,
+                "files": [str(file) for file in written],
+                "sensors": [reader.sensor for reader in readers],
+                "measurements": len(items),
+            }
+        )
+
+
+class _Items:
+    """What is exported, of one sensor after the other; whoever waits sees how far it is."""
+
+    def __init__(
+        self,
+        readers: "Sequence[RecordingReader | EnergyscapeReader]",
+        places: tuple[int, int] | None,
+        *,
+        process: bool,
+        quiet: bool,
+    ) -> None:
+        self._chosen = [(reader, _between(places, len(reader))) for reader in readers]
+        self._process, self._quiet = process, quiet
+
+    def __len__(self) -> int:
+        return sum(len(chosen) for _, chosen in self._chosen)
+
+    def __iter__(self) -> "Iterator[Energyscape | Measurement]":
+        with options.progress(self._each(), length=len(self), label="exporting", quiet=self._quiet) as shown:
+            yield from shown
+
+    def _each(self) -> "Iterator[Energyscape | Measurement]":
+        for reader, chosen in self._chosen:
+            read = (reader[index] for index in chosen)
+            yield from self._processed(read) if self._process else read
+
+    def _processed(self, measurements: "Iterable[Any]") -> "Iterator[Energyscape]":
+        """Yield images, each in the air of its measurement, which it takes a pipeline of its own for."""
+        for settings, group in itertools.groupby(measurements, lambda measurement: measurement.settings):
+            with options.pipeline(settings, quiet=self._quiet) as pipeline:
+                for measurement in group:
+                    yield pipeline.process(measurement)
+
+
+def _between(places: tuple[int, int] | None, count: int) -> range:
+    """Return the places from the first to the last that was asked for, or refuse them."""
+    if places is None:
+        return range(count)
+    first, last = (options.place(place, count) for place in places)
+    if first > last:
+        raise click.UsageError(
+            f"--measurement runs from {first} to {last}; give the smaller number first", click.get_current_context()
+        )
+    return range(first, last + 1)

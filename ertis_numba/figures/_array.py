@@ -1,0 +1,211 @@
+"""Where the microphones are, and how loud each direction is heard when they are steered to one."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _words
+from ertis_numba.figures._marks import name_points
+from ertis_numba.figures._page import Box, lay_out
+from ertis_numba.figures._style import LINES, Style
+from ertis_numba.geometry import Layout, microphones, unit_vectors
+from ertis_numba.settings import Settings
+
+__all__ = ["Cut", "draw", "pattern_db", "width_deg"]
+
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 5.0, 1.4, 4.0, 1.8
+_SHADES = (0.6, 0.8, 0.45, 0.95)  # places in the map of colours, of the second line on
+_MOST_LINES = 5
+_LEGEND_LINES = 1.4  # height of its lines, by the size of their letters
+_MOST_NAMES = 64
+_BAND_WAVES = 17
+_STEP_DEG = 0.2
+_HALF_POWER_DB = 10 * math.log10(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """A line of a beam pattern; frequencies are one, or those whose mean power counts."""
+
+    name: str
+    frequencies_hz: tuple[float, ...]
+
+
+def draw(
+    style: Style,
+    settings: Settings,
+    *,
+    dynamic_range_db: float,
+    frequencies_hz: Sequence[float] | None,
+    azimuth_deg: float,
+    elevation_deg: float,
+) -> Figure:
+    """Draw the layout, and the pattern along azimuth and along elevation."""
+    layout, em_pt = microphones(settings.array), style.em_pt
+    lines = _lines(settings, frequencies_hz)
+    low_m, high_m = (edge(layout.enabled_positions_m, axis=0) for edge in (np.min, np.max))
+    size_mm = 1e3 * (high_m - low_m)
+    spread = f"aperture {size_mm[1]:.3g} × {size_mm[2]:.3g} mm" + (
+        f", {size_mm[0]:.3g} mm deep" if size_mm[0] > 1e-6 else ""
+    )
+    steering = f"steered to azimuth {_words.angle(azimuth_deg)}, elevation {_words.angle(elevation_deg)}"
+    legend_pt = (_LEGEND_LINES * (len(lines) + 1) + 1.0) * style.tick_pt
+    page, boxes, _ = lay_out(
+        style,
+        _words.of_array(settings, spread, steering),
+        [lambda width_pt: 0.72 * width_pt + legend_pt + (_FLOOR_EMS + _ROOF_EMS) * em_pt] * 3,
+        width_pt=1080.0,
+        side_pt=0.0,
+        below_pt=0.0,
+    )
+    inner = [
+        box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
+        for box in boxes
+    ]
+    page.caption(_above(inner[0], em_pt), "microphones, seen from behind")
+    _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
+    sweep_deg = np.arange(-90.0, 90.0 + _STEP_DEG / 2, _STEP_DEG)
+    still = np.ones_like(sweep_deg)
+    told = [f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))]
+    cuts = (
+        (inner[1], "azimuth", sweep_deg, elevation_deg * still, azimuth_deg, told[1]),
+        (inner[2], "elevation", azimuth_deg * still, sweep_deg, elevation_deg, told[0]),
+    )
+    for box, axis, across_deg, up_deg, at_deg, other in cuts:
+        page.caption(_above(box, em_pt), f"along {axis}, at {other}")
+        axes = page.axes(box.inset(top=legend_pt), x=f"{axis} (°)", y="level (dB)")
+        for number, line in enumerate(lines):
+            level_db = pattern_db(
+                settings, line.frequencies_hz, across_deg, up_deg, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
+            )
+            width = width_deg(sweep_deg, level_db, at_deg)
+            axes.plot(
+                sweep_deg,
+                level_db,
+                LINES[number % len(LINES)],
+                color=_colour(style, number),
+                linewidth=1.2 * style.line_pt,
+                label=f"{line.name}: " + ("none" if width is None else f"{width:.3g}°"),
+            )
+        _finish(style, axes, dynamic_range_db, mirrored=axis == "azimuth")
+    return page.figure
+
+
+def pattern_db(
+    settings: Settings,
+    frequencies_hz: Sequence[float],
+    to_azimuth_deg: NDArray[np.float64],
+    to_elevation_deg: NDArray[np.float64],
+    *,
+    azimuth_deg: float,
+    elevation_deg: float,
+) -> NDArray[np.float64]:
+    """Return the level of plane waves from each direction in the beam to one, 0 dB there: (direction,) float64.
+
+    ``mean over f of |Σ_m exp(jk p_m·(u − u₀)) / M|²``, as delay-and-sum has it.
+    """
+    positions_m = microphones(settings.array).enabled_positions_m
+    looks = unit_vectors(np.radians(to_azimuth_deg), np.radians(to_elevation_deg))
+    beam = unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg))
+    paths_m = ((looks - beam) @ positions_m.T).astype(np.float32)  # exact to 1e-5 of a period, and twice as fast
+    power = np.zeros(len(looks))
+    for frequency_hz in frequencies_hz:
+        wave_1_m = 2 * math.pi * frequency_hz / sound_speed_m_s(settings.air)
+        power += np.abs(np.exp(np.complex64(1j * wave_1_m) * paths_m).mean(axis=1)) ** 2
+    return np.asarray(10 * np.log10(np.maximum(power / len(frequencies_hz), 1e-20)))
+
+
+def width_deg(angle_deg: NDArray[np.float64], level_db: NDArray[np.float64], at_deg: float) -> float | None:
+    """Return the width at half power of the lobe at an angle; None if it does not fall so far on both sides."""
+    middle = int(np.argmin(np.abs(angle_deg - at_deg)))
+    edges = []
+    for side in (slice(middle, None, -1), slice(middle, None)):
+        below = np.flatnonzero(level_db[side] < _HALF_POWER_DB)
+        if not len(below) or not below[0]:
+            return None
+        after = int(below[0])
+        angles, levels = angle_deg[side][after - 1 : after + 1], level_db[side][after - 1 : after + 1]
+        edges.append(float(np.interp(-_HALF_POWER_DB, -levels, angles)))
+    return edges[1] - edges[0]
+
+
+def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[Cut]:
+    """Return the lines to draw: the ends of the call's band and its mean, or what is asked for.
+
+    Raises
+    ------
+    ArgumentError
+        A frequency is not positive, or there are too many.
+    """
+    if frequencies_hz is None:
+        low_hz, high_hz = settings.call.low_frequency_hz, settings.call.high_frequency_hz
+        band = f"{low_hz / 1e3:g}–{high_hz / 1e3:g} kHz"
+        waves_hz = tuple(np.linspace(low_hz, high_hz, _BAND_WAVES).tolist())
+        ends = [Cut(f"{frequency_hz / 1e3:g} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
+        return [*ends, Cut(f"{band}, mean power", waves_hz)]
+    if not 1 <= len(frequencies_hz) <= _MOST_LINES:
+        raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MOST_LINES}")
+    return [
+        Cut(f"{checks.positive('frequencies_hz', frequency_hz) / 1e3:g} kHz", (float(frequency_hz),))
+        for frequency_hz in frequencies_hz
+    ]
+
+
+def _above(box: Box, em_pt: float) -> Box:
+    return Box(box.left, box.bottom, box.width, box.height + _ROOF_EMS * em_pt)
+
+
+def _colour(style: Style, number: int) -> object:
+    return style.mark if number == 0 else mpl.colormaps[style.colours](_SHADES[number - 1])
+
+
+def _draw_layout(style: Style, axes: Axes, layout: Layout) -> None:
+    places_mm = 1e3 * layout.positions_m[:, 1:]
+    on = layout.enabled
+    seen_mm = places_mm[on]
+    middle, reach = (seen_mm.min(axis=0) + seen_mm.max(axis=0)) / 2, np.ptp(seen_mm, axis=0)
+    box = axes.bbox
+    # One scale for both axes, and room around.
+    scale = 1.25 * max(reach[0] / box.width, reach[1] / box.height) or 20 / box.width
+    axes.set_xlim(middle[0] + scale * box.width / 2, middle[0] - scale * box.width / 2)
+    axes.set_ylim(middle[1] - scale * box.height / 2, middle[1] + scale * box.height / 2)
+    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
+    axes.locator_params(nbins=6)
+    size_pt = 5.0 * style.line_pt if len(seen_mm) <= _MOST_NAMES else 2.0 * style.line_pt
+    axes.plot(*seen_mm.T, "o", color=style.mark, markersize=size_pt, markeredgewidth=0)
+    if len(seen_mm) <= _MOST_NAMES:
+        names = [str(channel) for channel in np.flatnonzero(on)]
+        points = [(float(y), float(z)) for y, z in seen_mm]
+        name_points(axes, style, points, names, ring_pt=0.7 * size_pt, colour=style.faint)
+
+
+def _finish(style: Style, axes: Axes, dynamic_range_db: float, *, mirrored: bool) -> None:
+    axes.axhline(_HALF_POWER_DB, color=style.faint, linewidth=0.6 * style.line_pt, alpha=0.6)
+    axes.set_xlim(90, -90) if mirrored else axes.set_xlim(-90, 90)
+    axes.set_ylim(-dynamic_range_db, 3.0)
+    axes.set_xticks(range(-90, 91, 30))
+    step = max(1.0, 10.0 * round(dynamic_range_db / 50))
+    axes.set_yticks(np.arange(0.0, -dynamic_range_db - 1e-9, -step))
+    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
+    legend = axes.legend(
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        borderaxespad=0.4,
+        borderpad=0.2,
+        labelspacing=0.25,
+        title="half-power width",
+        frameon=False,
+        labelcolor=style.ink,
+        prop={"family": style.font, "size": style.tick_pt},
+        title_fontproperties={"family": style.font, "size": style.tick_pt},
+    )
+    legend.get_title().set_color(style.faint)

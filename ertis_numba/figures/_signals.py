@@ -1,0 +1,171 @@
+"""What the microphones heard: a trace of each, and a spectrogram."""
+
+import math
+
+import numpy as np
+import scipy.fft
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FixedLocator
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _words
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._hearing import Heard, signals
+from ertis_numba.figures._page import Box
+from ertis_numba.frames import Measurement
+from ertis_numba.settings import Settings
+
+__all__ = ["chosen", "draw", "row_ticks", "spectrogram"]
+
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
+_MOST_TRACES = 64
+_COLUMNS = 1200  # of a trace: the least and the greatest of each are drawn
+_MOST_SPECTRA = 600
+_LOUDEST = 0.999  # share of the samples that stay within their row
+
+
+def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) -> Figure:
+    """Draw the traces of all microphones or of one, and the mean of their spectrograms."""
+    settings, em_pt = measurement.settings, canvas.style.em_pt
+    heard = chosen(signals(measurement), microphone)
+    step = -(-len(heard.values) // _MOST_TRACES)  # of a large array some, evenly spaced
+    heard = Heard(heard.values[::step], heard.axis, heard.channels[::step])
+    rows = len(heard.values)
+
+    def traces_pt(width_pt: float) -> float:
+        return min(0.75 * width_pt, (8 + 1.1 * rows) * em_pt) + (_FLOOR_EMS + _ROOF_EMS) * em_pt
+
+    def spectrogram_pt(width_pt: float) -> float:
+        return 0.62 * width_pt + (_FLOOR_EMS + _ROOF_EMS) * em_pt
+
+    some_ms, all_ms = 1e3 * len(heard.axis) / settings.signal_rate_hz, 1e3 * settings.recording.duration_s
+    page, boxes, side = canvas.lay_out(
+        _words.of_measurement(
+            "Microphone signals",
+            settings,
+            measurement.stamp,
+            f"{settings.signal_rate_hz / 1e3:.4g} kHz sample rate",
+            f"{all_ms:.4g} ms" if some_ms > 0.999 * all_ms else f"the first {some_ms:.4g} of {all_ms:.4g} ms",
+        ),
+        [traces_pt, spectrogram_pt],
+        width_pt=1008.0,
+    )
+    inner = [
+        box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
+        for box in boxes
+    ]
+    loudest = float(np.quantile(np.abs(heard.values), _LOUDEST)) or 1.0
+    page.caption(_above(inner[0], em_pt), f"a row is ±{loudest:.2g} of full scale")
+    axes = page.axes(inner[0], x="time (ms)", y="microphone (bit of the word)")
+    _traces(canvas, axes, heard, loudest)
+    whose = f"mean of {rows} microphones" if rows > 1 else f"microphone {heard.channels[0]}"
+    page.caption(_above(inner[1], em_pt), f"spectrogram, {whose}")
+    axes = page.axes(inner[1], x="time (ms)", y="frequency (kHz)")
+    return canvas.side(page, side, _spectrogram(canvas, axes, heard, settings))
+
+
+def chosen(heard: Heard, microphone: int | None) -> Heard:
+    """Return what one microphone heard, or all.
+
+    Raises
+    ------
+    ArgumentError
+        There is no such microphone, or it is disabled.
+    """
+    if microphone is None:
+        return heard
+    place = np.flatnonzero(heard.channels == checks.whole("microphone", microphone, 0))
+    if not len(place):
+        raise ArgumentError(
+            f"microphone {microphone} is none of the {len(heard.channels)} enabled ones; "
+            f"give one from {heard.channels[0]} to {heard.channels[-1]}"
+        )
+    return Heard(heard.values[place], heard.axis, heard.channels[place])
+
+
+def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_pt: float) -> None:
+    """Name the rows 0, 1, … of an axis by their channels, as many as fit."""
+    step = max(1, math.ceil(len(channels) * 1.6 * em_pt / height_pt))
+    step = next(nice for nice in (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024) if nice >= step)
+    places = np.arange(0, len(channels), step)
+    axes.yaxis.set_major_locator(FixedLocator(places.tolist()))
+    axes.yaxis.set_ticklabels([str(channel) for channel in channels[places]])
+
+
+def spectrogram(
+    heard: Heard, settings: Settings
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean power of short spectra: (frequency, time) float32, the frequencies and the times.
+
+    The Hann window is about as long as the call stays within the bandwidth of the window, ``2 √(T / B)``: where a
+    sweep looks sharpest.
+    """
+    call, rate_hz = settings.call, settings.signal_rate_hz
+    swept_hz = call.high_frequency_hz - call.low_frequency_hz
+    count = len(heard.axis)
+    size = min(count, max(16, round(2 * math.sqrt(call.duration_s / swept_hz) * rate_hz)))
+    n_fft = scipy.fft.next_fast_len(4 * size)
+    starts = np.unique(np.linspace(0, count - size, min(_MOST_SPECTRA, count - size + 1)).astype(np.intp))
+    window = np.hanning(size + 2)[1:-1].astype(np.float32)
+    frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
+    inside = frequency_hz <= min(rate_hz / 2, 1.3 * call.high_frequency_hz)
+    power = np.zeros((len(starts), int(inside.sum())), dtype=np.float32)
+    for values in heard.values:
+        pieces = np.lib.stride_tricks.sliding_window_view(values, size)[starts] * window
+        power += np.abs(scipy.fft.rfft(pieces, n_fft)[:, inside]) ** 2
+    times_s = heard.axis[starts] + (size - 1) / 2 / rate_hz
+    return power.T / np.float32(len(heard.values)), frequency_hz[inside], times_s
+
+
+def _above(box: Box, em_pt: float) -> Box:
+    return Box(box.left, box.bottom, box.width, box.height + _ROOF_EMS * em_pt)
+
+
+def _traces(canvas: Canvas, axes: Axes, heard: Heard, loudest: float) -> None:
+    """Draw a row for each trace, the first on top; what is louder than its row is cut off."""
+    values = heard.values
+    time_ms, low, high = _ends(heard.axis * 1e3, np.clip(values / (2 * loudest), -0.5, 0.5))
+    rows = np.arange(len(values))[:, None]
+    xs = np.broadcast_to(np.repeat(time_ms, 2), (len(values), 2 * len(time_ms)))
+    # Least and greatest in turn are a line that covers all between them.
+    ys = np.stack([rows - high, rows - low], axis=2).reshape(len(values), -1)
+    lines = LineCollection(
+        list(np.stack([xs, ys], axis=2)),
+        colors=canvas.style.mark,
+        linewidths=0.5 * canvas.style.line_pt,
+        rasterized=True,
+    )
+    axes.add_collection(lines, autolim=False)
+    axes.set_xlim(0.0, heard.axis[-1] * 1e3)
+    axes.set_ylim(len(values) - 0.4, -0.6)
+    height_pt = axes.bbox.height * 72 / axes.figure.dpi
+    row_ticks(axes, heard.channels, height_pt=height_pt, em_pt=canvas.style.em_pt)
+
+
+def _ends(
+    axis: NDArray[np.float64], values: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+    """Return places, least and greatest of so many samples in a row that few are left: (place,), twice (row, place)."""
+    step = -(-values.shape[1] // _COLUMNS)
+    starts = np.arange(0, values.shape[1], step)
+    return axis[starts], np.minimum.reduceat(values, starts, axis=1), np.maximum.reduceat(values, starts, axis=1)
+
+
+def _spectrogram(canvas: Canvas, axes: Axes, heard: Heard, settings: Settings) -> AxesImage:
+    power, frequency_hz, times_s = spectrogram(heard, settings)
+    half_s = (times_s[-1] - times_s[0]) / max(1, 2 * (len(times_s) - 1)) or 0.5e-3
+    extent = (
+        1e3 * (times_s[0] - half_s),
+        1e3 * (times_s[-1] + half_s),
+        0.0,
+        float(frequency_hz[-1]) / 1e3,
+    )
+    shown = canvas.show(axes, canvas.level_db(np.sqrt(power)), extent=extent)
+    axes.set_xlim(0.0, heard.axis[-1] * 1e3)
+    canvas.grid(axes)
+    return shown

@@ -1,0 +1,148 @@
+"""Cuts through an image: a level plane and an upright one, in metres of the sensor frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _words
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._sampling import join_ranges, volume_raster
+from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["draw"]
+
+_PIXELS = 500  # along the longer side
+_NEAR_M = 0.05  # of a plane, or a fiftieth of the range: reflectors that are ringed in it
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
+_MOST_RATIO = 1.1
+
+
+def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float) -> Figure:
+    """Draw the plane of a height and the upright one that runs forward at a distance to the left."""
+    level_db = canvas.level_db(image.energy)
+    cuts = [_level(image, height_m)]
+    if not image.is_planar:
+        cuts.append(_upright(image, left_m))
+    rasters = [cut.sample(level_db, image) for cut in cuts]
+    page, boxes, side = canvas.lay_out(
+        _words.of_image(image), [cut.height_at(canvas) for cut in cuts], width_pt=720.0 if len(cuts) == 1 else 1008.0
+    )
+    shown = [cut.draw_into(canvas, page, box, raster) for cut, box, raster in zip(cuts, boxes, rasters, strict=True)]
+    return canvas.side(page, side, shown[0])
+
+
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """A plane through an image.
+
+    Attributes
+    ----------
+    name : str
+        Of the argument that places it.
+    at_m : float
+    across, up, normal : int
+        Axes of the sensor frame.
+    extent_m : (left, right, bottom, top)
+        Of the picture; the left end is the greater one where y runs to the left.
+    """
+
+    name: str
+    at_m: float
+    across: int
+    up: int
+    normal: int
+    title: str
+    extent_m: tuple[float, float, float, float]
+
+    def sample(self, level_db: NDArray[np.float32], image: Energyscape) -> NDArray[np.float32]:
+        """Return the levels in the plane: (row, column), NaN where there are none.
+
+        Raises
+        ------
+        ArgumentError
+            The image does not reach to it.
+        """
+        left, right, bottom, top = self.extent_m
+        step_m = max(abs(right - left), top - bottom) / _PIXELS
+        across_m = _centres(left, right, step_m)
+        up_m = _centres(bottom, top, step_m)
+        points_m = np.full((len(up_m), len(across_m), 3), self.at_m)
+        points_m[..., self.across] = across_m
+        points_m[..., self.up] = up_m[:, None]
+        range_m, joined_db = join_ranges(image.range_m, level_db, most=_PIXELS)
+        directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+        raster = volume_raster(joined_db, directions, range_m, points_m=points_m)
+        if np.isnan(raster).all():
+            raise ArgumentError(
+                f"{self.name} is {self.at_m:g}, where the image shows nothing; give a plane that crosses it"
+            )
+        return raster
+
+    def height_at(self, canvas: Canvas) -> Callable[[float], float]:
+        """Return the function from the width of the picture to its height, both with what is around it, in points."""
+        em_pt, ratio = canvas.style.em_pt, min(_MOST_RATIO, self._ratio)
+        return lambda width_pt: (width_pt - (_LEFT_EMS + _RIGHT_EMS) * em_pt) * ratio + (_FLOOR_EMS + _ROOF_EMS) * em_pt
+
+    @property
+    def _ratio(self) -> float:
+        left, right, bottom, top = self.extent_m
+        return (top - bottom) / abs(right - left)
+
+    def draw_into(self, canvas: Canvas, page: Page, box: Box, raster: NDArray[np.float32]) -> AxesImage:
+        """Draw the plane and the reflectors in it."""
+        em_pt = canvas.style.em_pt
+        inner = box.inset(
+            left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
+        ).fitted(self._ratio)
+        page.caption(Box(inner.left, inner.bottom, inner.width, inner.height + _ROOF_EMS * em_pt), self.title)
+        names = "x, forward (m)", "y, left (m)", "z, up (m)"
+        axes = page.axes(inner, x=names[self.across], y=names[self.up])
+        shown = canvas.show(axes, raster, extent=self.extent_m)
+        axes.set_xlim(*self.extent_m[:2])
+        axes.set_ylim(*self.extent_m[2:])
+        canvas.grid(axes)
+        canvas.mark_peaks(axes, self._place)
+        return shown
+
+    def _place(self, peak: Peak) -> tuple[float, float] | None:
+        unit = unit_vectors(np.radians(peak.azimuth_deg), np.radians(peak.elevation_deg))
+        place_m = peak.range_m * unit
+        if abs(place_m[self.normal] - self.at_m) > max(_NEAR_M, peak.range_m / 50):
+            return None
+        return float(place_m[self.across]), float(place_m[self.up])
+
+
+def _level(image: Energyscape, height_m: float) -> _Cut:
+    spans = _spans(image)
+    title = f"level plane at z = {_words.minus(f'{height_m:g}')} m"
+    return _Cut("height_m", height_m, 1, 0, 2, title, (spans[1][1], spans[1][0], *spans[0]))
+
+
+def _upright(image: Energyscape, left_m: float) -> _Cut:
+    spans = _spans(image)
+    title = f"upright plane at y = {_words.minus(f'{left_m:g}')} m"
+    return _Cut("left_m", left_m, 0, 2, 1, title, (*spans[0], *spans[2]))
+
+
+def _spans(image: Energyscape) -> list[tuple[float, float]]:
+    """Return how far the image and the sensor reach along x, y and z."""
+    points_m = unit_vectors(image.azimuth_rad, image.elevation_rad) * image.range_m[-1]
+    least_m = 0.1 * float(image.range_m[-1])  # what is thinner could not be seen
+    spans = []
+    for low, high in zip(points_m.min(axis=0), points_m.max(axis=0), strict=True):
+        first, last = min(0.0, float(low)), max(0.0, float(high))
+        spare = max(0.0, least_m - (last - first)) / 2
+        spans.append((first - spare, last + spare))
+    return spans
+
+
+def _centres(first: float, last: float, step: float) -> NDArray[np.float64]:
+    count = max(1, round(abs(last - first) / step))
+    return np.asarray(first + (np.arange(count) + 0.5) * (last - first) / count)

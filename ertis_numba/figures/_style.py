@@ -1,0 +1,136 @@
+"""How pictures look: colours, letters and sizes, on a screen and in print."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypedDict
+
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["COLUMNS_MM", "FONTS", "LINES", "MONOSPACE", "THEMES", "Look", "Style", "style_of", "text_width_pt"]
+
+COLUMNS_MM = {1: 85.0, 2: 170.0}
+"""Width of a picture for print over so many columns of a page."""
+FONTS = {"sans": "DejaVu Sans", "serif": "STIXGeneral"}  # both come with Matplotlib; the second is like Times
+MONOSPACE = "DejaVu Sans Mono"
+LINES: tuple[str, ...] = ("-", "--", "-.", ":")  # which tell curves apart where colours are not printed
+
+_PT_PER_MM = 72 / 25.4
+_SLACK = 1.03  # letters are set to whole pixels on a screen
+_WIDE_EMS = 55.0
+
+
+class Look(TypedDict, total=False):
+    """What all functions of this package take besides what is drawn.
+
+    Attributes
+    ----------
+    theme : {"dark", "light", "paper"}
+        Of a screen, or white with letters and lines of the size of print.
+    columns : {1, 2}
+        Width of ``paper``: 85 mm for one column or 170 mm for two, the default.
+    font : {"sans", "serif"}
+    """
+
+    theme: Literal["dark", "light", "paper"]
+    columns: Literal[1, 2] | None
+    font: Literal["sans", "serif"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Style:
+    """Colours, letters and sizes; ``colours`` is a perceptually uniform map of Matplotlib.
+
+    Attributes
+    ----------
+    page, ink, faint, mark, colours : str
+    font : str
+    title_pt, label_pt, tick_pt, list_pt : float
+        Sizes of letters.
+    line_pt : float
+    margin_pt : float
+        Around the page.
+    side_pt : float
+        What is left beside pictures for scale and list, at least.
+    dpi : int
+    width_pt : float or None
+        Of the page; what the kind of picture takes where it is None.
+    """
+
+    page: str
+    ink: str
+    faint: str
+    mark: str
+    colours: str
+    font: str = FONTS["sans"]
+    title_pt: float = 14.0
+    label_pt: float = 9.0
+    tick_pt: float = 8.5
+    list_pt: float = 7.5
+    line_pt: float = 1.0
+    margin_pt: float = 30.0
+    side_pt: float = 166.0
+    dpi: int = 160
+    width_pt: float | None = None
+
+    @property
+    def em_pt(self) -> float:
+        """The size of labels, which distances go by."""
+        return self.label_pt
+
+    def is_wide(self, width_pt: float) -> bool:
+        """Whether pictures stand beside each other on a page of a width, rather than below."""
+        return width_pt >= _WIDE_EMS * self.em_pt
+
+
+THEMES = {
+    "dark": Style(page="#0b0d12", ink="#e8eaf0", faint="#9aa0b0", mark="#7fe7ff", colours="inferno"),
+    "light": Style(page="#ffffff", ink="#1b1e26", faint="#5f6573", mark="#00617d", colours="magma_r"),
+    "paper": Style(
+        page="#ffffff",
+        ink="#000000",
+        faint="#404040",
+        mark="#00617d",
+        colours="magma_r",
+        title_pt=8.0,
+        label_pt=7.0,
+        tick_pt=6.5,
+        list_pt=6.0,
+        line_pt=0.6,
+        margin_pt=3.0,
+        side_pt=50.0,
+        dpi=300,
+        width_pt=COLUMNS_MM[2] * _PT_PER_MM,
+    ),
+}
+
+
+def style_of(
+    theme: Literal["dark", "light", "paper"] = "dark",
+    columns: Literal[1, 2] | None = None,
+    font: Literal["sans", "serif"] = "sans",
+) -> Style:
+    """Return a style by its name.
+
+    Raises
+    ------
+    ArgumentError
+        A name is unknown, or columns are given for a screen.
+    """
+    checks.choice("theme", theme, THEMES)
+    checks.choice("font", font, FONTS)
+    style = replace(THEMES[theme], font=FONTS[font])
+    if columns is None:
+        return style
+    checks.choice("columns", columns, COLUMNS_MM)
+    if style.width_pt is None:
+        raise ArgumentError(f"columns is {columns}, which theme {theme!r} has none of; give theme 'paper'")
+    return replace(style, width_pt=COLUMNS_MM[columns] * _PT_PER_MM)
+
+
+def text_width_pt(text: str, size_pt: float, font: str, *, bold: bool = False) -> float:
+    """Return about how wide a line of text will be, and not less."""
+    properties = FontProperties(family=font, size=size_pt, weight="bold" if bold else "normal")
+    return _SLACK * text_to_path.get_text_width_height_descent(text, properties, ismath=False)[0]

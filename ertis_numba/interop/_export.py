@@ -1,0 +1,221 @@
+"""Energyscapes and microphone signals in the formats of other programs."""
+
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_numba import checks
+from ertis_numba.atomic import check_target, replacing
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.interop._mountings import Mountings, checked
+
+__all__ = ["FORMATS", "TOPICS", "Format", "export", "files_of", "format_of"]
+
+TOPICS: Final = ("points", "image", "sonar_image")
+"""What MCAP can hold of a sensor."""
+_POINTS = (
+    *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
+    *("sensor", "sequence", "sec", "nanosec"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """A format that can be written.
+
+    Attributes
+    ----------
+    ending : str
+        Of the file.
+    holds : tuple of str
+        Names of what is in the file.
+    """
+
+    ending: str
+    holds: tuple[str, ...]
+
+
+FORMATS: Final = {
+    "mcap": Format(ending=".mcap", holds=(*TOPICS, "tf_static")),
+    "ply": Format(ending=".ply", holds=_POINTS),
+    "pcd": Format(ending=".pcd", holds=_POINTS),
+    "csv": Format(
+        ending=".csv",
+        holds=(
+            *("sensor", "epoch", "sequence", "sync_count", "timestamp_ns"),
+            *("x_m", "y_m", "z_m", "energy", "uncertainty_range_m", "uncertainty_across_m"),
+        ),
+    ),
+    "npz": Format(
+        ending=".npz",
+        holds=(
+            *("energy", "azimuth_rad", "elevation_rad", "range_m"),
+            *("epoch", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
+            *("sensor", "settings"),
+        ),
+    ),
+    "acoular": Format(ending=".h5", holds=("time_data", "metadata")),
+}
+"""Formats by name; ``docs/export.md`` says what each keeps."""
+
+
+def format_of(path: str | Path, name: str | None = None) -> str:
+    """Return the name of the format of a file to write: the one given, or else by its ending.
+
+    Raises
+    ------
+    ArgumentError
+        There is no such format.
+    """
+    if name is None:
+        endings = {each.ending: known for known, each in FORMATS.items()}
+        checks.choice("ending of the export", Path(path).suffix.lower(), endings)
+        return endings[Path(path).suffix.lower()]
+    checks.choice("format", name, FORMATS)
+    return name
+
+
+def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
+    """Return the files that an export makes: for ``acoular`` also that of the array, with the ending ``.xml``."""
+    return (Path(path), Path(path).with_suffix(".xml"))[: 1 + (name == "acoular")]
+
+
+def export(
+    path: str | Path,
+    items: Iterable[Energyscape | Measurement],
+    *,
+    file_format: str | None = None,
+    mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+    topics: Collection[str] = TOPICS,
+    top: int = 256,
+    min_level_db: float = -20.0,
+    text: bool = False,
+    overwrite: bool = False,
+) -> tuple[Path, ...]:
+    """Write energyscapes, or the signals of a measurement, for other programs.
+
+    Files appear complete, or not at all. ``docs/export.md`` has the formats, what each keeps, and where they are
+    defined.
+
+    Parameters
+    ----------
+    path : str or Path
+    items : iterable of Energyscape or of Measurement
+        Energyscapes, of several sensors where the format allows it; for ``acoular`` one measurement. They are written
+        as they come, but for ``npz`` gathered first where they have no length.
+    file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular"}, optional
+        By the ending of the path by default.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Where each sensor is on its platform, by its name, as for `RecordingWriter`; points of ``ply``, ``pcd`` and
+        ``csv`` are then in the frame of the platform, else in that of the sensor.
+    topics : collection of {"points", "image", "sonar_image"}
+        What of each sensor goes into ``mcap``.
+    top, min_level_db
+        Which points: see `ertis_numba.stages.points.PointExtractor`.
+    text : bool
+        ``ply`` and ``pcd`` as text.
+    overwrite : bool
+        Replace files of these names.
+
+    Returns
+    -------
+    tuple of Path
+        The files: one, for ``acoular`` also that of the array, with the ending ``.xml``.
+
+    Raises
+    ------
+    ArgumentError
+        There is nothing to write, the format cannot hold it, an option is not one of the format's, or a file exists.
+    DataError
+        The disk is full or cannot be written.
+    """
+    name = format_of(path, file_format)
+    for topic in topics:
+        checks.choice("topic", topic, TOPICS)
+    if set(topics) != set(TOPICS) and name != "mcap":
+        raise ArgumentError(f"topics are chosen, which format {name!r} has none of; leave them out or give 'mcap'")
+    if text and name not in {"ply", "pcd"}:
+        raise ArgumentError(f"text is asked for, which format {name!r} knows nothing of; leave it out")
+    paths = files_of(path, name)
+    for each in paths:
+        check_target(each, overwrite=overwrite)
+    try:
+        with ExitStack() as stack:
+            parts = [stack.enter_context(replacing(each, overwrite=overwrite)) for each in paths]
+            if name == "acoular":
+                _write_signals(parts[0], parts[1], items)
+            elif name == "npz":
+                _write_npz(parts[0], items)
+            else:
+                options = {"top": top, "min_level_db": min_level_db}
+                _write_points(name, parts[0], _energyscapes(items), checked(mounting), topics, options, text=text)
+    except OSError as error:
+        if isinstance(error, ErtisError):  # of what the images come from
+            raise
+        raise DataError(
+            f"{path} cannot be written ({error.strerror or error}); free some space or write elsewhere"
+        ) from error
+    return paths
+
+
+# Writers are imported when they are needed: they bring scipy.spatial, and one of them an extra.
+
+
+def _write_signals(path: Path, geometry: Path, items: Iterable[Energyscape | Measurement]) -> None:
+    from ertis_numba.interop._acoular import write_acoular  # noqa: PLC0415
+
+    several = list(itertools.islice(items, 2))
+    if len(several) != 1 or not isinstance(several[0], Measurement):
+        came = f"{'no' if not several else 'more than one'} measurement" if len(several) != 1 else "an energyscape"
+        raise ArgumentError(
+            f"format 'acoular' holds signals of one measurement, and {came} came; give one (--measurement)"
+        )
+    write_acoular(path, geometry, several[0])
+
+
+def _write_npz(path: Path, items: Iterable[Energyscape | Measurement]) -> None:
+    from ertis_numba.interop._npz import write_npz  # noqa: PLC0415
+
+    count = len(items) if isinstance(items, Sized) else None
+    write_npz(path, _energyscapes(items), count)
+
+
+def _write_points(
+    name: str,
+    path: Path,
+    images: Iterator[Energyscape],
+    mountings: Mountings,
+    topics: Collection[str],
+    finding: dict[str, Any],
+    *,
+    text: bool,
+) -> None:
+    from ertis_numba.interop import _mcap, _point_files  # noqa: PLC0415
+    from ertis_numba.interop._points import PointFinder, PointTable  # noqa: PLC0415
+
+    find = PointFinder(**finding)
+    if name == "mcap":
+        _mcap.write_mcap(path, images, find, mountings, topics=topics)
+        return
+    table = PointTable.of(images, find, mountings)
+    if name == "csv":
+        _point_files.write_csv(path, table)
+    elif name == "ply":
+        _point_files.write_ply(path, table, text=text)
+    else:
+        _point_files.write_pcd(path, table, text=text)
+
+
+def _energyscapes(items: Iterable[Energyscape | Measurement]) -> Iterator[Energyscape]:
+    """Yield energyscapes; refuse measurements, and that there are none."""
+    count = 0
+    for count, item in enumerate(items, 1):  # noqa: B007  it is used below
+        if not isinstance(item, Energyscape):
+            raise ArgumentError("a measurement is given, wanted energyscapes; process it first (Pipeline.process)")
+        yield item
+    if not count:
+        raise ArgumentError("no energyscape is given; give at least one")

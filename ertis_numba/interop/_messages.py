@@ -1,0 +1,141 @@
+"""Definitions of ROS 2 messages, and what encodes them.
+
+Fields, types and constants are those of ``common_interfaces`` and ``geometry2`` (both the same from Humble on),
+``rcl_interfaces``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of Washington. They are
+written out here since a file carries the definitions of its messages, and neither needs ROS.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Final
+
+__all__ = ["DEFINITIONS", "encoder", "schema"]
+
+DEFINITIONS: Final = {
+    "builtin_interfaces/msg/Time": """
+int32 sec
+uint32 nanosec
+""",
+    "std_msgs/msg/Header": """
+builtin_interfaces/Time stamp
+string frame_id
+""",
+    "geometry_msgs/msg/Vector3": """
+float64 x
+float64 y
+float64 z
+""",
+    "geometry_msgs/msg/Quaternion": """
+float64 x 0
+float64 y 0
+float64 z 0
+float64 w 1
+""",
+    "geometry_msgs/msg/Transform": """
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+""",
+    "geometry_msgs/msg/TransformStamped": """
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+""",
+    "tf2_msgs/msg/TFMessage": """
+geometry_msgs/TransformStamped[] transforms
+""",
+    "sensor_msgs/msg/PointField": """
+uint8 INT8=1
+uint8 UINT8=2
+uint8 INT16=3
+uint8 UINT16=4
+uint8 INT32=5
+uint8 UINT32=6
+uint8 FLOAT32=7
+uint8 FLOAT64=8
+string name
+uint32 offset
+uint8 datatype
+uint32 count
+""",
+    "sensor_msgs/msg/PointCloud2": """
+std_msgs/Header header
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+""",
+    "sensor_msgs/msg/Image": """
+std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+""",
+    "marine_acoustic_msgs/msg/PingInfo": """
+float32 frequency
+float32 sound_speed
+float32[] tx_beamwidths
+float32[] rx_beamwidths
+""",
+    "marine_acoustic_msgs/msg/SonarImageData": """
+uint32 DTYPE_UINT8=0
+uint32 DTYPE_INT8=1
+uint32 DTYPE_UINT16=2
+uint32 DTYPE_INT16=3
+uint32 DTYPE_UINT32=4
+uint32 DTYPE_INT32=5
+uint32 DTYPE_UINT64=6
+uint32 DTYPE_INT64=7
+uint32 DTYPE_FLOAT32=8
+uint32 DTYPE_FLOAT64=9
+bool is_bigendian
+uint32 dtype
+uint32 beam_count
+uint8[] data
+""",
+    "marine_acoustic_msgs/msg/ProjectedSonarImage": """
+std_msgs/Header header
+marine_acoustic_msgs/PingInfo ping_info
+geometry_msgs/Vector3[] beam_directions
+float32[] ranges
+marine_acoustic_msgs/SonarImageData image
+""",
+}
+"""Each message by itself; other messages in it have the name of their package."""
+_RULE = "=" * 80
+
+
+def schema(name: str) -> str:
+    """Return the definition of a message and of all in it, as MCAP has them (``ros2msg`` in its registry)."""
+    first, *others = _with_needed(name)
+    parts = [DEFINITIONS[first].lstrip()]
+    parts += [f"MSG: {other.replace('/msg/', '/')}{DEFINITIONS[other]}" for other in others]
+    return f"{_RULE}\n".join(parts)
+
+
+def _with_needed(name: str) -> list[str]:
+    """Return a message, and those in it, each once."""
+    found = [name]
+    for each in found:  # which grows meanwhile
+        for line in DEFINITIONS[each].split("\n"):
+            package, slash, message = line.partition(" ")[0].removesuffix("[]").partition("/")
+            needed = f"{package}/msg/{message}"
+            if slash and needed not in found:
+                found.append(needed)
+    return found
+
+
+@functools.cache
+def encoder(name: str) -> Callable[[dict[str, Any]], bytes]:
+    """Return what makes CDR, as ROS 2 has it, of a message: a dict for each message in it."""
+    # The writer of mcap-ros2-support has no way to give a topic the metadata that its profile asks for, and what
+    # encodes has no name without an underscore.
+    from mcap_ros2._dynamic import serialize_dynamic  # noqa: PLC0415  an extra
+
+    return serialize_dynamic(name, schema(name))[name]

@@ -1,0 +1,60 @@
+"""Energyscapes as grey pictures, one pixel for each direction and range or for each direction."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["DYNAMIC_RANGE_DB", "Picture"]
+
+DYNAMIC_RANGE_DB = 40.0
+"""Below the strongest, at which a pixel is black."""
+_MOST_PIXELS = 1000  # along a side of a map
+_GAP = 1.3  # spacings from the nearest direction, beyond which a pixel of a map shows nothing
+
+
+class Picture:
+    """Makes pictures of images with the directions of one.
+
+    A planar image becomes a picture of azimuth, from the left, and of range, from below. One with elevations becomes a
+    map of azimuth and elevation as the sensor sees it: the strongest over range of the nearest direction.
+
+    Parameters
+    ----------
+    image : Energyscape
+    """
+
+    def __init__(self, image: Energyscape) -> None:
+        self._columns = np.argsort(-image.azimuth_rad, kind="stable")
+        self._map = None if image.is_planar else _map(image)
+
+    def __call__(self, energy: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Return the picture of energies, (direction, range): (row, column) uint8, 255 the strongest."""
+        floor = 10 ** (-DYNAMIC_RANGE_DB / 20)
+        shown = energy if self._map is None else energy.max(axis=1, keepdims=True)
+        strongest = float(shown.max(initial=0.0)) or 1.0
+        level_db = 20 * np.log10(np.maximum(shown / strongest, floor))
+        grey = np.rint(255 * (1 + level_db / DYNAMIC_RANGE_DB)).astype(np.uint8)
+        if self._map is None:
+            return np.ascontiguousarray(grey[self._columns].T[::-1])
+        return np.append(grey[:, 0], np.uint8(0))[self._map]
+
+
+def _map(image: Energyscape) -> NDArray[np.int64]:
+    """Return the direction that each pixel shows, the number of directions where it shows none: (row, column) int64."""
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    tree = KDTree(directions)
+    apart = float(np.median(tree.query(directions, k=2)[0][:, 1]))  # infinite for a single direction
+    spacing_rad = 2 * math.asin(min(1.0, apart / 2)) or math.pi
+    axes = []
+    for angle_rad in (image.azimuth_rad, image.elevation_rad):
+        span_rad = float(np.ptp(angle_rad))
+        count = min(_MOST_PIXELS, 1 + round(span_rad / max(spacing_rad, span_rad / _MOST_PIXELS)))
+        axes.append(np.linspace(angle_rad.max(), angle_rad.min(), count))
+    looks = unit_vectors(*np.meshgrid(*axes))
+    distance, nearest = tree.query(looks)
+    return np.where(distance > _GAP * spacing_rad, len(directions), nearest).astype(np.int64)

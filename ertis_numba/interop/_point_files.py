@@ -1,0 +1,109 @@
+"""Points as PLY, PCD and CSV.
+
+PLY: G. Turk, The PLY Polygon File Format (1994). PCD: Point Cloud Library, The PCD (Point Cloud Data) file format,
+version 0.7. CSV: RFC 4180, but for the ends of lines.
+"""
+
+import csv
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.interop._points import PointTable
+
+__all__ = ["CSV_COLUMNS", "POINT_FIELDS", "write_csv", "write_pcd", "write_ply"]
+
+POINT_FIELDS: Final = {
+    "x": "<f4",
+    "y": "<f4",
+    "z": "<f4",
+    "intensity": "<f4",
+    "uncertainty_range": "<f4",
+    "uncertainty_across": "<f4",
+    "sensor": "<u2",
+    "sequence": "<u4",
+    "sec": "<i4",
+    "nanosec": "<u4",
+}
+"""What PLY and PCD hold of each point. Neither has integers of 64 bits that all readers know."""
+_PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
+CSV_COLUMNS: Final = {
+    "sensor": "sensor",
+    "epoch": "epoch",
+    "sequence": "sequence",
+    "sync_count": "sync_count",
+    "timestamp_ns": "timestamp_ns",
+    "x_m": "x",
+    "y_m": "y",
+    "z_m": "z",
+    "energy": "intensity",
+    "uncertainty_range_m": "uncertainty_range",
+    "uncertainty_across_m": "uncertainty_across",
+}
+"""Columns of CSV, and which they are in the table of points."""
+_HEADING = "Point cloud of ertis-numba"
+
+
+def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
+    """Write points as PLY, little-endian or as text."""
+    properties = [f"property {_PLY_TYPES[dtype]} {name}" for name, dtype in POINT_FIELDS.items()]
+    head = [
+        "ply",
+        f"format {'ascii' if text else 'binary_little_endian'} 1.0",
+        *(f"comment {line}" for line in _about(table)),
+        f"element vertex {len(table.rows)}",
+        *properties,
+        "end_header",
+    ]
+    _write(path, head, table.columns(POINT_FIELDS), text=text)
+
+
+def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
+    """Write points as PCD 0.7, little-endian or as text."""
+    kinds = [np.dtype(dtype) for dtype in POINT_FIELDS.values()]
+    count = len(table.rows)
+    head = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {line}" for line in _about(table)),
+        "VERSION 0.7",
+        f"FIELDS {' '.join(POINT_FIELDS)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",  # the points are where they are: a viewer would move them by another one
+        f"POINTS {count}",
+        f"DATA {'ascii' if text else 'binary'}",
+    ]
+    _write(path, head, table.columns(POINT_FIELDS), text=text)
+
+
+def write_csv(path: Path, table: PointTable) -> None:
+    """Write points as CSV."""
+    rows = table.rows
+    names = np.array([*table.sensors, ""])[rows["sensor"]]
+    columns = [names if column == "sensor" else rows[column].astype(str) for column in CSV_COLUMNS.values()]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CSV_COLUMNS)
+        writer.writerows(zip(*columns, strict=True))
+
+
+def _about(table: PointTable) -> list[str]:
+    """Return what stands in comments, a word and its value each."""
+    numbered = [f"sensor {number} {name}" for number, name in enumerate(table.sensors)]
+    return [_HEADING, f"frame {table.frame}", *numbered]
+
+
+def _write(path: Path, head: list[str], rows: NDArray[np.void], *, text: bool) -> None:
+    with path.open("wb") as file:
+        file.write("\n".join([*head, ""]).encode("ascii"))
+        if text:
+            # NumPy writes the fewest digits from which the same float32 is read.
+            columns = [rows[name].astype(str) for name in POINT_FIELDS]
+            file.write("".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode("ascii"))
+        else:
+            file.write(rows.tobytes())

@@ -1,0 +1,156 @@
+"""The points of several measurements as one table."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.geometry import Grid
+from ertis_numba.interop._mountings import PLATFORM, Mountings
+from ertis_numba.stages.points import PointExtractor
+
+__all__ = ["PointFinder", "PointTable", "ros_time", "same_directions"]
+
+_POINT: Final = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across")),
+        ("sensor", "<u2"),
+        *((name, "<i8") for name in ("epoch", "sequence", "sync_count", "timestamp_ns")),
+        ("sec", "<i4"),
+        ("nanosec", "<u4"),
+    ]
+)
+_NS = 1_000_000_000
+_MOST_SEC = 2**31 - 1
+
+
+class PointFinder:
+    """Finds the points of images of any sensors, with an extractor for each.
+
+    Parameters
+    ----------
+    top, min_level_db
+        As for `ertis_numba.stages.points.PointExtractor`.
+    """
+
+    def __init__(self, *, top: int, min_level_db: float) -> None:
+        self._top, self._min_level_db = top, min_level_db
+        self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
+
+    def __call__(self, image: Energyscape) -> PointCloud:
+        """Return the points of an image, in the frame of its sensor."""
+        known = self._extractors.get(image.stamp.sensor)
+        if known is None or not same_directions(known[0], image):
+            grid = Grid(image.azimuth_rad, image.elevation_rad)
+            extractor = PointExtractor(image.settings, grid, top=self._top, min_level_db=self._min_level_db)
+            known = self._extractors[image.stamp.sensor] = image, extractor
+        return known[1](image)
+
+
+def same_directions(image: Energyscape, other: Energyscape) -> bool:
+    """Whether two images have the same directions."""
+    return all(
+        getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
+        for name in ("azimuth_rad", "elevation_rad")
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTable:
+    """Points of several measurements, a row each.
+
+    Attributes
+    ----------
+    rows : (point,) structured
+        x, y, z and their uncertainty in metres, intensity, number of the sensor, the stamp of the measurement, and
+        its time once more in whole seconds and nanoseconds.
+    sensors : tuple of str
+        By their numbers.
+    frame : str
+        Of x, y and z: the platform's where it is known how the sensors are mounted, else that of the only sensor.
+    """
+
+    rows: NDArray[np.void]
+    sensors: tuple[str, ...]
+    frame: str
+
+    @classmethod
+    def of(cls, images: Iterable[Energyscape], find: PointFinder, mountings: Mountings) -> "PointTable":
+        """Gather the points of images.
+
+        Raises
+        ------
+        ArgumentError
+            There are several sensors, and it is not known where each of them is.
+        """
+        numbers: dict[str, int] = {}
+        parts = [np.empty(0, _POINT)]
+        for image in images:
+            sensor = image.stamp.sensor
+            parts.append(_rows(find(image), numbers.setdefault(sensor, len(numbers)), mountings))
+            frames = {PLATFORM if name in mountings else name for name in numbers}
+            if len(frames) > 1:
+                raise ArgumentError(
+                    f"where sensors {', '.join(numbers)} are on their platform is not known, wanted one frame for "
+                    "all points; choose one (--sensor), or export the recording"
+                )
+        frame = PLATFORM if numbers.keys() & mountings.keys() else next(iter(numbers), PLATFORM)
+        return cls(np.concatenate(parts), tuple(numbers), frame)
+
+    def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
+        """Return some columns, packed, in the types that a format has for them.
+
+        Raises
+        ------
+        ArgumentError
+            A number is beyond its type.
+        """
+        made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
+        for name, dtype in dtypes.items():
+            column: NDArray[Any] = self.rows[name]
+            made[name] = column.astype(dtype)
+            if not np.array_equal(made[name], column, equal_nan=column.dtype.kind == "f"):
+                raise ArgumentError(f"{name} of a measurement is {column.max()}, more than the format holds; use csv")
+        return made
+
+
+def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.void]:
+    stamp = cloud.stamp
+    made = np.empty(len(cloud), _POINT)
+    if stamp.sensor in mountings:
+        translation_m, rotation_xyzw = mountings[stamp.sensor]
+        cloud = cloud.replace(translation_m=translation_m, rotation_xyzw=rotation_xyzw)
+        position_m = cloud.on_platform_m()
+    else:
+        position_m = cloud.position_m
+    made["x"], made["y"], made["z"] = position_m.T
+    made["intensity"] = cloud.energy
+    unknown_m = np.full((len(cloud), 2), np.nan, dtype=np.float32)
+    uncertainty_m = unknown_m if cloud.uncertainty_m is None else cloud.uncertainty_m
+    made["uncertainty_range"], made["uncertainty_across"] = uncertainty_m.T
+    made["sensor"] = number
+    for name in ("epoch", "sequence", "sync_count", "timestamp_ns"):
+        made[name] = getattr(stamp, name)
+    made["sec"], made["nanosec"] = ros_time(stamp)
+    return made
+
+
+def ros_time(stamp: Stamp) -> tuple[int, int]:
+    """Return the time of a measurement as ROS 2 has it (builtin_interfaces/msg/Time): seconds and nanoseconds.
+
+    Raises
+    ------
+    ArgumentError
+        It lies before 1970 or after 2038.
+    """
+    sec, nanosec = divmod(stamp.timestamp_ns, _NS)
+    if not 0 <= sec <= _MOST_SEC:
+        raise ArgumentError(
+            f"measurement {stamp.sequence} has the time {stamp.timestamp_ns} ns, wanted one from 1970 to 2038; use npz "
+            "or csv"
+        )
+    return sec, nanosec

@@ -1,0 +1,211 @@
+"""Folders of RTIS Dev: a raw file for each measurement, and the settings as JSON."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from ertis_numba import checks
+from ertis_numba.errors import DataError
+from ertis_numba.interop.rtis import RawReader
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+
+__all__ = ["open_rtis_folder"]
+
+_RECORDING: dict[str, float] = {
+    "microphoneSamples": 163_840,
+    "microphoneSampleFrequency": 4_500_000,
+    "callSampleFrequency": 450_000,
+    "callDuration": 2.5,  # ms
+    "callMinimumFrequency": 25_000,
+    "callMaximumFrequency": 50_000,
+    "callEmissions": 1,
+}
+"""What rtisdev 2.16.0 takes where a file of recording settings leaves it out."""
+_PROCESSING = (
+    "microphoneLayout",
+    "minRange",
+    "maxRange",
+    "directions",
+    "2D",
+    "azimuthLowLimit",
+    "azimuthHighLimit",
+    "elevationLowLimit",
+    "elevationHighLimit",
+)
+_DUMPED = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
+"""Names in ``dict(RTISSettings)``, which users write to JSON as well, for those in files of settings."""
+_AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # radians, in dict(RTISSettings)
+_NOT_HELD = {
+    "callCustom": "give --preset to process it as a sweep",
+    "directionsCustom": "take it out, and give --directions when processing",
+    "delayMatrixCustom": "take it out",
+    "rangesCustom": "take it out, and give --range when processing",
+}
+"""Keys that name other files, with what to do."""
+_KNOWN = {*_RECORDING, *_PROCESSING, *_DUMPED, *_NOT_HELD, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
+_SLOWEST_AIR_M_S = 300.0  # as for the presets: the whole echo fits into the record in any air
+_FARTHEST_M = 5.0
+_RANGE_STEPS = (100, 40, 20, 10)
+_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth, as the presets have it
+
+
+def open_rtis_folder(
+    folder: str | Path,
+    *,
+    layout: str | None = None,
+    preset: str | None = None,
+    air: Air | None = None,
+    sensor: str = "sensor",
+) -> RawReader:
+    """Open a folder with the measurements that a program on RTIS Dev has saved.
+
+    RTIS Dev hands out the words of a measurement, and its examples write each to a file ``NAME<number>.bin``; the
+    number becomes the sequence number, so that a missing file is a gap. Settings are read from JSON files beside them:
+    those of recording (``microphoneSamples``, ``callMinimumFrequency`` and others), those of processing
+    (``microphoneLayout``, ``maxRange`` and others), or all of ``dict(RTISSettings)`` in one, as rtisdev 2.16.0 (PyPI)
+    reads and yields them. Filters, cleaning and beamforming are not taken over.
+
+    Parameters
+    ----------
+    folder : str or Path
+    layout : str, optional
+        Array, in place of the one that the folder names.
+    preset : str, optional
+        Length of a measurement and call, in place of those in the folder.
+    air : Air, optional
+        Standard air by default: nothing in the folder tells.
+    sensor : str
+        Name to give to the sensor.
+
+    Raises
+    ------
+    DataError
+        There are no measurements, their order is not known, or settings are missing, contradict each other or
+        cannot be held in a recording.
+    ArgumentError
+        A setting has a value that cannot be used.
+    """
+    folder = Path(folder)
+    paths, first = _measurements(folder)
+    told = _settings_in(folder)
+    layout = layout or told.get("microphoneLayout")
+    if layout is None:
+        raise DataError(f"{folder} does not say which array it was (microphoneLayout); give --layout")
+    if preset is not None:
+        settings = Settings.from_preset(preset)
+    elif told.keys() & {*_RECORDING, "callCustom"}:
+        settings = _recorded(folder, told)
+    else:
+        raise DataError(f"{folder} holds no recording settings of RTIS Dev (.json); give --preset")
+    processing = _processed(folder, told, settings.processing)
+    settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
+    return RawReader(paths, settings, sensor=sensor, first=first)
+
+
+def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
+    """Return the raw files in their order, and their numbers."""
+    try:
+        paths = [path for path in folder.iterdir() if path.suffix == ".bin"]
+    except OSError as error:
+        raise DataError(f"{folder}: {error.strerror}; give a folder of raw files") from error
+    if not paths:
+        raise DataError(f"{folder} is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev")
+    split = [re.fullmatch(r"(.*?)(\d*)", path.stem) for path in paths]
+    names = {match[1] for match in split if match}
+    digits = [match[2] for match in split if match]
+    if len(paths) == 1:
+        return paths, [int(digits[0] or 0)]
+    if len(names) != 1 or not all(digits) or len({int(number) for number in digits}) != len(paths):
+        raise DataError(
+            f"{folder}: the order of its {len(paths)} .bin files is not known, wanted names like NAME<number>.bin; "
+            "give the files themselves in their order"
+        )
+    ordered = sorted(zip(map(int, digits), paths, strict=True))
+    return [path for _, path in ordered], [number for number, _ in ordered]
+
+
+def _settings_in(folder: Path) -> dict[str, Any]:
+    """Return the settings in all JSON files of a folder, by the names of files of settings."""
+    told: dict[str, Any] = {}
+    sources: dict[str, Path] = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            content = json.loads(path.read_text("utf-8-sig"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: {error}; give readable JSON, or take the file away") from error
+        for key in _KNOWN & content.keys() if isinstance(content, dict) else ():
+            name = _DUMPED.get(key, key)
+            if name in told and told[name] != content[key]:
+                raise DataError(
+                    f"{path}: {key} is {content[key]!r}, but {told[name]!r} in {sources[name].name}; keep one of them"
+                )
+            told[name], sources[name] = content[key], path
+    return told
+
+
+def _recorded(folder: Path, told: dict[str, Any]) -> Settings:
+    """Return call and length of a measurement."""
+    _refuse(folder, told, "callCustom")
+    number = {
+        name: checks.finite(f"{folder}: {name}", told.get(name, standard)) for name, standard in _RECORDING.items()
+    }
+    if number["callEmissions"] != 1:
+        raise DataError(
+            f"{folder}: callEmissions is {number['callEmissions']:g}, wanted 1, as an image shows one emission; give "
+            "--preset to take the first one"
+        )
+    call = Call(
+        start_frequency_hz=number["callMaximumFrequency"],
+        stop_frequency_hz=number["callMinimumFrequency"],
+        duration_s=round(number["callDuration"] / 1e3, 12),
+        sample_rate_hz=number["callSampleFrequency"],
+    )
+    n_samples = checks.whole(f"{folder}: microphoneSamples", told.get("microphoneSamples", 163_840), 1)
+    recording = Recording(pdm_rate_hz=number["microphoneSampleFrequency"], n_samples=n_samples)
+    echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
+    last_m = min(_FARTHEST_M, math.floor(10 * echo_m) / 10)
+    least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
+    step = next((step for step in _RANGE_STEPS if recording.pdm_rate_hz / step >= least_hz), _RANGE_STEPS[-1])
+    processing = Processing(range_m=(min(0.5, max(0.0, last_m)), max(0.0, last_m)), range_decimation=step)
+    return Settings(call=call, recording=recording, processing=processing)
+
+
+def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Processing:
+    """Return ranges and directions."""
+    _refuse(folder, told, "directionsCustom", "delayMatrixCustom", "rangesCustom")
+
+    def number(name: str, otherwise: float) -> float:
+        return checks.finite(f"{folder}: {name}", told.get(name, otherwise))
+
+    if number("elevation2DAngle", 0.0):
+        raise DataError(
+            f"{folder}: elevation2DAngle is {told['elevation2DAngle']:g}, wanted 0; take it out, and give a CSV of "
+            "--directions when processing"
+        )
+    range_m = (number("minRange", standard.range_m[0]), number("maxRange", standard.range_m[1]))
+    processing = standard.replace(range_m=range_m)
+    if "directions" not in told:
+        return processing
+    count = checks.whole(f"{folder}: directions", told["directions"], 1)
+    planar = not any(told[_ELEVATIONS]) if _ELEVATIONS in told else bool(number("2D", 1))
+    half_turn = (-math.pi / 2, math.pi / 2)
+    azimuth_rad = told.get(_AZIMUTHS, half_turn) if planar else half_turn
+    return processing.replace(
+        directions=f"{2 if planar else 3}d:{count}",
+        azimuth_limits_deg=(
+            number("azimuthLowLimit", math.degrees(min(azimuth_rad))),
+            number("azimuthHighLimit", math.degrees(max(azimuth_rad))),
+        ),
+        elevation_limits_deg=(number("elevationLowLimit", -90.0), number("elevationHighLimit", 90.0)),
+    )
+
+
+def _refuse(folder: Path, told: dict[str, Any], *names: str) -> None:
+    """Refuse settings that lie in other files."""
+    for name in names:
+        if name in told:
+            raise DataError(
+                f"{folder}: {name} is the file {told[name]!r}, which a recording cannot hold; {_NOT_HELD[name]}"
+            )

@@ -1,0 +1,268 @@
+"""False alarms are as many as were asked for, and reflectors are found beside clutter and beside each other."""
+
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.special
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.stages.cfar import METHODS, cfar, cfar_peaks, clean, threshold_factor
+from ertis_numba.stages.detect import find_peaks
+from tests.cases import noise
+from tests.test_detect import image_of
+
+N = 32
+SETTINGS = Settings()
+MIDDLE = 18  # of ranges so far apart that each is a resolution and the guard one: 16 + 1 + 1 + 1 + 16 and some
+SPACING_M = 0.05
+
+
+def rayleigh(n_rows, scale=1.0, *, seed=1, n_ranges=37):
+    """Noise in so many directions: only one bin of each is looked at, so that all that is counted is independent."""
+    values = np.random.default_rng(seed).rayleigh(size=(n_rows, n_ranges)) * scale
+    angles = np.linspace(-1.0, 1.0, n_rows)
+    return Energyscape(values.astype(np.float32), angles, np.zeros(n_rows), SPACING_M * np.arange(n_ranges), SETTINGS)
+
+
+def interval(count, total, confidence=0.999):
+    """Probabilities that so many of so many do not speak against (Clopper and Pearson, 1934)."""
+    tail = (1 - confidence) / 2
+    low = scipy.special.betaincinv(count, total - count + 1, tail) if count else 0.0
+    return low, scipy.special.betaincinv(count + 1, total - count, 1 - tail)
+
+
+def assert_share(found, wanted):
+    """Assert that a share of true values is that of a probability."""
+    low, high = interval(int(np.count_nonzero(found)), found.size)
+    assert low <= wanted <= high, (np.mean(found), wanted)
+
+
+def exact(method, scales, false_alarm):
+    """Probability that a bin of scale 1 stands out of bins of others: (reference,), the first half before it.
+
+    For the k-th lowest and for the greater half by counting over which half or which bins are lower.
+    """
+    alpha = threshold_factor(method, N, false_alarm)
+    power = np.asarray(scales, dtype=float) ** 2
+    if method == "cell_averaging":  # the transform of a sum of exponential variables
+        return float(np.prod(1 / (1 + alpha * power / N)))
+    if method == "greatest_of":  # ∫ exp(−α max(a, b)) over both halves, as sums of equal exponentials each
+        grid = np.linspace(0, 40, 40_001)
+        halves = [scipy.special.gammainc(N // 2, grid * (N // 2) / part[0]) for part in (power[:16], power[16:])]
+        cumulated = halves[0] * halves[1]
+        return float(np.sum(np.exp(-alpha * (grid[1:] + grid[:-1]) / 2) * np.diff(cumulated)))
+    # The k-th lowest is below x when k or more bins are; the count of two groups is two binomial ones.
+    grid = np.linspace(0, 40, 8001)
+    groups = [(np.count_nonzero(power == value), 1 - np.exp(-grid / value)) for value in np.unique(power)]
+    counts = np.ones((len(grid), 1))
+    for size, below in groups:
+        each = np.stack([math.comb(size, i) * below**i * (1 - below) ** (size - i) for i in range(size + 1)], axis=1)
+        counts = np.stack([np.convolve(a, b) for a, b in zip(counts, each, strict=True)])
+    cumulated = counts[:, 24:].sum(axis=1)
+    return float(np.sum(np.exp(-alpha * (grid[1:] + grid[:-1]) / 2) * np.diff(cumulated)))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
+def test_factor_gives_the_probability(method, false_alarm):
+    """By another way than the formula it is solved from."""
+    assert exact(method, np.ones(N), false_alarm) == pytest.approx(false_alarm, rel=0.01)
+
+
+ROWS = {1e-2: 5_000, 1e-3: 30_000, 1e-4: 160_000}
+"""Trials: for some twenty false alarms."""
+
+
+@functools.cache
+def noise_alone(false_alarm):
+    return rayleigh(ROWS[false_alarm])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
+def test_false_alarms_in_noise(method, false_alarm):
+    """In the middle and at both ends, whatever the level is."""
+    given = noise_alone(false_alarm)
+    found = cfar(given, false_alarm=false_alarm, method=method)
+    for place in (0, MIDDLE, -1):
+        assert_share(found[:, place], false_alarm)
+    quieter = given.replace(energy=given.energy[:5000] * np.float32(2**-30))
+    np.testing.assert_array_equal(cfar(quieter, false_alarm=false_alarm, method=method), found[:5000])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
+def test_false_alarms_beside_a_clutter_edge(method, false_alarm):
+    """20 dB between one side and the other: what it is right at the edge is what theory says."""
+    step = np.where(np.arange(37) < MIDDLE, 0.1, 1.0)  # the bin in the middle is the first of the louder side
+    found = cfar(rayleigh(ROWS[false_alarm], step, seed=3), false_alarm=false_alarm, method=method)
+    wanted = exact(method, np.where(np.arange(N) < N // 2, 0.1, 1.0), false_alarm)
+    assert_share(found[:, MIDDLE], wanted)
+    # On the quieter side there are fewer than asked for.
+    assert interval(int(np.count_nonzero(found[:, MIDDLE - 1])), len(found))[0] <= false_alarm
+    if method == "greatest_of":
+        assert wanted < 6 * false_alarm
+    else:
+        assert wanted > 6 * false_alarm or false_alarm > 1e-3
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
+def test_false_alarms_beside_a_strong_reflector(method, false_alarm):
+    """40 dB above the noise: the ordered statistic loses some, the means are blind."""
+    scale = np.ones(37)
+    scale[MIDDLE + 5 : MIDDLE + 8] = 100.0
+    found = cfar(rayleigh(ROWS[false_alarm], scale, seed=4), false_alarm=false_alarm, method=method)[:, MIDDLE]
+    assert interval(int(np.count_nonzero(found)), len(found))[0] <= false_alarm
+    if method == "ordered_statistic":
+        scales = np.ones(N)
+        scales[-3:] = 100.0
+        wanted = exact(method, scales, false_alarm)
+        assert_share(found, wanted)
+        assert wanted > 0.15 * false_alarm
+    else:
+        assert not found.any()
+
+
+@pytest.mark.parametrize("false_alarm", [1e-2, 1e-3])
+def test_false_alarms_of_real_bits(false_alarm):
+    """Images of microphones that hear nothing, whose ranges lie closer than the resolution."""
+    settings = Settings(
+        recording=Recording(n_samples=65_536), processing=Processing(directions="2d:9", range_m=(0.3, 2.0))
+    )
+    with Pipeline(settings, device="numpy", max_error_db=-30) as pipeline:
+        shares = [np.mean(cfar(pipeline.process(noise(settings, seed)), false_alarm=false_alarm)) for seed in range(12)]
+    deviation = np.std(shares) / math.sqrt(len(shares))
+    assert np.mean(shares) == pytest.approx(false_alarm, abs=3 * deviation + 0.1 * false_alarm)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_is_the_reference(method):
+    """The same, bin by bin, at the usual spacing of ranges: every other bin, ten bins aside."""
+    image = image_of([(12.0, 0.0, 1.3, 0.3)], directions="2d:5", range_m=(0.8, 1.7))
+    values = np.random.default_rng(1).rayleigh(size=image.energy.shape) * 0.1
+    image = image.replace(energy=(image.energy + values).astype(np.float32))
+    alpha, count = threshold_factor(method, N, 1e-2), image.energy.shape[1]
+    wanted = np.zeros(image.energy.shape, dtype=bool)
+    step, guard = 2, 11
+    for direction, place in np.ndindex(wanted.shape):
+        before = [place - guard - step * n for n in range(1, 200) if place - guard - step * n >= 0]
+        behind = [place + guard + step * n for n in range(1, 200) if place + guard + step * n < count]
+        n_behind = min(len(behind), N - min(len(before), N // 2))
+        power = image.energy[direction, before[: N - n_behind] + behind[:n_behind]].astype(float) ** 2
+        told = {
+            "ordered_statistic": np.sort(power)[23],
+            "cell_averaging": power.mean(),
+            "greatest_of": max(power[:16].mean(), power[16:].mean()),
+        }[method]
+        wanted[direction, place] = image.energy[direction, place].astype(float) ** 2 > alpha * told
+    found = cfar(image, false_alarm=1e-2, method=method)
+    assert wanted.any()
+    assert np.count_nonzero(found != wanted) <= 1  # of rounding
+
+
+def test_weak_reflector_beside_a_strong_one():
+    """26 dB weaker and 20 cm behind: the mean is blinded, the ordered statistic is not."""
+    image = image_of([(0.0, 0.0, 1.2, 1.0), (0.0, 0.0, 1.4, 0.05)], directions="2d:3", range_m=(0.9, 1.65))
+    values = np.random.default_rng(1).rayleigh(size=image.energy.shape) * 0.002
+    image = image.replace(energy=(image.energy + values).astype(np.float32))
+    weak = np.argmin(np.abs(image.range_m - 1.4))
+    found = {method: cfar(image, method=method)[1, weak - 2 : weak + 3].any() for method in METHODS}
+    assert found == {"ordered_statistic": True, "cell_averaging": False, "greatest_of": False}
+
+
+def test_cleaning_keeps_the_strongest_of_each_range():
+    image = image_of([], directions="2d:4", range_m=(0.9, 1.0))
+    energy = np.zeros(image.energy.shape, np.float32)
+    energy[:, 3] = [1.0, 0.55, 0.45, 0.1]
+    energy[:, 5] = [0.0, 0.0, 0.02, 0.01]
+    given = image.replace(energy=energy)
+    kept = clean(given, within_db=6.0).energy
+    np.testing.assert_array_equal(kept[:, 3], np.float32([1.0, 0.55, 0, 0]))
+    np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))  # the half is a little above −6 dB
+    assert not kept[:, [0, 1, 2, 4]].any()
+    kept = clean(given, within_db=6.0, above_mean_db=6.0).energy  # the mean of the first is 0.525, of the other 0.0075
+    assert not kept[:, 3].any()
+    np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))
+    assert given.energy is energy
+
+
+def test_cleaning_takes_side_lobes_away():
+    image = image_of([(12.0, 0.0, 1.2, 1.0), (-40.0, 0.0, 1.4, 0.02)], directions="2d:181", range_m=(0.9, 1.6))
+    kept = clean(image, within_db=10.0)
+    lobes = np.flatnonzero(kept.energy[:, np.argmin(np.abs(image.range_m - 1.2))])
+    assert np.ptp(np.degrees(image.azimuth_rad[lobes])) < 20
+    assert kept.energy[50, np.argmin(np.abs(image.range_m - 1.4))] > 0  # 34 dB weaker, but alone at its range
+
+
+def test_peaks_are_found_however_weak():
+    """46 dB below the strongest, and 14 dB above the noise."""
+    reflectors = [(12.3, 0, 1.1, 1.0), (-33.3, 0, 1.45, 0.005)]
+    image = image_of(reflectors, directions="2d:91", range_m=(0.9, 1.65))
+    rng = np.random.default_rng(1)
+    parts = rng.normal(size=(2, *image.energy.shape)) * 0.001 / math.sqrt(2)
+    image = image.replace(energy=np.abs(image.energy + parts[0] + 1j * parts[1]).astype(np.float32))
+    peaks = cfar_peaks(image)
+    assert len(find_peaks(image)) == 1
+    assert [peak.azimuth_deg for peak in peaks[:2]] == pytest.approx([12.3, -33.3], abs=3)
+    assert peaks[1].level_db == pytest.approx(-46, abs=2)
+    assert len(peaks) < 2 + 8  # of 18,000 bins
+    assert len(cfar_peaks(image, top=1)) == 1
+    assert len(cfar_peaks(image, min_level_db=-20)) == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_silence_stands_out_of_nothing(method):
+    image = rayleigh(3)
+    silent = image.replace(energy=np.zeros_like(image.energy))
+    assert not cfar(silent, method=method).any()
+    silent.energy[1, 20] = 1e-6
+    assert np.argwhere(cfar(silent, method=method)).tolist() == [[1, 20]]
+    assert not clean(image.replace(energy=np.zeros_like(image.energy))).energy.any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"false_alarm": 0.0}, "false_alarm is 0; give a number from 1e-09 to 0.5"),
+        ({"method": "median"}, "method 'median' is unknown; known are ordered_statistic, cell_averaging, greatest_of"),
+        ({"n_reference": 5}, "n_reference is 5; give an even number, half for each side"),
+        ({"n_reference": 2}, "n_reference is 2; give a whole number from 4 to 512"),
+        ({"n_reference": 64}, "image has 37 ranges, and 64 reference bins take 69; give a wider range window"),
+    ],
+)
+def test_refuses(arguments, match):
+    with pytest.raises(ArgumentError, match=match):
+        cfar(rayleigh(2), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"within_db": -1.0}, "within_db is -1; give a number from 0 to 1000"),
+        ({"above_mean_db": -1.0}, "above_mean_db"),
+    ],
+)
+def test_cleaning_refuses(arguments, match):
+    with pytest.raises(ArgumentError, match=match):
+        clean(rayleigh(2), **arguments)
+
+
+def test_bins_that_may_be_peaks_have_the_shape_of_the_image():
+    with pytest.raises(ArgumentError, match=r"where has shape \(2, 2\); give shape"):
+        find_peaks(rayleigh(4), where=np.ones((2, 2), dtype=bool))
+
+
+def test_page_tells_what_theory_says():
+    """The table of false alarms beside a step of 20 dB."""
+    page = (Path(__file__).parents[1] / "docs" / "plots.md").read_text("utf-8")
+    step = np.where(np.arange(N) < N // 2, 0.1, 1.0)
+    for false_alarm in ("1e-2", "1e-3", "1e-4"):
+        row = " | ".join(f"{exact(method, step, float(false_alarm)):.1e}".replace("e-0", "e-") for method in METHODS)
+        assert f"| {false_alarm} | {row} |" in page

@@ -1,0 +1,257 @@
+"""``ertis export`` chooses, writes whole files or none, and the page on it says what is so."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli import export as command
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.interop import FORMATS, TOPICS, export, files_of, format_of
+from ertis_numba.settings import Air
+from ertis_numba.storage import write_energyscapes, write_recording
+from tests.files import SMALL, image, noise
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "export.md").read_text()
+MOUNTED = {"left": ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "right": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, ["export", *map(str, arguments)])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A recording of two sensors, one of one, and their energyscapes."""
+    folder = tmp_path_factory.mktemp("files")
+    both = [
+        Measurement(given.words, SMALL, Stamp(sensor=sensor, sequence=number))
+        for sensor in ("left", "right")
+        for number, given in enumerate(noise())
+    ]
+    write_recording(folder / "both.h5", both, mounting=MOUNTED)
+    write_recording(folder / "rec.h5", noise())
+    pipeline = ertis.Pipeline(SMALL)
+    images = [pipeline.process(given) for given in both]
+    write_energyscapes(folder / "both.energy.h5", images)
+    write_energyscapes(folder / "img.h5", [image(seed=seed) for seed in range(4)])
+    return folder
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_recording_is_processed_with_its_own_settings(files, tmp_path):
+    run(files / "rec.h5", "-o", tmp_path / "a.npz")
+    with ertis.open_recording(files / "rec.h5") as recording, np.load(tmp_path / "a.npz") as data:
+        pipeline = ertis.Pipeline(recording.settings)
+        assert np.array_equal(data["energy"], [pipeline.process(each).energy for each in recording])
+        assert data["sequence"].tolist() == [10, 11, 12]
+
+
+@pytest.mark.parametrize(("places", "chosen"), [("2", [2]), ("1:2", [1, 2]), ("0:0", [0]), (None, [0, 1, 2, 3])])
+def test_measurements_are_chosen(files, tmp_path, places, chosen):
+    run(files / "img.h5", "-o", tmp_path / "a.npz", *(() if places is None else ("--measurement", places)))
+    with np.load(tmp_path / "a.npz") as data:
+        assert np.array_equal(data["energy"], [image(seed=seed).energy for seed in chosen])
+
+
+def test_all_sensors_are_in_the_frame_of_their_platform(files, tmp_path):
+    run(files / "both.h5", "-o", tmp_path / "a.csv", "--top", 3)
+    run(files / "both.energy.h5", "-o", tmp_path / "b.csv", "--sensor", "right", "--top", 3)
+    both, right = rows(tmp_path / "a.csv"), rows(tmp_path / "b.csv")
+    assert {row["sensor"] for row in both} == {"left", "right"}
+    turned = [row for row in both if row["sensor"] == "right"]
+    assert len(turned) == len(right) == 9
+    for there, here in zip(turned, right, strict=True):  # half a turn about z, and a metre back
+        assert float(there["x_m"]) == pytest.approx(-1 - float(here["x_m"]), abs=1e-6)
+        assert float(there["y_m"]) == pytest.approx(-float(here["y_m"]), abs=1e-6)
+        assert there["energy"] == here["energy"]
+
+
+def test_json_and_words(files, tmp_path):
+    done = run(files / "both.h5", "-o", tmp_path / "a.csv", "--json")
+    assert json.loads(done.stdout) == {
+        "output": str(tmp_path / "a.csv"),
+        "format": "csv",
+        "files": [str(tmp_path / "a.csv")],
+        "sensors": ["left", "right"],
+        "measurements": 6,
+    }
+    assert "6 measurements of 2 sensors as csv" in done.stderr
+    assert run(files / "rec.h5", "-o", tmp_path / "b.csv", "--quiet").stderr == ""
+
+
+def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
+    run(files / "img.h5", "-o", tmp_path / "CLOUD.PLY")
+    assert (tmp_path / "CLOUD.PLY").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
+    run(files / "img.h5", "-o", tmp_path / "cloud.txt", "--format", "pcd", "--ascii")
+    assert "\nDATA ascii\n" in (tmp_path / "cloud.txt").read_text()
+    run(files / "rec.h5", "-o", tmp_path / "signals.h5", "-m", 1)
+    assert {path.name for path in tmp_path.iterdir()} == {"CLOUD.PLY", "cloud.txt", "signals.h5", "signals.xml"}
+    assert [format_of("x.h5"), format_of("x.csv"), format_of("x.csv", "npz")] == ["acoular", "csv", "npz"]
+    assert [path.name for path in files_of("x.h5", "acoular")] == ["x.h5", "x.xml"]
+
+
+def test_air_that_changes(tmp_path):
+    """Each image is made in the air of its measurement; one NPZ has one axis of ranges only."""
+    words = noise(count=1)[0].words
+    warm = SMALL.replace(air=Air(temperature_c=35.0))
+    given = [Measurement(words, settings, Stamp(sequence=n)) for n, settings in enumerate((SMALL, warm, warm))]
+    write_recording(tmp_path / "rec.h5", given)
+    run(tmp_path / "rec.h5", "-o", tmp_path / "a.csv", "--top", 1)
+    x_m = [float(row["x_m"]) for row in rows(tmp_path / "a.csv")]
+    assert x_m[1] == x_m[2]
+    done = run(tmp_path / "rec.h5", "-o", tmp_path / "a.npz", code=1)
+    assert "has another range_m than the first, as in other air" in done.stderr
+    run(tmp_path / "rec.h5", "-o", tmp_path / "b.npz", "-m", "1:2")
+
+
+CASES = {
+    "no ending": ("rec.h5 -o a.xyz", 1, "ending of the export '.xyz' is unknown; known are .mcap, .ply, .pcd"),
+    "no output": ("rec.h5", 2, "Missing option '--output'"),
+    "no format": ("rec.h5 -o a --format las", 2, "'las' is not one of 'mcap', 'ply'"),
+    "no such place": ("img.h5 -o a.npz -m 4", 1, "--measurement is 4; give a whole number from 0 to 3"),
+    "places backwards": ("img.h5 -o a.npz -m 2:1", 2, "--measurement runs from 2 to 1; give the smaller number first"),
+    "no places": ("img.h5 -o a.npz -m 1:x", 2, "'1:x' is no measurement, give a number, or two as in 2:5"),
+    "unknown mounting": ("both.energy.h5 -o a.ply", 1, "choose one (--sensor), or export the recording"),
+    "several sensors": ("both.h5 -o a.npz", 1, "sensors left and right cannot share the axes of one npz"),
+    "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement came; give one (--measurement)"),
+    "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; give"),
+    "topics of a cloud": ("img.h5 -o a.ply --topic points", 1, "topics are chosen, which format 'ply' has none of"),
+    "text of a table": ("img.h5 -o a.csv --ascii", 1, "text is asked for, which format 'csv' knows nothing of"),
+    "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
+    "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
+    "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: there is no folder none; make it or give another"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_line_and_nothing_left(files, monkeypatch, name):
+    arguments, code, message = CASES[name]
+    monkeypatch.chdir(files)
+    before = {path: path.stat().st_mtime_ns for path in files.iterdir()}
+    done = run(*arguments.split(), code=code)
+    assert done.stdout == ""
+    assert done.stderr.startswith("ertis: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert {path: path.stat().st_mtime_ns for path in files.iterdir()} == before
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
+    target, *others = files_of(tmp_path / f"a{FORMATS[kind].ending}", kind)
+    for path in (target, *others):
+        path.write_text("mine")
+
+    def broken():
+        yield from [noise(count=1)[0]] if kind == "acoular" else [image(), image(seed=2)]
+        raise DataError("the source broke off; copy it again")
+
+    with pytest.raises(DataError, match="broke off"):
+        export(target, broken(), overwrite=True)
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"mine"}
+    assert len(list(tmp_path.iterdir())) == 1 + len(others)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "acoular"])
+def test_a_full_disk_is_told(tmp_path, kind):
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+
+    class Full(type(Path())):
+        def open(self, *arguments, **options):
+            return Path("/dev/full").open(*arguments, **options)
+
+    from ertis_numba.interop import _mcap, _npz, _point_files, _points  # noqa: PLC0415  what the format needs
+
+    part = Full(tmp_path / "a.part")
+    find = _points.PointFinder(top=256, min_level_db=-60.0)
+    images = [image(seed=seed) for seed in range(30)]
+    table = _points.PointTable.of(images, find, {})
+    write = {
+        "mcap": lambda: _mcap.write_mcap(part, images, find, {}, topics=TOPICS),
+        "npz": lambda: _npz.write_npz(Path("/dev/full"), images, None),
+        "csv": lambda: _point_files.write_csv(part, table),
+        "ply": lambda: _point_files.write_ply(part, table, text=True),
+        "pcd": lambda: _point_files.write_pcd(part, table, text=False),
+    }[kind]
+    with pytest.raises(OSError, match="No space left on device"):
+        write()
+
+
+def test_errors_of_the_disk_name_the_file(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ertis_numba.interop._npz.write_npz", full)
+    with pytest.raises(DataError, match=r"a.npz cannot be written \(No space left on device\); free some space"):
+        export(tmp_path / "a.npz", [image()])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_measurements_are_no_images(tmp_path):
+    with pytest.raises(ArgumentError, match="a measurement is given, wanted energyscapes; process it first"):
+        export(tmp_path / "a.ply", noise())
+    with pytest.raises(ArgumentError, match="format 'las' is unknown"):
+        export(tmp_path / "a.ply", [image()], file_format="las")
+
+
+def test_the_command_knows_the_formats():
+    assert tuple(FORMATS) == command.FORMATS
+    assert command.TOPICS == TOPICS
+
+
+def test_the_page_names_what_the_formats_hold():
+    table = PAGE[PAGE.index("| format |") :].split("\n\n", 1)[0].splitlines()[2:]
+    told = {}
+    for line in table:
+        name, ending, held, _ = (cell.strip() for cell in line.strip("|").split("|"))
+        told[name.strip("`")] = (ending.strip("`"), tuple(re.findall(r"`(\w+)`", held)))
+    assert told == {name: (each.ending, each.holds) for name, each in FORMATS.items()}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with what the page names."""
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    (tmp_path / "FOLDER").mkdir()
+    for number in (3, 4):
+        (tmp_path / "FOLDER" / f"measurement_{number}.bin").write_bytes(bytes(4 * 65_536))
+    settings = {"microphoneSamples": 65_536, "callMinimumFrequency": 25_000, "callMaximumFrequency": 50_000}
+    (tmp_path / "FOLDER" / "recording.json").write_text(json.dumps(settings))
+    (tmp_path / "FOLDER" / "processing.json").write_text(json.dumps({"microphoneLayout": "eRTIS_v3D1", "maxRange": 1}))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_page(place):
+    for words in re.findall(r"^\$ ertis (.*)$", PAGE, re.MULTILINE):
+        done = CliRunner().invoke(cli, words.split())
+        assert done.exit_code == 0, (words, done.stderr, done.exception)
+    made = {path.name for path in place.iterdir()} - {"data", "FOLDER"}
+    assert made == {
+        *("REC.mcap", "CLOUD.ply", "CLOUD.pcd", "POINTS.csv", "IMG.npz", "SIGNALS.h5", "SIGNALS.xml", "REC.h5"),
+    }
+    with ertis.open_recording("REC.h5") as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == [3, 4]
+    code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["(1, 181, 1178) sensor", "{'time': 1, 'sample': 163840}"]

@@ -1,0 +1,269 @@
+"""MCAP as rosbags reads it, which shares no code with what writes: every field is what went in."""
+
+import sys
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Stamp
+from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.interop import TOPICS, export
+from ertis_numba.interop._messages import DEFINITIONS, schema
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.stages.points import PointExtractor
+from tests.files import SMALL, image
+
+TIME_NS = 1_700_000_000_123_456_789
+MOUNTING = {"eRTIS-7": ((1.0, -2.0, 0.5), (0.0, 0.0, 0.6, 0.8)), "2.right": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+
+
+def spatial(seed=1):
+    """An image with elevations."""
+    grid = direction_grid(Processing(directions="3d:60"))
+    return image(*np.degrees([grid.azimuth_rad, grid.elevation_rad]), range_m=np.linspace(0.5, 1.5, 50), seed=seed)
+
+
+def stamped(given, sensor, sequence, time_ns):
+    return given.replace(stamp=Stamp(sensor=sensor, sequence=sequence, timestamp_ns=time_ns))
+
+
+GIVEN = [
+    stamped(image(seed=1), "eRTIS-7", 10, TIME_NS),
+    stamped(image(seed=2), "eRTIS-7", 2**40 + 11, TIME_NS + 50_000_000),
+    stamped(spatial(), "2.right", 10, TIME_NS + 1),
+]
+KINDS = {
+    "points": "sensor_msgs/msg/PointCloud2",
+    "image": "sensor_msgs/msg/Image",
+    "sonar_image": "marine_acoustic_msgs/msg/ProjectedSonarImage",
+}
+FRAMES = {"eRTIS-7": "/eRTIS_7", "2.right": "/sensor_2_right"}
+
+
+def read(path):
+    """What rosbags finds: (topic, time) to message, and the profiles of topics."""
+    messages, profiles, kinds = {}, {}, {}
+    with AnyReader([path]) as reader:
+        for connection in reader.connections:
+            profiles[connection.topic] = connection.ext.offered_qos_profiles
+            kinds[connection.topic] = connection.msgtype
+        for connection, time_ns, raw in reader.messages():
+            messages[connection.topic, time_ns] = reader.deserialize(raw, connection.msgtype)
+    return messages, profiles, kinds
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    (path,) = export(tmp_path_factory.mktemp("bag") / "a.mcap", GIVEN, mounting=MOUNTING, top=40, min_level_db=-60.0)
+    return read(path)
+
+
+def told(message):
+    """A message as dicts, lists and numbers."""
+    if hasattr(message, "__msgtype__"):
+        return {name: told(value) for name, value in vars(message).items() if name.islower() and name != "__msgtype__"}
+    if isinstance(message, np.ndarray):
+        return message.tolist()
+    return [told(item) for item in message] if isinstance(message, list) else message
+
+
+def header(given, frame):
+    sec, nanosec = divmod(given.stamp.timestamp_ns, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
+
+
+def test_topics(bag):
+    messages, profiles, kinds = bag
+    assert tuple(KINDS) == TOPICS
+    wanted = {f"{base}/{topic}": kind for base in FRAMES.values() for topic, kind in KINDS.items()}
+    assert kinds == wanted | {"/tf_static": "tf2_msgs/msg/TFMessage"}
+    times = {(f"{FRAMES[each.stamp.sensor]}/{topic}", each.stamp.timestamp_ns) for each in GIVEN for topic in TOPICS}
+    assert set(messages) == times | {("/tf_static", TIME_NS)}
+    for topic, (profile,) in profiles.items():
+        static = topic == "/tf_static"
+        assert isinstance(profile, Qos)
+        assert profile.durability is (QosDurability.TRANSIENT_LOCAL if static else QosDurability.VOLATILE)
+        assert (profile.history, profile.depth) == (QosHistory.KEEP_LAST, 1 if static else 10)
+        assert profile.reliability is QosReliability.RELIABLE
+        assert profile.lifespan == profile.deadline == (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
+
+
+@pytest.mark.parametrize("given", GIVEN, ids=["first", "second", "spatial"])
+def test_points(bag, given):
+    sensor = given.stamp.sensor
+    message = bag[0][f"{FRAMES[sensor]}/points", given.stamp.timestamp_ns]
+    grid = Grid(given.azimuth_rad, given.elevation_rad)
+    cloud = PointExtractor(given.settings, grid, top=40, min_level_db=-60.0)(given)
+    assert len(cloud) > 1
+    rows = np.column_stack([cloud.position_m, cloud.energy])
+    assert told(message) == {
+        "header": header(given, sensor),
+        "height": 1,
+        "width": len(cloud),
+        "fields": [
+            {"name": name, "offset": 4 * number, "datatype": 7, "count": 1}
+            for number, name in enumerate(["x", "y", "z", "intensity"])
+        ],
+        "is_bigendian": False,
+        "point_step": 16,
+        "row_step": 16 * len(cloud),
+        "data": list(rows.astype("<f4").tobytes()),
+        "is_dense": True,
+    }
+
+
+@pytest.mark.parametrize("given", GIVEN, ids=["first", "second", "spatial"])
+def test_sonar_image(bag, given):
+    sensor = given.stamp.sensor
+    message = bag[0][f"{FRAMES[sensor]}/sonar_image", given.stamp.timestamp_ns]
+    energies = message.image.data.view("<f4").reshape(len(given.range_m), len(given.azimuth_rad))
+    assert np.array_equal(energies, given.energy.T)
+    assert np.array_equal(message.ranges, given.range_m.astype(np.float32))
+    # The frame is z forward, x up, y right; that of the sensor x forward, y left, z up.
+    forward, left, up = unit_vectors(given.azimuth_rad, given.elevation_rad).T
+    beams = [[beam.x, beam.y, beam.z] for beam in message.beam_directions]
+    assert np.array_equal(beams, np.column_stack([up, -left, forward]))
+    rest = told(message)
+    for name in ("beam_directions", "ranges"):
+        rest.pop(name)
+    rest["image"].pop("data")
+    assert rest == {
+        "header": header(given, f"{sensor}_sonar"),
+        "ping_info": {
+            "frequency": 37_500.0,
+            "sound_speed": float(np.float32(sound_speed_m_s(given.settings.air))),
+            "tx_beamwidths": [],
+            "rx_beamwidths": [],
+        },
+        "image": {"is_bigendian": False, "dtype": 8, "beam_count": len(given.azimuth_rad)},
+    }
+
+
+def test_pictures(bag):
+    """Planar: columns from the left, rows from the far end. In space: the brightest pixel is in the right direction."""
+    messages, _, _ = bag
+    planar = messages["/eRTIS_7/image", TIME_NS]
+    given = GIVEN[0]
+    assert (planar.height, planar.width, planar.step) == (400, 37, 37)
+    assert (planar.encoding, planar.is_bigendian) == ("mono8", 0)
+    assert told(planar.header) == header(given, "eRTIS-7")
+    pixels = planar.data.reshape(400, 37)
+    level_db = 20 * np.log10(given.energy / given.energy.max())
+    wanted = np.rint(255 * np.clip(1 + level_db / 40, 0, 1)).T[::-1, ::-1]
+    assert np.abs(pixels - wanted).max() <= 1
+    assert pixels.max() == 255
+    skewed = given.energy.copy()
+    skewed[5, 30] = 1.0  # to the right of the middle and near
+    assert given.azimuth_rad[5] < 0
+    row, column = np.unravel_index(_pixels(given.replace(energy=skewed)).argmax(), (400, 37))
+    assert (row, column) == (400 - 1 - 30, 37 - 1 - 5)
+
+
+def _pixels(given):
+    from ertis_numba.interop._picture import Picture  # noqa: PLC0415  as the file has it
+
+    return Picture(given)(given.energy)
+
+
+@pytest.mark.parametrize("direction", [0, 17, 33, 59])
+def test_map_of_directions(direction):
+    given = spatial()
+    energy = np.full_like(given.energy, 0.001)
+    energy[direction, 20] = 1.0
+    pixels = _pixels(given.replace(energy=energy))
+    rows, columns = np.nonzero(pixels == 255)
+    height, width = pixels.shape
+    azimuth_rad = np.interp(columns.mean(), [0, width - 1], [given.azimuth_rad.max(), given.azimuth_rad.min()])
+    elevation_rad = np.interp(rows.mean(), [0, height - 1], [given.elevation_rad.max(), given.elevation_rad.min()])
+    seen = unit_vectors(np.array(azimuth_rad), np.array(elevation_rad))
+    there = unit_vectors(given.azimuth_rad, given.elevation_rad)[direction]
+    assert np.degrees(np.arccos(min(1.0, float(seen @ there)))) < 12  # of 18° between directions
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "elevation_deg", "shape"),
+    [([5], [10], (1, 1)), ([-30, 0, 30], [10, 10, 10], (1, 3)), ([0, 0], [-9, 9], (2, 1))],
+)
+def test_maps_of_few_directions(azimuth_deg, elevation_deg, shape):
+    pixels = _pixels(image(azimuth_deg, elevation_deg))
+    assert pixels.shape == shape
+    assert pixels.max() == 255
+
+
+def test_static_transforms(bag):
+    message = bag[0]["/tf_static", TIME_NS]
+    found = {each.child_frame_id: (each.header.frame_id, told(each.transform)) for each in message.transforms}
+    assert set(found) == {"eRTIS-7", "eRTIS-7_sonar", "2.right", "2.right_sonar"}
+    parent, transform = found["eRTIS-7"]
+    assert parent == "base_link"
+    assert tuple(transform["translation"].values()) == MOUNTING["eRTIS-7"][0]
+    assert tuple(transform["rotation"].values()) == MOUNTING["eRTIS-7"][1]
+    parent, transform = found["2.right_sonar"]
+    assert parent == "2.right"
+    assert set(transform["translation"].values()) == {0.0}
+    turn = np.array(list(transform["rotation"].values()))
+    axis, w = turn[:3], turn[3]
+    for beam, sensor in (((0, 0, 1), (1, 0, 0)), ((1, 0, 0), (0, 0, 1)), ((0, 1, 0), (0, -1, 0))):
+        turned = beam + 2 * w * np.cross(axis, beam) + 2 * np.cross(axis, np.cross(axis, beam))
+        np.testing.assert_allclose(turned, sensor, atol=1e-12)
+
+
+def test_definitions_are_those_of_ros():
+    """By the hashes of REP 2016; those of the marine messages are in no store and are compared by their fields."""
+    own, theirs = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_JAZZY)
+    for name in ("tf2_msgs/msg/TFMessage", *KINDS.values()):
+        own.register(get_types_from_msg(schema(name), name))
+    assert set(own.fielddefs) >= set(DEFINITIONS)
+    compared = [name for name in DEFINITIONS if name in theirs.fielddefs]
+    assert len(compared) == len(DEFINITIONS) - 3
+    for name in compared:
+        assert own.hash_rihs01(name) == theirs.hash_rihs01(name)
+        assert own.fielddefs[name][0] == theirs.fielddefs[name][0]  # constants, which no hash holds
+    constants, fields = own.fielddefs["marine_acoustic_msgs/msg/SonarImageData"]
+    kinds = ("UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "UINT64", "INT64", "FLOAT32", "FLOAT64")
+    assert [constant[0] for constant in constants] == [f"DTYPE_{kind}" for kind in kinds]
+    assert [constant[2] for constant in constants] == list(range(10))
+    assert [field[0] for field in fields] == ["is_bigendian", "dtype", "beam_count", "data"]
+    _, fields = own.fielddefs["marine_acoustic_msgs/msg/PingInfo"]
+    assert [field[0] for field in fields] == ["frequency", "sound_speed", "tx_beamwidths", "rx_beamwidths"]
+
+
+def test_settings_are_in_the_metadata(tmp_path):
+    from mcap.reader import make_reader  # noqa: PLC0415  one test needs it
+
+    (path,) = export(tmp_path / "a.mcap", GIVEN[:1], topics=["points"])
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        (record,) = reader.iter_metadata()
+        assert reader.get_header().profile == "ros2"
+        assert [message.sequence for _, channel, message in reader.iter_messages("/eRTIS_7/points")] == [10]
+    assert (record.name, record.metadata["sensor"]) == ("ertis_numba/eRTIS-7", "eRTIS-7")
+    settings = Settings.from_toml(record.metadata["settings"])
+    assert settings.replace(array=SMALL.array) == SMALL
+    assert set(read(path)[2]) == {"/eRTIS_7/points", "/tf_static"}  # and no transform, as nobody knows one
+    assert read(path)[0]["/tf_static", TIME_NS].transforms == []
+
+
+def test_what_is_refused(tmp_path, monkeypatch):
+    given = GIVEN[0]
+    for items, options, message in (
+        ([], {}, "no energyscape is given"),
+        ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, image, sonar_image"),
+        ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "wanted one from 1970 to 2038"),
+        (
+            [given.replace(stamp=Stamp(sensor=name)) for name in ("a-b", "a.b")],
+            {},
+            "sensors a-b and a.b would share topics /a_b; choose one",
+        ),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            export(tmp_path / "a.mcap", items, **options)
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    with pytest.raises(ArgumentError, match=r"needs mcap and mcap-ros2-support .*pip install 'ertis-numba\[ros\]'"):
+        export(tmp_path / "a.mcap", [given])
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,168 @@
+"""Points come back from PLY, PCD and CSV, as readers that share no code with the writers see them."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+from pypcd4 import PointCloud as Pcd
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Stamp
+from ertis_numba.geometry import Grid
+from ertis_numba.interop import FORMATS, export
+from ertis_numba.stages.points import PointExtractor
+from tests.files import image
+
+REFLECTORS = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
+TURNED = ((1.0, 2.0, 3.0), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))  # a quarter turn to the left
+FINDING = {"top": 40, "min_level_db": -60.0}
+
+
+def images(sensor="eRTIS-7", count=2, **stamp):
+    """Planar images of noise and a reflector, with stamps of large numbers."""
+    return [
+        image(seed=seed + 1).replace(
+            stamp=Stamp(
+                sensor=sensor,
+                **{
+                    "sequence": 4_000_000_000 + seed,
+                    "epoch": 2**62 + seed,
+                    "sync_count": 2**40 + seed,
+                    "timestamp_ns": 1_700_000_000_123_456_789 + seed,
+                }
+                | stamp,
+            )
+        )
+        for seed in range(count)
+    ]
+
+
+def expected(given, **mounting):
+    """The clouds of images, by the stage that finds them."""
+    return [
+        PointExtractor(each.settings, Grid(each.azimuth_rad, each.elevation_rad), **FINDING)(each).replace(**mounting)
+        for each in given
+    ]
+
+
+def read_ply(path):
+    data = plyfile.PlyData.read(path)
+    return data["vertex"].data, data.comments
+
+
+def read_pcd(path):
+    cloud = Pcd.from_path(path)
+    lines = path.read_bytes().partition(b"DATA")[0].decode().splitlines()
+    return cloud.pc_data, [line.removeprefix("# ") for line in lines if line.startswith("#")]
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
+def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
+    given = [*images("left"), *images("right", 1, sequence=7)]
+    (path,) = export(
+        tmp_path / f"a.{kind}", given, text=text, mounting=dict.fromkeys(("left", "right"), TURNED), **FINDING
+    )
+    points, comments = read(path)
+    assert points.dtype.names == FORMATS[kind].holds
+    assert {"frame base_link", "sensor 0 left", "sensor 1 right"} <= set(comments)
+    clouds = expected(given, translation_m=TURNED[0], rotation_xyzw=TURNED[1])
+    assert len(points) == sum(map(len, clouds)) > 60
+    where = np.concatenate([cloud.on_platform_m() for cloud in clouds])
+    assert np.array_equal(np.column_stack([points[axis] for axis in "xyz"]), where)
+    assert points["x"].dtype == np.float32
+    assert np.array_equal(points["intensity"], np.concatenate([cloud.energy for cloud in clouds]))
+    uncertainty_m = np.column_stack([points["uncertainty_range"], points["uncertainty_across"]])
+    assert np.array_equal(uncertainty_m, np.concatenate([cloud.uncertainty_m for cloud in clouds]))
+    assert np.ptp(uncertainty_m[:, 1]) > 0
+    counts = [len(cloud) for cloud in clouds]
+    assert np.array_equal(points["sensor"], np.repeat([0, 0, 1], counts))
+    assert np.array_equal(points["sequence"], np.repeat([4_000_000_000, 4_000_000_001, 7], counts))
+    times_ns = points["sec"].astype(np.int64) * 1_000_000_000 + points["nanosec"]
+    assert np.array_equal(times_ns, np.repeat([each.stamp.timestamp_ns for each in given], counts))
+
+
+def test_csv_comes_back(tmp_path):
+    given = images('left, and"right')  # which a recording would refuse
+    (path,) = export(tmp_path / "a.csv", given, **FINDING)
+    with path.open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert tuple(head) == FORMATS["csv"].holds
+    clouds = expected(given)
+    columns = dict(zip(head, zip(*rows, strict=True), strict=True))
+    assert set(columns["sensor"]) == {'left, and"right'}
+    stamps = [cloud.stamp for cloud in clouds for _ in range(len(cloud))]
+    for name in ("epoch", "sequence", "sync_count", "timestamp_ns"):
+        assert [int(cell) for cell in columns[name]] == [getattr(stamp, name) for stamp in stamps]
+    where = np.concatenate([cloud.position_m for cloud in clouds])
+    uncertainty_m = np.concatenate([cloud.uncertainty_m for cloud in clouds])
+    energy = np.concatenate([cloud.energy for cloud in clouds])
+    wanted = np.column_stack([where, energy, uncertainty_m])
+    names = ("x_m", "y_m", "z_m", "energy", "uncertainty_range_m", "uncertainty_across_m")
+    assert np.array_equal(np.column_stack([np.array(columns[name], dtype=np.float32) for name in names]), wanted)
+
+
+def test_the_nearest_reflector_is_where_it_is(tmp_path):
+    """From the words of a scene to a cloud that another program reads."""
+    with ertis.open_recording(REFLECTORS) as recording:
+        pipeline = ertis.Pipeline(recording.settings)
+        export(tmp_path / "a.ply", [pipeline.process(recording[0])])
+    points, _ = read_ply(tmp_path / "a.ply")
+    first = points[0]
+    range_m = float(np.hypot(first["x"], first["y"]))
+    assert range_m == pytest.approx(1.15, abs=0.005)
+    assert np.degrees(np.arctan2(first["y"], first["x"])) == pytest.approx(-38.0, abs=0.5)
+    assert first["z"] == 0
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
+def test_silence_is_a_cloud_without_points(tmp_path, kind, read, text):
+    silent = image().replace(energy=np.zeros_like(image().energy))
+    (path,) = export(tmp_path / f"a.{kind}", [silent], text=text)
+    if kind == "pcd" and text:  # which that reader cannot read
+        assert path.read_text().endswith("POINTS 0\nDATA ascii\n")
+        return
+    points, comments = read(path)
+    assert len(points) == 0
+    assert "frame sensor" in comments
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
+def test_what_one_microphone_cannot_tell_is_infinite(tmp_path, kind, read, text):
+    given = images(sequence=1, count=1)[0]
+    array = given.settings.array.replace(positions_m=((0.0, 0.0, 0.0),))
+    export(tmp_path / f"a.{kind}", [given.replace(settings=given.settings.replace(array=array))], text=text)
+    points, _ = read(tmp_path / f"a.{kind}")
+    assert np.isfinite(points["uncertainty_range"]).all()
+    assert np.isinf(points["uncertainty_across"]).all()
+
+
+def test_of_an_unknown_mounting_the_frame_is_that_of_the_sensor(tmp_path):
+    given = images("left", 1)
+    export(tmp_path / "a.ply", given, **FINDING)
+    points, comments = read_ply(tmp_path / "a.ply")
+    assert "frame left" in comments
+    assert np.array_equal(points["x"], expected(given)[0].position_m[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "message"),
+    [
+        ([], {}, "no energyscape is given; give at least one"),
+        ([*images("left"), *images("right")], {}, "where sensors left, right are on their platform is not known"),
+        (images(sequence=2**32), {}, "sequence of a measurement is 4294967296, more than the format holds; use csv"),
+        (images(timestamp_ns=-1), {}, "has the time -1 ns, wanted one from 1970 to 2038; use npz or csv"),
+        (images(timestamp_ns=2**62), {}, "wanted one from 1970 to 2038"),
+        (images(), {"top": 0}, "top is 0; give a whole number of at least 1"),
+        (images(), {"mounting": {"eRTIS-7": ((0, 0, 0), (0, 0, 0, 2))}}, "has length 2; give a unit quaternion"),
+    ],
+)
+def test_what_cannot_be_in_a_cloud(tmp_path, given, options, message):
+    with pytest.raises(ArgumentError, match=message):
+        export(tmp_path / "a.ply", given, **options)
+    assert list(tmp_path.iterdir()) == []

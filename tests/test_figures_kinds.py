@@ -1,0 +1,238 @@
+"""Each kind of picture shows what is there, where it is, in each theme, with one microphone and with many."""
+
+import functools
+import io
+import itertools
+import time
+
+import matplotlib.text
+import matplotlib.transforms
+import numpy as np
+import pytest
+
+from ertis_numba import figures
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement, Peak, Stamp
+from ertis_numba.geometry import direction_grid
+from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.waveform import call_at
+from tests.cases import words_of
+from tests.files import image
+
+STAMP = Stamp(sensor="eRTIS-7", sequence=12, timestamp_ns=1_700_000_000_123_456_789)
+SETTINGS = Settings(recording=Recording(n_samples=81_920), processing=Processing(range_m=(0.5, 2.4)))
+ONE = Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=32)
+ARRAYS = {1: ONE, 32: Array()}
+LOOKS = {
+    "dark": {},
+    "one column": {"theme": "paper", "columns": 1},
+    "two columns": {"theme": "paper", "font": "serif"},
+}
+PEAKS = [
+    Peak(azimuth_deg=20.0 + turn, elevation_deg=3.0, range_m=2.5 + turn / 50, level_db=-2.0 * turn) for turn in range(7)
+]
+
+
+def heard(n_mics=32, delay_s=9e-3, *, settings=SETTINGS):
+    """A measurement of one call that reaches all microphones at the same time."""
+    settings = settings.replace(array=ARRAYS[n_mics])
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    signal = 0.5 * call_at(settings.call, time_s - delay_s)
+    return Measurement(words_of(np.broadcast_to(signal, (n_mics, len(signal)))), settings, STAMP)
+
+
+def solid(count=300, settings=None, **more):
+    """A hemisphere of speckle."""
+    grid = direction_grid(Processing(directions=f"3d:{count}", azimuth_limits_deg=(-80.0, 80.0)))
+    more = {"settings": settings} if settings else more
+    return image(np.degrees(grid.azimuth_rad), np.degrees(grid.elevation_rad), **more).replace(stamp=STAMP)
+
+
+@functools.cache
+def pictures(n_mics):
+    """Each kind of picture, by its name."""
+    settings = SETTINGS.replace(array=ARRAYS[n_mics])
+    planar, hemisphere = image().replace(stamp=STAMP, settings=settings), solid(settings=settings)
+    measurement = heard(n_mics)
+    marks = {"peaks": PEAKS}
+    return {
+        "plot": lambda **look: figures.plot(planar, **marks, **look),
+        "plot, hemisphere": lambda **look: figures.plot(hemisphere, **marks, **look),
+        "plot, one direction": lambda **look: figures.plot(image([12.0]), **look),
+        "polar": lambda **look: figures.polar(hemisphere, **look),
+        "polar, narrow": lambda **look: figures.polar(image(np.linspace(-40, 40, 9)), **marks, **look),
+        "polar, all around": lambda **look: figures.polar(image(np.linspace(-180, 180, 73)), **look),
+        "projection": lambda **look: figures.projection(hemisphere, **marks, **look),
+        "slices": lambda **look: figures.slices(hemisphere, **marks, **look),
+        "slices, planar": lambda **look: figures.slices(planar, **marks, **look),
+        "signals": lambda **look: figures.signals(measurement, **look),
+        "matched filter": lambda **look: figures.matched_filter(measurement, **look),
+        "array": lambda **look: figures.array(settings, **look),
+        "array, steered": lambda **look: figures.array(
+            settings, frequencies_hz=[20e3, 40e3, 80e3, 90e3], azimuth_deg=-30, elevation_deg=20, **look
+        ),
+    }
+
+
+KINDS = {
+    "plot": (32,),
+    "plot, hemisphere": (32,),
+    "plot, one direction": (32,),
+    "polar": (32,),
+    "polar, narrow": (32,),
+    "polar, all around": (32,),
+    "projection": (32,),
+    "slices": (32,),
+    "slices, planar": (32,),
+    "signals": (1, 32),
+    "matched filter": (1, 32),
+    "array": (1, 32),
+    "array, steered": (32,),
+}
+"""With how many microphones each is worth a look."""
+
+
+def texts_of(figure):
+    """All that is written, as text and box in points."""
+    for axes in figure.axes:
+        for drawn in (*axes.images, *axes.collections):
+            drawn.set_visible(False)  # takes most of the time
+    figure.draw_without_rendering()
+    found = [*figure.texts]
+    for axes in figure.axes:
+        found += [*axes.texts, axes.title]
+        if axes.get_legend():
+            found += [*axes.get_legend().get_texts(), axes.get_legend().get_title()]
+        if axes.axison:
+            for axis in (axes.xaxis, axes.yaxis):
+                low, high = sorted(axis.get_view_interval())
+                found += [axis.label]
+                found += [
+                    tick.label2 if tick.label2.get_visible() else tick.label1
+                    for tick in axis.get_major_ticks()
+                    if low - 1e-9 <= tick.get_loc() <= high + 1e-9
+                ]
+    shown = [text for text in found if text.get_visible() and text.get_text().strip()]
+    scale = 72 / figure.dpi
+    boxes = [matplotlib.text.Text.get_window_extent(text) for text in shown]  # of a note without its arrow
+    return [
+        (text.get_text(), matplotlib.transforms.Bbox(box.get_points() * scale))
+        for text, box in zip(shown, boxes, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("kind", "n_mics"), [(kind, count) for kind, counts in KINDS.items() for count in counts])
+@pytest.mark.parametrize("look", LOOKS)
+def test_no_words_overlap_or_leave_the_page(kind, look, n_mics):
+    figure = pictures(n_mics)[kind](**LOOKS[look])
+    width_pt, height_pt = 72 * figure.get_size_inches()
+    texts = texts_of(figure)
+    assert len(texts) > 8
+    for text, box in texts:
+        assert box.x0 >= -0.5, text
+        assert box.y0 >= -0.5, text
+        assert box.x1 <= width_pt + 0.5, text
+        assert box.y1 <= height_pt + 0.5, text
+    for (first, ours), (second, theirs) in itertools.combinations(texts, 2):
+        across = min(ours.x1, theirs.x1) - max(ours.x0, theirs.x0)
+        up = min(ours.y1, theirs.y1) - max(ours.y0, theirs.y0)
+        assert min(across, up) < 0.75, (first, second)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if not kind.startswith("polar,")])
+def test_pictures_say_what_they_show(kind):
+    """Units at all axes, and the settings that matter."""
+    figure = pictures(32)[kind]()
+    texts = [text for text, _ in texts_of(figure)]
+    for axes in figure.axes:
+        if axes.axison:
+            labels = [label for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
+            assert labels
+            assert all("(" in label or "dB" in label for label in labels), labels
+    heading = " ".join(text.get_text() for text in figure.texts)
+    wanted = ["eRTIS_v3D1", "20 °C"]
+    if not kind.startswith("array"):
+        wanted += ["call 25–50 kHz, 2.5 ms", " m"]
+    if not kind.startswith(("array", "plot, one")):
+        wanted += ["eRTIS-7", "measurement 12", "2023-11-14 22:13:20.123 UTC"]
+    if kind.startswith(("plot", "projection", "slices")):
+        wanted += ["method fast", "error up to −35 dB"]
+    assert all(word in heading for word in wanted), heading
+    assert any("dB" in text for text in texts)
+
+
+def test_sizes_of_print():
+    """85 and 170 mm, letters from 6 to 8 points, ink on white."""
+    for columns, width_mm in ((1, 85.0), (2, 170.0)):
+        figure = figures.plot(image(), theme="paper", columns=columns, font="serif", peaks=PEAKS)
+        assert figure.get_size_inches()[0] * 25.4 == pytest.approx(width_mm)
+        sizes = {text.get_fontsize() for text in [*figure.texts, *figure.axes[0].texts]}
+        assert min(sizes) >= 6
+        assert max(sizes) <= 8
+        assert matplotlib.colors.to_hex(figure.get_facecolor()) == "#ffffff"
+        assert figure.texts[0].get_fontfamily() == ["STIXGeneral"]
+
+
+@pytest.mark.parametrize("kind", ["svg", "pdf"])
+def test_files_are_small_and_the_same_each_time(kind):
+    """What is drawn in colours is a picture in them, and letters of a PDF are letters."""
+    sizes = []
+    for name in ("plot, hemisphere", "matched filter"):
+        files, figure = [io.BytesIO(), io.BytesIO()], pictures(32)[name](theme="paper", columns=1)
+        for file in files:
+            figures.save(figure, file, format=kind)
+        assert files[0].getvalue() == files[1].getvalue()
+        sizes.append(len(files[0].getvalue()))
+        if kind == "pdf":
+            assert b"/Type0" in files[0].getvalue()  # TrueType, as journals ask for, not outlines
+    assert max(sizes) < 1_500_000, sizes  # of noise, which cannot be compressed
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("draw", [figures.plot, figures.slices, figures.projection])
+def test_big_images_are_drawn_within_2_s(draw):
+    big = solid(3000, range_m=np.linspace(0.5, 5.0, 1178))
+    best = np.inf
+    for _ in range(3):
+        start = time.perf_counter()
+        figures.save(draw(big, peaks=PEAKS), io.BytesIO(), format="png")
+        best = min(best, time.perf_counter() - start)
+    assert best < 2
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("draw", [figures.signals, figures.matched_filter])
+def test_recordings_are_drawn_within_2_s(draw):
+    measurement = heard(settings=Settings.from_preset("default_25_50"))
+    best = np.inf
+    for _ in range(3):
+        start = time.perf_counter()
+        figures.save(draw(measurement), io.BytesIO(), format="png")
+        best = min(best, time.perf_counter() - start)
+    assert best < 2
+
+
+@pytest.mark.parametrize(
+    ("draw", "match"),
+    [
+        (lambda: figures.plot(image(), theme="drak"), "theme 'drak' is unknown "),
+        (lambda: figures.plot(image(), font="comic"), "font 'comic' is unknown; known are sans, serif"),
+        (lambda: figures.plot(image(), theme="paper", columns=3), "columns '3' is unknown; known are 1, 2"),
+        (lambda: figures.plot(image(), columns=1), "columns is 1, which theme 'dark' has none of; give theme 'paper'"),
+        (lambda: figures.slices(image(), height_m=3.0), "height_m is 3, where the image shows nothing; give a plane"),
+        (lambda: figures.slices(image(), left_m=np.nan), "left_m is nan; give a finite number"),
+        (lambda: figures.slices(solid(), left_m=9.0), "left_m is 9, where the image shows nothing"),
+        (
+            lambda: figures.signals(heard(), microphone=32),
+            "microphone 32 is none of the 32 enabled ones; give one from",
+        ),
+        (lambda: figures.matched_filter(heard(), microphone=-1), "microphone is -1; give a whole number of at least 0"),
+        (lambda: figures.array(Settings(), frequencies_hz=[]), "frequencies_hz holds 0 frequencies; give 1 to 5"),
+        (lambda: figures.array(Settings(), frequencies_hz=[0.0]), "frequencies_hz is 0; give a number above 0"),
+        (lambda: figures.array(Settings(), azimuth_deg=91), "azimuth_deg is 91; give a number from -90 to 90"),
+        (lambda: figures.array(Settings(), dynamic_range_db=0), "dynamic_range_db is 0; give a number above 0"),
+    ],
+)
+def test_arguments_that_are_refused(draw, match):
+    with pytest.raises(ArgumentError, match=match):
+        draw()

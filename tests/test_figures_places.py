@@ -1,0 +1,179 @@
+"""What pictures show is where it is: reflectors, echoes, sweeps, microphones and beams."""
+
+import numpy as np
+import pytest
+
+from ertis_numba import figures
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.figures._array import pattern_db, width_deg
+from ertis_numba.figures._hearing import echoes, signals
+from ertis_numba.figures._signals import spectrogram
+from ertis_numba.frames import Measurement, Peak
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.settings import Array, Call, Settings
+from ertis_numba.waveform import call_at
+from tests.cases import words_of
+from tests.test_figures_kinds import ONE, SETTINGS, STAMP, heard, solid
+
+
+def brightest(axes):
+    """Where the brightest pixel of the raster is, in the coordinates of its axes."""
+    shown = axes.images[0]
+    values = np.ma.filled(shown.get_array(), -np.inf)
+    row, column = np.unravel_index(np.nanargmax(values), values.shape)
+    left, right, bottom, top = shown.get_extent()
+    return (
+        left + (column + 0.5) * (right - left) / values.shape[1],
+        bottom + (row + 0.5) * (top - bottom) / values.shape[0],
+    )
+
+
+def with_reflector(azimuth_deg, elevation_deg, range_m):
+    """A hemisphere that is dark but for one reflector as wide as a beam, and the bin that is its middle."""
+    given = solid(3000, range_m=np.linspace(0.5, 5.0, 600))
+    looks = unit_vectors(given.azimuth_rad, given.elevation_rad)
+    middle = looks[np.argmax(looks @ unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg)))]
+    beam = np.exp(-0.5 * (np.linalg.norm(looks - middle, axis=1) / 0.05) ** 2)
+    pulse = np.exp(-0.5 * ((given.range_m - range_m) / 0.01) ** 2)
+    energy = (beam[:, None] * pulse + 1e-4).astype(np.float32)
+    return given.replace(energy=energy), range_m * middle
+
+
+def test_slices_show_a_reflector_where_it_is():
+    given, (ahead_m, left_m, up_m) = with_reflector(25.0, 12.0, 3.0)
+    figure = figures.slices(given, height_m=float(up_m), left_m=float(left_m))
+    level, upright = figure.axes[:2]
+    assert brightest(level) == pytest.approx((left_m, ahead_m), abs=0.03)
+    assert brightest(upright) == pytest.approx((ahead_m, up_m), abs=0.03)
+    assert level.get_xlim()[0] > level.get_xlim()[1]  # y is to the left
+    # Elsewhere there is nothing of it.
+    other = figures.slices(given, height_m=float(up_m) + 1.0, left_m=float(left_m) - 1.0)
+    assert [np.nanmax(axes.images[0].get_array()) for axes in other.axes[:2]] == pytest.approx([-40, -40], abs=1)
+
+
+def test_projection_shows_a_reflector_where_it_is():
+    given, place_m = with_reflector(-40.0, 20.0, 2.0)
+    (axes, *_) = figures.projection(given).axes
+    elevation_deg = np.degrees(np.arcsin(place_m[2] / 2.0))
+    assert brightest(axes) == pytest.approx((np.degrees(np.arctan2(place_m[1], place_m[0])), elevation_deg), abs=1.0)
+
+
+def test_polar_takes_the_strongest_elevation():
+    given, place_m = with_reflector(30.0, 30.0, 3.0)
+    (axes, *_) = figures.polar(given).axes
+    azimuth_rad = np.arctan2(place_m[1], place_m[0])
+    assert brightest(axes) == pytest.approx((-3 * np.sin(azimuth_rad), 3 * np.cos(azimuth_rad)), abs=0.12)
+
+
+def test_reflectors_are_ringed_in_the_planes_that_they_lie_in():
+    given, (ahead_m, left_m, up_m) = with_reflector(25.0, 12.0, 3.0)
+    azimuth_deg, elevation_deg = np.degrees([np.arctan2(left_m, ahead_m), np.arcsin(up_m / 3)])
+    peak = Peak(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=3.0, level_db=0.0)
+    figure = figures.slices(given, height_m=float(up_m), peaks=[peak])  # the upright plane is elsewhere
+    rings = [[line.get_xydata()[0] for line in axes.lines if line.get_marker() == "o"] for axes in figure.axes[:2]]
+    np.testing.assert_allclose(rings[0], [[left_m, ahead_m]], atol=1e-9)
+    assert rings[1] == []
+
+
+@pytest.mark.parametrize(("start_hz", "stop_hz"), [(50_000.0, 25_000.0), (20_000.0, 80_000.0)])
+def test_ridge_of_the_spectrogram_is_the_sweep(start_hz, stop_hz):
+    settings = SETTINGS.replace(call=Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz))
+    delay_s = 9e-3
+    power, frequency_hz, times_s = spectrogram(signals(heard(1, delay_s, settings=settings)), settings)
+    middle = (times_s > delay_s + 0.3e-3) & (times_s < delay_s + 2.2e-3)
+    ridge_hz = frequency_hz[np.argmax(power[:, middle], axis=0)]
+    share = (times_s[middle] - delay_s) / settings.call.duration_s
+    swept_hz = 1 / (1 / start_hz + share * (1 / stop_hz - 1 / start_hz))
+    assert np.count_nonzero(middle) > 20
+    np.testing.assert_allclose(ridge_hz, swept_hz, rtol=0.04)
+
+
+def test_signals_and_their_picture():
+    measurement = heard()
+    settings = measurement.settings
+    given = signals(measurement)
+    emitted = 0.5 * call_at(settings.call, given.axis - 9e-3)
+    assert given.values.shape[0] == 32
+    # Each bit is random, of which the low pass leaves a part: the mean over microphones is clean.
+    np.testing.assert_allclose(given.values.mean(axis=0), emitted, atol=0.2)
+    traces, spectra = figures.signals(measurement).axes[:2]
+    assert len(traces.collections[0].get_segments()) == 32
+    for row, segment in enumerate(traces.collections[0].get_segments()):
+        inside = (segment[:, 0] > 9.2) & (segment[:, 0] < 11.3)
+        height = np.abs(segment[:, 1] - row)
+        assert height[inside].mean() > 1.3 * height[~inside].mean()
+    across_ms, _ = brightest(spectra)
+    assert 9.0 <= across_ms <= 11.6
+    assert len(figures.signals(measurement, microphone=5).axes[0].collections[0].get_segments()) == 1
+
+
+def test_matched_filter_puts_the_echo_at_its_range():
+    measurement = heard(32, 9e-3)
+    at_m = sound_speed_m_s(measurement.settings.air) * 9e-3 / 2
+    given = echoes(measurement)
+    assert given.values.shape == (32, len(given.axis))
+    assert given.axis[np.argmax(given.values, axis=1)] == pytest.approx(at_m, abs=1.5e-3)
+    assert given.values.max(axis=1) == pytest.approx(0.5, abs=0.05)
+    upper, lower = figures.matched_filter(measurement).axes[:2]
+    curve = upper.lines[0]
+    assert curve.get_xdata()[np.argmax(curve.get_ydata())] == pytest.approx(at_m, abs=2e-3)
+    assert brightest(lower)[0] == pytest.approx(at_m, abs=5e-3)
+
+
+def test_matched_filter_takes_calibration_out():
+    late_s, gain = (0.0, 40e-6), (1.0, 0.5)
+    array = Array(layout="two", positions_m=((0, 0, 0), (0, 0.01, 0)), gain=gain, delay_s=late_s, word_bits=32)
+    settings = SETTINGS.replace(array=array)
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    both = [0.6 * own * call_at(settings.call, time_s - 9e-3 - delay) for own, delay in zip(gain, late_s, strict=True)]
+    given = echoes(Measurement(words_of(np.stack(both)), settings, STAMP))
+    assert given.values.max(axis=1) == pytest.approx([0.6, 0.6], abs=0.05)
+    assert np.ptp(given.axis[np.argmax(given.values, axis=1)]) < 2e-3
+
+
+@pytest.mark.parametrize(("frequency_hz", "wanted_deg"), [(25e3, 10.7), (40e3, 6.7), (50e3, 5.35), (80e3, 3.3)])
+def test_beam_width_is_that_of_the_array(frequency_hz, wanted_deg):
+    """What the line that is drawn falls to, for eRTIS_v3D1 with uniform weights."""
+    axes = figures.array(Settings(), frequencies_hz=[frequency_hz]).axes[1]
+    assert width_deg(*axes.lines[0].get_data(), 0.0) == pytest.approx(wanted_deg, abs=0.06)
+    assert f"{frequency_hz / 1e3:g} kHz" in axes.get_legend().get_texts()[0].get_text()
+
+
+def test_beam_width_of_the_mean_power_of_the_band():
+    axes = figures.array(Settings()).axes[1]
+    told = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert told[2].startswith("25–50 kHz, mean power: 7.")
+    assert width_deg(*axes.lines[2].get_data(), 0.0) == pytest.approx(7.1, abs=0.1)
+
+
+def test_beam_of_a_line_is_the_formula():
+    """sin(Nψ/2) / (N sin(ψ/2)), its first side lobe at −13.15 dB with 16 microphones, steered to 20°."""
+    count, spacing_m, frequency_hz = 16, 0.004, 40e3
+    array = Array(layout="line", positions_m=tuple((0.0, spacing_m * mic, 0.0) for mic in range(count)), word_bits=16)
+    settings = Settings(array=array)
+    angle_deg = np.linspace(-90, 90, 721)
+    level_db = pattern_db(settings, [frequency_hz], angle_deg, 0 * angle_deg, azimuth_deg=20, elevation_deg=0)
+    wave_m = sound_speed_m_s(settings.air) / frequency_hz
+    psi = 2 * np.pi * spacing_m / wave_m * (np.sin(np.radians(angle_deg)) - np.sin(np.radians(20)))
+    wanted = np.abs(np.sinc(count * psi / 2 / np.pi) / np.sinc(psi / 2 / np.pi))
+    np.testing.assert_allclose(10 ** (level_db / 20), wanted, atol=1e-5)
+    assert angle_deg[np.argmax(level_db)] == pytest.approx(20)
+
+
+def test_layout_is_drawn_as_it_is():
+    (axes, *_) = figures.array(Settings()).axes
+    drawn_mm = axes.lines[0].get_xydata()
+    assert drawn_mm.shape == (32, 2)
+    assert drawn_mm.mean(axis=0) == pytest.approx([0, 0], abs=1e-9)
+    assert np.ptp(drawn_mm, axis=0) == pytest.approx([83.1930 - 16.7401, 49.0132 - 11.4385])
+    assert axes.get_xlim()[0] > axes.get_xlim()[1]  # y is to the left
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    assert (left - right) / axes.bbox.width == pytest.approx((high - low) / axes.bbox.height)  # one scale
+    assert {text.get_text() for text in axes.texts} <= {str(channel) for channel in range(32)}
+    assert len(axes.texts) > 24
+
+
+def test_one_microphone_has_no_beam():
+    axes = figures.array(Settings(array=ONE)).axes[1]
+    assert np.abs(axes.lines[0].get_ydata()).max() < 1e-9
+    assert ": none" in axes.get_legend().get_texts()[0].get_text()

@@ -1,0 +1,220 @@
+"""Folders of RTIS Dev become recordings, as far as what is in them is known."""
+
+import importlib.metadata
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop import open_rtis_folder
+from ertis_numba.settings import PRESETS, Air, Array, Settings
+from ertis_numba.storage import open_recording
+
+SHORT = {
+    "microphoneSamples": 65_536,
+    "microphoneSampleFrequency": 4_500_000,
+    "callSampleFrequency": 450_000,
+    "callDuration": 2.5,
+    "callMinimumFrequency": 25_000,
+    "callMaximumFrequency": 50_000,
+    "callEmissions": 1,
+}
+PLANAR = {"microphoneLayout": "eRTIS_v3D1", "minRange": 0.4, "maxRange": 1.5, "directions": 91, "2D": 1}
+N_WORDS = 65_536
+
+
+def words(number, count=1):
+    return np.random.default_rng(number).integers(0, 2**32, count * N_WORDS, dtype="<u4")
+
+
+def folder_of(tmp_path, *, names=("m_0.bin", "m_1.bin"), recording=SHORT, processing=PLANAR, more=None):
+    folder = tmp_path / "run.1"
+    folder.mkdir()
+    for number, name in enumerate(names):
+        (folder / name).write_bytes(words(number).tobytes())
+    given = {"recording.json": recording, "processing.json": processing, **(more or {})}
+    for name, content in given.items():
+        if content is not None:
+            (folder / name).write_text(json.dumps(content))
+    (folder / "notes.txt").write_text("windy")
+    return folder
+
+
+def shipped(kind):
+    """The settings that come with rtisdev, by their names."""
+    folder = Path(importlib.metadata.distribution("rtisdev").locate_file(f"rtisdev/config/premadeSettings/{kind}"))
+    return {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+
+
+def test_words_and_numbers(tmp_path):
+    """By their numbers, not their names; a missing one is a gap."""
+    reader = open_rtis_folder(folder_of(tmp_path, names=("m_9.bin", "m_10.bin", "m_12.bin")), sensor="left")
+    assert len(reader) == 3
+    for (number, sequence), measurement in zip(enumerate((9, 10, 12)), reader, strict=True):
+        assert np.array_equal(measurement.words, words(number))
+        assert (measurement.stamp.sensor, measurement.stamp.sequence) == ("left", sequence)
+        assert measurement.stamp.timestamp_ns == 0
+        assert measurement.settings is reader.settings
+
+
+def test_settings(tmp_path):
+    reader = open_rtis_folder(folder_of(tmp_path))
+    wanted = Settings.from_preset("short_25_50")
+    processing = wanted.processing.replace(range_m=(0.4, 1.5), directions="2d:91")
+    assert reader.settings == wanted.replace(processing=processing)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_shipped_recording_settings_are_the_presets(tmp_path, preset):
+    settings = shipped("recording")[preset]
+    folder = folder_of(tmp_path, names=(), recording=settings, processing=None)
+    (folder / "0.bin").write_bytes(bytes(4 * settings["microphoneSamples"]))
+    reader = open_rtis_folder(folder, layout="eRTIS_v2")
+    assert reader.settings == Settings.from_preset(preset, array=Array(layout="eRTIS_v2"))
+
+
+@pytest.mark.parametrize("name", sorted(set(shipped("processing")) - {"custom_example_2D_5m_91"}))
+def test_shipped_processing_settings_can_be_used(tmp_path, name):
+    given = shipped("processing")[name]
+    processing = open_rtis_folder(folder_of(tmp_path, processing=given)).settings.processing
+    assert processing.range_m == (given["minRange"], given["maxRange"])
+    assert processing.directions == f"{2 if given['2D'] else 3}d:{given['directions']}"
+
+
+def test_what_is_left_out_is_what_rtisdev_takes(tmp_path):
+    folder = folder_of(tmp_path, recording={"microphoneSamples": N_WORDS}, processing={"microphoneLayout": "eRTIS_v2"})
+    assert open_rtis_folder(folder).settings == Settings.from_preset("short_25_50", array=Array(layout="eRTIS_v2"))
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_all_settings_in_one(tmp_path, planar):
+    """What ``dict(RTISSettings)`` yields, of which more is there than is needed."""
+    azimuth_rad = np.radians(np.linspace(-60, 60, 5)).tolist()
+    elevation_rad = [0.0] * 5 if planar else [0.0, 0.1, 0.2, 0.3, 0.4]
+    dumped = {**SHORT, **{name: PLANAR[name] for name in ("microphoneLayout", "minRange", "maxRange")}}
+    dumped["dacSampleFrequency"] = dumped.pop("callSampleFrequency")
+    dumped |= {"nDirections": 5, "directionsAzimuth": azimuth_rad, "directionsElevation": elevation_rad}
+    dumped |= {"version": "2.16.0", "dacSamples": 1126, "pdmb": [0.1, 0.2], "disableList": []}
+    folder = folder_of(tmp_path, recording=None, processing=None, more={"settings.json": dumped})
+    processing = open_rtis_folder(folder).settings.processing
+    assert processing.directions == ("2d:5" if planar else "3d:5")
+    assert np.allclose(processing.azimuth_limits_deg, (-60, 60) if planar else (-90, 90))
+
+
+def test_other_calls_and_clocks(tmp_path):
+    recording = SHORT | {"microphoneSampleFrequency": 1_125_000, "callDuration": 3.1, "callMaximumFrequency": 30_000}
+    folder = folder_of(tmp_path, recording=recording, processing={"microphoneLayout": "uRTIS_v1"})
+    settings = open_rtis_folder(folder).settings
+    assert (settings.call.duration_s, settings.call.start_frequency_hz) == (0.0031, 30_000)
+    assert settings.recording.pdm_rate_hz == 1_125_000
+    assert settings.output_rate_hz >= 2 * 5_000  # ranges are fine enough for the bandwidth
+    assert math.isclose(settings.processing.range_m[1], 5.0)
+
+
+def test_options_take_the_place_of_the_folder(tmp_path):
+    processing = PLANAR | {"microphoneLayout": "mine"}
+    folder = folder_of(tmp_path, recording=SHORT | {"callEmissions": 3}, processing=processing)
+    air = Air(temperature_c=3.0)
+    settings = open_rtis_folder(folder, layout="eRTIS_v2", preset="short_20_80", air=air).settings
+    assert settings.array.layout == "eRTIS_v2"
+    assert settings.call == Settings.from_preset("short_20_80").call
+    assert settings.air == air
+
+
+def test_the_measurement_that_comes_with_rtisdev(tmp_path):
+    real = Path(importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin"))
+    recording, processing = shipped("recording")["default_25_50"], shipped("processing")["2D_5m_181"]
+    folder = folder_of(tmp_path, names=(), recording=recording, processing=processing)
+    (folder / "simulate.bin").write_bytes(real.read_bytes())
+    (measurement,) = open_rtis_folder(folder)
+    assert np.array_equal(measurement.words, np.fromfile(real, dtype="<u4"))
+    assert measurement.settings.processing.directions == "2d:181"
+    assert measurement.stamp.sequence == 0
+
+
+def test_one_file_of_many_measurements(tmp_path):
+    folder = folder_of(tmp_path, names=())
+    (folder / "all.bin").write_bytes(words(1, 3).tobytes())
+    assert [each.stamp.sequence for each in open_rtis_folder(folder)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"names": ()}, r"run.1 is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev"),
+        ({"names": ("a_1.bin", "b_2.bin")}, "the order of its 2 .bin files is not known, wanted names like NAME<num"),
+        ({"names": ("a.bin", "a1.bin")}, "the order of its 2 .bin files is not known"),
+        ({"names": ("a1.bin", "a01.bin")}, "the order of its 2 .bin files is not known"),
+        ({"recording": None}, "run.1 holds no recording settings of RTIS Dev .*; give --preset"),
+        ({"processing": None}, r"does not say which array it was \(microphoneLayout\); give --layout"),
+        ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, wanted 1, as an image shows one emission"),
+        ({"recording": {"callCustom": "bat.csv"}}, "callCustom is the file 'bat.csv', which a recording cannot hold"),
+        ({"processing": PLANAR | {"rangesCustom": "r.csv"}}, "rangesCustom is the file 'r.csv', .*give --range when"),
+        ({"processing": PLANAR | {"directionsCustom": "d.csv"}}, "directionsCustom is the file"),
+        ({"processing": PLANAR | {"elevation2DAngle": 20}}, "elevation2DAngle is 20, wanted 0; take it out"),
+        ({"more": {"z.json": {"callDuration": 3}}}, r"z.json: callDuration is 3, but 2.5 in recording.json; keep one"),
+    ],
+)
+def test_what_is_refused(tmp_path, made, message):
+    with pytest.raises(DataError, match=message):
+        open_rtis_folder(folder_of(tmp_path, **made))
+
+
+@pytest.mark.parametrize(
+    ("recording", "processing", "message"),
+    [
+        (SHORT | {"callDuration": "long"}, PLANAR, "run.1: callDuration is 'long'; give a number"),
+        (SHORT | {"microphoneSamples": 0.5}, PLANAR, "microphoneSamples is 0.5; give a whole number"),
+        (SHORT | {"callMinimumFrequency": 50_000}, PLANAR, "call sweeps from 50000 Hz to itself"),
+        (SHORT, PLANAR | {"microphoneLayout": "eRTIS_v9"}, "layout 'eRTIS_v9' is unknown"),
+        (SHORT, PLANAR | {"directions": 1.5}, "directions is 1.5; give a whole number"),
+    ],
+)
+def test_values_that_are_refused(tmp_path, recording, processing, message):
+    with pytest.raises(ArgumentError, match=message):
+        open_rtis_folder(folder_of(tmp_path, recording=recording, processing=processing))
+
+
+def test_json_that_is_refused_or_of_others(tmp_path):
+    folder = folder_of(tmp_path, more={"list.json": [1, 2], "other.json": {"weather": "windy"}})
+    assert len(open_rtis_folder(folder)) == 2
+    (folder / "bad.json").write_text("{")
+    with pytest.raises(DataError, match=r"bad.json: .*; give readable JSON, or take the file away"):
+        open_rtis_folder(folder)
+    with pytest.raises(DataError, match="none: No such file or directory; give a folder of raw files"):
+        open_rtis_folder(tmp_path / "none")
+
+
+def test_numbers_that_overlap(tmp_path):
+    folder = folder_of(tmp_path)
+    (folder / "m_0.bin").write_bytes(words(0, 2).tobytes())
+    with pytest.raises(DataError, match=r"m_0.bin holds 2 measurements, and the next file is number 1; give the files"):
+        open_rtis_folder(folder)
+
+
+def test_command(tmp_path):
+    folder = folder_of(tmp_path, names=("m_5.bin", "m_7.bin"))
+    done = CliRunner().invoke(cli, ["import", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {"output": str(tmp_path / "run.1.h5"), "measurements": 2}
+    with open_recording(tmp_path / "run.1.h5") as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == [5, 7]
+        assert [(gap.first, gap.last) for gap in recording.gaps] == [(6, 6)]
+        assert recording.settings.air == Air(temperature_c=12.5)
+        assert recording.settings.processing.directions == "2d:91"
+        assert recording.sensor == "left"
+
+
+@pytest.mark.parametrize("option", ["--layout", "--preset"])
+def test_files_need_what_a_folder_says(tmp_path, option):
+    (tmp_path / "a.bin").write_bytes(words(1).tobytes())
+    given = {"--layout": "eRTIS_v3D1", "--preset": "short_25_50"}
+    del given[option]
+    done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), *sum(given.items(), ())])
+    assert done.exit_code == 2
+    assert f"Missing option '{option}'" in done.stderr

@@ -1,0 +1,64 @@
+"""``ertis peaks`` with either detector."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.stages.cfar import cfar_peaks
+from ertis_numba.storage import open_energyscapes, write_energyscapes
+from tests.files import image
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+@pytest.fixture
+def images(tmp_path):
+    given = image()
+    energy = given.energy.copy()
+    energy[5, 300] = 0.012  # 32 dB below the strongest, 12 dB above the noise
+    return write_energyscapes(tmp_path / "img.h5", [given.replace(energy=energy)])
+
+
+def test_cfar_finds_what_is_weak(images):
+    found = json.loads(run("peaks", images, "--detector", "cfar", "--json").stdout)["peaks"]
+    assert min(peak["level_db"] for peak in found) < -30
+    with open_energyscapes(images) as file:
+        wanted = cfar_peaks(file[0], false_alarm=1e-4)
+        weak = np.degrees(file[0].azimuth_rad[5]), file[0].range_m[300]
+    assert [peak["range_m"] for peak in found] == [round(peak.range_m, 6) for peak in wanted]
+    assert any(peak["range_m"] == pytest.approx(weak[1], abs=0.02) for peak in found)
+    plain = json.loads(run("peaks", images, "--json").stdout)["peaks"]
+    assert min(peak["level_db"] for peak in plain) >= -30
+
+
+def test_options_of_cfar(images):
+    limited = json.loads(run("peaks", images, "--detector", "cfar", "--min-level", -20, "--json").stdout)["peaks"]
+    assert len(limited) == 1
+    counts = [
+        len(
+            json.loads(run("peaks", images, "--detector", "cfar", "--top", 999, "--false-alarm", p, "--json").stdout)[
+                "peaks"
+            ]
+        )
+        for p in (1e-5, 1e-2)
+    ]
+    assert counts[0] < counts[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "match"),
+    [
+        ("--false-alarm 1e-3", 2, "--false-alarm is for --detector cfar; give both"),
+        ("--detector cfar --truth", 2, "--truth compares with --detector peaks; leave out one"),
+        ("--detector cfar --false-alarm 2", 1, "false_alarm is 2; give a number from 1e-09 to 0.5"),
+    ],
+)
+def test_what_is_refused(images, options, code, match):
+    assert match in run("peaks", images, *options.split(), code=code).stderr

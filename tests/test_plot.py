@@ -1,0 +1,129 @@
+"""``ertis plot`` draws each kind from what it is made of, and ``docs/plots.md`` shows how."""
+
+import contextlib
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+from ertis_cli.plot import _KINDS, _ONLY, plot
+from PIL import Image
+
+from ertis_numba.geometry import direction_grid
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.storage import write_energyscapes, write_recording
+from tests.files import image, noise
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "plots.md").read_text("utf-8")
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plot")
+    grid = direction_grid(Processing(directions="3d:200"))
+    solid = image(grid.azimuth_rad * 57.29577951308232, grid.elevation_rad * 57.29577951308232)
+    write_energyscapes(folder / "img.h5", [image(), image(seed=2)])
+    write_energyscapes(folder / "solid.h5", [solid])
+    write_recording(folder / "rec.h5", noise())
+    (folder / "settings.toml").write_text(Settings().to_toml())
+    (folder / "layout.toml").write_text("positions_mm = [[0, 0], [5, 0], [0, 8]]\n")
+    (folder / "layout.csv").write_text("0, 0\n5, 0\n0, 8\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("source", "kind", "options"),
+    [
+        ("img.h5", "image", "--peaks 2 --font serif"),
+        ("solid.h5", "polar", "--theme light"),
+        ("solid.h5", "projection", "--peaks 0"),
+        ("solid.h5", "slices", "--height 0.5 --left -0.5 -m 0"),
+        ("rec.h5", "signals", "--microphone 3"),
+        ("rec.h5", "matched-filter", "-m 1 --sensor eRTIS-7"),
+        ("rec.h5", "array", ""),
+        ("img.h5", "array", "--steer 20:-10 --frequency 25e3 --frequency 40000"),
+        ("settings.toml", "array", ""),
+        ("layout.toml", "array", ""),
+        ("layout.csv", "array", ""),
+    ],
+)
+def test_each_kind_is_drawn(files, tmp_path, source, kind, options):
+    target = tmp_path / "a.png"
+    theme = [] if "--theme" in options else ["--theme", "paper", "--columns", 1]
+    command = ["plot", files / source, "--kind", kind, *options.split(), *theme, "-o", target, "--json"]
+    report = json.loads(run(*command).stdout)
+    assert (report["output"], report["kind"]) == (str(target), kind)
+    assert ("measurement" in report) == (kind != "array")
+    with Image.open(target) as picture:
+        assert picture.getpixel((0, 0))[:3] == (255, 255, 255)
+        assert len(picture.convert("RGB").getcolors(2**24)) > 30
+        if not options.startswith("--theme"):
+            assert picture.width == pytest.approx(85 / 25.4 * 300, abs=1)
+
+
+def test_name_of_a_layout(tmp_path):
+    with contextlib.chdir(tmp_path):
+        said = run("plot", "uRTIS_v1", "--kind", "array").stderr
+    assert said == "uRTIS_v1.png: array of uRTIS_v1\n"
+    assert (tmp_path / "uRTIS_v1.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "match"),
+    [
+        ("plot img.h5 --kind polar --height 1", 2, "--height is for --kind slices; leave it out with polar"),
+        ("plot rec.h5 --kind signals --peaks 3", 2, "--peaks is for --kind image, polar, projection, slices"),
+        ("plot rec.h5 --kind array -m 1", 2, "--measurement is for --kind image, polar, projection, slices, signals"),
+        ("plot img.h5 --frequency 4e4", 2, "--frequency is for --kind array; leave it out with image"),
+        ("plot img.h5 --columns 1", 1, "columns is 1, which theme 'dark' has none of; give theme 'paper'"),
+        ("plot img.h5 --kind signals", 1, "img.h5 is an energyscape file, wanted a recording"),
+        ("plot settings.toml --kind array --sensor x", 2, "--sensor is for files that hold several"),
+        ("plot eRTIS_v3D2 --kind array", 1, "eRTIS_v3D2"),
+        ("plot rec.h5 --kind signals --microphone 40", 1, "microphone 40 is none of the 32 enabled ones"),
+        ("plot solid.h5 --kind slices --height 50", 1, "height_m is 50, where the image shows nothing"),
+    ],
+)
+def test_what_is_refused(files, tmp_path, command, code, match):
+    name, source, *rest = command.split()
+    source = files / source if (files / source).exists() else source
+    said = run(name, source, *rest, "-o", tmp_path / "a.png", code=code).stderr
+    assert match in said
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_every_option_belongs_to_kinds():
+    """Those of the table are there, and help names each kind."""
+    names = {option.opts[0].removeprefix("--") for option in plot.params}
+    assert set(_ONLY) <= names
+    said = " ".join(run("plot", "--help").stdout.split())
+    assert all(about in said for about in _KINDS.values())
+
+
+def test_commands_of_the_page(tmp_path):
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors_3d.h5", tmp_path / "REC3D.h5")
+    commands = re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", PAGE, re.MULTILINE)
+    with contextlib.chdir(tmp_path):
+        for command in commands:
+            done = CliRunner().invoke(cli, command.split())
+            assert done.exit_code == 0, (command, done.stderr, done.exception)
+    assert {kind for kind in _KINDS if f"--kind {kind}" in PAGE} == {*_KINDS} - {"image"}
+    assert all(f"`{kind}`" in PAGE for kind in _KINDS)
+
+
+def test_python_of_the_page(tmp_path):
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
+    with contextlib.chdir(tmp_path):
+        for code in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
+            exec(compile(code, "docs/plots.md", "exec"), {})
+    assert (tmp_path / "picture.pdf").read_bytes().startswith(b"%PDF")
