@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx check data pictures bench soak gpu clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx check docs data pictures bench soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -16,7 +16,7 @@ $(VENV)/ready: setup.cfg pyproject.toml
 	touch $@
 
 $(VENV)/ready-to-test: $(VENV)/ready  # what tests and checks need: CUDA's compilers are 0.7 GB of it
-	$(BIN)/python -m pip install --quiet --editable '.[test,check]'
+	$(BIN)/python -m pip install --quiet --editable '.[test,check,docs]'
 	touch $@
 
 demo: $(VENV)/ready
@@ -44,13 +44,19 @@ check: $(VENV)/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m sphinx -q -W --keep-going docs site
+
+docs: $(VENV)/ready-to-test  ## the guide as a site: open site/index.html
+	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/synthetic/build.py
 	$(BIN)/python data/synthetic/gallery.py
 
-pictures: $(VENV)/ready  ## redraw the pictures of the README
+pictures: $(VENV)/ready  ## redraw the pictures of the README; Chromium takes that of the viewer
+	$(BIN)/python -m pip install --quiet --editable '.[view,browser]'
 	$(BIN)/python docs/pictures/build.py
+	$(BIN)/python docs/pictures/view.py
 
 bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench paper --update bench/README.md --update README.md
@@ -69,4 +75,4 @@ gpu: $(VENV)/ready  ## test and measure this machine's NVIDIA GPU, in less than 
 	$(BIN)/ertis bench gpu --results bench/results --update docs/cuda.md --update README.md
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo
+	rm -rf $(VENV) build dist *.egg-info demo site

@@ -31,6 +31,7 @@ PAGES = (
     "docs/plots.md",
     "docs/reliability.md",
     "docs/simulation.md",
+    "docs/view.md",
 )
 
 
@@ -66,10 +67,7 @@ def test_commands(place):
             else:
                 run(place, sys.executable, "-m", "ertis_cli.main", name, *arguments)
             started.add(name)
-    elsewhere = {"keys", "listen", "record", "serve", "status"} | {
-        "completion",
-        "doctor",
-    }  # test_network_page, test_config
+    elsewhere = {"completion", "doctor", "keys", "listen", "record", "serve", "status", "view"}  # on pages of their own
     assert started == {*COMMANDS} - elsewhere - {"bench"}
     assert (place / "picture.png").stat().st_size > 10_000
     assert (place / "shelf.png").stat().st_size > 10_000

@@ -9,6 +9,7 @@ from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
+from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.tables import network, network_faults
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
@@ -25,6 +26,7 @@ __all__ = [
     "factorisation",
     "gpu",
     "gpu_short",
+    "many",
     "network",
     "network_faults",
     "paper",
@@ -317,6 +319,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
     "scaling": {"scaling": scaling},
     "simulation": {"simulation": simulation},
+    "many": {"many": many},
     "factorisation": {"factorisation": factorisation},
     "ptx": {"ptx": ptx},
     "reliability": {"reliability": reliability},

@@ -103,6 +103,21 @@ def simulation(**given: Any) -> None:
 
 
 @bench.command()
+@click.option("--count", type=click.IntRange(min=2), default=24, show_default=True, metavar="N", help="Recordings.")
+@click.option(
+    "--rounds", type=click.IntRange(min=1), default=5, show_default=True, metavar="N", help="Of all in turns."
+)
+@_update
+@options.quiet
+@options.as_json
+def many(**given: Any) -> None:
+    """Many recordings by one worker, several, and a dask cluster; all files are compared."""
+    from ertis_bench import many as benchmark
+
+    _run("many", benchmark, **given)
+
+
+@bench.command()
 @_update
 @options.quiet
 @options.as_json

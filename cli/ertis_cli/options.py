@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
     from ertis_numba.stages.compare import Comparison
@@ -38,7 +37,6 @@ __all__ = [
     "print_json",
     "progress",
     "quiet",
-    "require_same_air",
     "say",
     "sensor",
     "sensors_of",
@@ -220,19 +218,6 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
     """Return ``items`` under a progress bar on stderr, which is hidden where nobody looks."""
     hidden = quiet or not sys.stderr.isatty()
     return click.progressbar(items, length=length, label=label, file=sys.stderr, hidden=hidden)
-
-
-def require_same_air(measurement: "Measurement", settings: "Settings") -> None:
-    """Refuse a measurement in other air, whose ranges would not be those of the axis."""
-    from ertis_numba.errors import DataError
-
-    came, wanted = measurement.settings.air, settings.air
-    if came != wanted:
-        raise DataError(
-            f"measurement {measurement.stamp.sequence} was taken at {came.temperature_c:g} °C, "
-            f"{came.humidity_percent:g} %, {came.pressure_pa:g} Pa, others at {wanted.temperature_c:g} °C, "
-            f"{wanted.humidity_percent:g} %, {wanted.pressure_pa:g} Pa; give one air for all with --settings"
-        )
 
 
 @contextmanager

@@ -1,32 +1,31 @@
-"""``ertis process``: a recording to energyscapes."""
+"""``ertis process``: recordings to energyscapes."""
 
-import itertools
 import statistics
-import time
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import options, plans
+from ertis_cli import _process_examine, _process_many, options, plans
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Energyscape, Measurement
-    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.campaign import Wanted
     from ertis_numba.settings import Settings
-    from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 
 __all__ = ["process"]
 
-_BATCH_BYTES = 256e6  # of images that wait to be written
-
 
 @click.command()
-@options.input_file("REC.h5")
-@options.output("Energyscape file to write; REC.energy.h5 beside the recording by default.")
+@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--output",
+    "-o",
+    "target",
+    type=click.Path(),
+    metavar="FILE|DIR",
+    help="Energyscape file to write, REC.energy.h5 beside the recording by default; of several recordings a folder.",
+)
 @options.sensor("One sensor only; all of the recording by default.")
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Limits of 2d:N and 3d:N in °.")
@@ -82,13 +81,24 @@ _BATCH_BYTES = 256e6  # of images that wait to be written
     metavar="N",
     help="Measurements worked on at the same time, fewer where images are large; 1 is one after the other.",
 )
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Processes that share several recordings; one for each core by default.",
+)
+@click.option(
+    "--scheduler",
+    metavar="tcp://HOST:PORT",
+    help="Let the workers of this dask scheduler process several recordings.",
+)
 @options.force
 @options.quiet
 @options.as_json
 def process(
     *,
-    path: Path,
-    target: Path | None,
+    paths: tuple[str, ...],
+    target: str | None,
     sensor: str | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
@@ -106,6 +116,8 @@ def process(
     device: str,
     threads: int | None,
     batch: int,
+    workers: int | None,
+    scheduler: str | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -116,52 +128,108 @@ def process(
     recording gives the same energies, bit by bit, whatever the number of threads and the batch. All
     sensors of a recording go into one file, each with its own settings.
 
+    Several recordings, a pattern in quotes or a folder go into the folder -o, a file each, on all cores.
+    Processed again, what was made of the same recording by the same settings is left alone. One that
+    fails does not stop the others. --json then prints an object for each as it ends, and one at the end.
+
     The fast method plans how exact to be: it takes the fastest way whose predicted error keeps --max-error.
     The error is that of the image against the exact one, over all directions and ranges.
     """
+
+    def changed(recorded: "Settings") -> "Settings":
+        settings = options.settings_with(
+            recorded,
+            settings_file=settings_file,
+            directions=directions,
+            azimuth_limits_deg=azimuth,
+            elevation_limits_deg=elevation,
+            range_m=range_m,
+            method=method,
+            beamformer=beamformer,
+            wavefront=wavefront,
+            max_error_db=max_error_db,
+        )
+        plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
+        return settings
+
+    from ertis_numba.campaign import Wanted
+
+    wanted = Wanted(
+        settings=changed,
+        sensor=sensor,
+        dtype=dtype,
+        device=device,
+        threads=threads,
+        batch=batch,
+        strict=strict,
+        overwrite=force,
+        examine=_process_examine.NAME if explain or verify else "",
+        examine_with={"explain": explain, "verify": verify, "silent": as_json},
+    )
+    if _process_many.are_meant(paths, target):
+        _process_many.process_many(
+            paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
+        )
+        return
+    for name, given in (("--workers", workers), ("--scheduler", scheduler)):
+        if given is not None:
+            raise click.UsageError(
+                f"{name} is for several recordings; give more, a folder or a pattern, or an -o that ends in /",
+                click.get_current_context(),
+            )
+    path = Path(paths[0])
+    report = _process_one(
+        path,
+        Path(target) if target else path.with_suffix(".energy.h5"),
+        wanted,
+        explain=explain,
+        verify=verify,
+        quiet=quiet,
+        as_json=as_json,
+    )
+    for line in _process_many.summary(Path(report["output"]), report["sensors"], report["device"]):
+        options.say(line, quiet=quiet)
+    if as_json:
+        options.print_json(report)
+
+
+def _process_one(
+    path: Path, target: Path, wanted: "Wanted", *, explain: bool, verify: bool, quiet: bool, as_json: bool
+) -> dict[str, Any]:
+    """Process one recording in this process, and return the report."""
+    from ertis_numba.campaign import SensorRun, faults_of
+    from ertis_numba.errors import DataError
     from ertis_numba.storage import EnergyscapeWriter, open_recording
 
-    target = target or path.with_suffix(".energy.h5")
     with ExitStack() as stack:
-        names = options.sensors_of(path, sensor)
+        names = options.sensors_of(path, wanted.sensor)
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]
         # Every sensor is looked at before the first one is processed, so that what cannot be done is told at once.
-        settings = [
-            options.settings_with(
-                recording.settings,
-                settings_file=settings_file,
-                directions=directions,
-                azimuth_limits_deg=azimuth,
-                elevation_limits_deg=elevation,
-                range_m=range_m,
-                method=method,
-                beamformer=beamformer,
-                wavefront=wavefront,
-                max_error_db=max_error_db,
-            )
-            for recording in recordings
-        ]
-        for given in settings:
-            plans.require_plan(given, explain=explain, verify=verify, max_error_db=max_error_db)
-        writer = EnergyscapeWriter(target, recording=recordings, dtype=dtype, overwrite=force)
-        runs = [
-            _Run(stack.enter_context(options.pipeline(given, device=device, threads=threads, quiet=quiet)))
+        settings = [wanted.settings(recording.settings) for recording in recordings]
+        writer = EnergyscapeWriter(target, recording=recordings, dtype=wanted.dtype, overwrite=wanted.overwrite)
+        pipelines = [
+            stack.enter_context(options.pipeline(given, device=wanted.device, threads=wanted.threads, quiet=quiet))
             for given in settings
         ]
+        runs = [SensorRun(pipeline, batch=wanted.batch) for pipeline in pipelines]
         for run, recording in zip(runs, recordings, strict=True):
-            first = replace(recording[0], settings=run.pipeline.settings)
-            _tell_faults(f"{path}: sensor {recording.sensor}", first, strict=strict)
-            run.told = plans.tell(run.pipeline, first, threads=threads, explain=explain, verify=verify, silent=as_json)
-        written = (
-            None for run, recording in zip(runs, recordings, strict=True) for _ in run.write(recording, writer, batch)
-        )
+            first = run.known(recording[0])
+            faults = faults_of(f"{path}: sensor {recording.sensor}", first)
+            if faults and wanted.strict:
+                raise DataError(faults)
+            if faults:
+                click.echo(f"ertis: warning: {faults}", err=True)
+            run.told = plans.tell(
+                run.pipeline, first, threads=wanted.threads, explain=explain, verify=verify, silent=as_json
+            )
+        written = (None for run, recording in zip(runs, recordings, strict=True) for _ in run.write(recording, writer))
         length = sum(map(len, recordings))
         with writer, options.progress(written, length=length, label="processing", quiet=quiet) as shown:
             for _ in shown:
                 pass
     rows = [{"sensor": name, **run.report()} for name, run in zip(names, runs, strict=True)]
     times_ms = [time_ms for run in runs for time_ms in run.times_ms]
-    report = {
+    return {
         "output": str(target),
         "measurements": len(times_ms),
         **({name: rows[0][name] for name in ("directions", "ranges", *runs[0].told)} if len(rows) == 1 else {}),
@@ -169,75 +237,3 @@ def process(
         "median_ms": round(statistics.median(times_ms), 3),
         "sensors": rows,
     }
-    for row in rows:
-        of = f" of {row['sensor']}" if len(rows) > 1 else ""
-        options.say(
-            f"{target}: {options.counted(row['measurements'], 'measurement')}{of}, "
-            f"{options.counted(row['directions'], 'direction')} × {options.counted(row['ranges'], 'range')} "
-            f"on {report['device']}, {row['median_ms']:.1f} ms each (median)",
-            quiet=quiet,
-        )
-    if as_json:
-        options.print_json(report)
-
-
-def _tell_faults(name: str, measurement: "Measurement", *, strict: bool) -> None:
-    """Warn of faulty microphones, or refuse them."""
-    from ertis_numba.errors import DataError
-    from ertis_numba.stages.health import health
-
-    report = health(measurement)
-    if not report.faults:
-        return
-    every = all(channel.faults for channel in report.channels)
-    remedy = "check its cable and supply" if every else "put them under 'disabled' in a layout file for --settings"
-    text = f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
-    if strict:
-        raise DataError(text)
-    click.echo(f"ertis: warning: {text}", err=True)
-
-
-class _Run:
-    """The pipeline of one sensor, what was said of its plan, and how long it took for each measurement."""
-
-    def __init__(self, pipeline: "Pipeline") -> None:
-        self.pipeline = pipeline
-        self.times_ms: list[float] = []
-        self.told: dict[str, Any] = {}
-
-    def write(self, recording: "RecordingReader", writer: "EnergyscapeWriter", batch: int) -> Iterator[None]:
-        """Process a recording and write its images; yield after each."""
-        image_bytes = 4 * len(self.pipeline.grid) * len(self.pipeline.range_m)
-        size = max(1, min(batch, int(_BATCH_BYTES / image_bytes)))
-        measurements = iter(recording)
-        while group := list(itertools.islice(measurements, size)):
-            images = self._processed([self._known(measurement, recording.settings) for measurement in group])
-            images.reverse()
-            while images:  # none is kept: a GPU's images lie in memory that the next ones need
-                writer.write(images.pop())
-                yield
-
-    def _known(self, measurement: "Measurement", recorded: "Settings") -> "Measurement":
-        """Return a measurement as it is now known: a settings file may know better what array, call or air it was."""
-        settings = self.pipeline.settings
-        if settings.air == recorded.air:
-            options.require_same_air(measurement, settings)
-        return replace(measurement, settings=settings)
-
-    def _processed(self, measurements: "Sequence[Measurement]") -> "list[Energyscape]":
-        start_s = time.perf_counter()
-        if len(measurements) == 1:
-            images = [self.pipeline.process(measurements[0])]
-        else:
-            images = self.pipeline.process_batch(measurements)
-        self.times_ms += [1000 * (time.perf_counter() - start_s) / len(images)] * len(images)
-        return images
-
-    def report(self) -> dict[str, Any]:
-        return {
-            "measurements": len(self.times_ms),
-            "directions": len(self.pipeline.grid),
-            "ranges": len(self.pipeline.range_m),
-            "median_ms": round(statistics.median(self.times_ms), 3),
-            **self.told,
-        }

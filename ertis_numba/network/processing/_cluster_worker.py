@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.cluster import worker
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.network.processing.slots import POINTS_BYTES
 
@@ -84,14 +85,11 @@ def _chain(settings: str, device: str) -> "Chain":
 
 def _threads(device: str) -> int:
     """Return how many threads one measurement may have, where a worker is given several at once."""
-    from distributed import get_worker  # noqa: PLC0415  there is one where this runs
-
     from ertis_numba import kernels  # noqa: PLC0415
 
-    return max(1, kernels.load(device).max_threads // max(1, get_worker().state.nthreads))
+    at_once = int(worker().state.nthreads)
+    return max(1, kernels.load(device).max_threads // max(1, at_once))
 
 
 def _address() -> str:
-    from distributed import get_worker  # noqa: PLC0415
-
-    return str(get_worker().address)
+    return str(worker().address)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_numba.errors import DeviceError, NetworkError
+from ertis_numba.cluster import Future, connect
 from ertis_numba.network.processing import _cluster_worker as there
 from ertis_numba.network.processing.notes import Prepared
 from ertis_numba.network.processing.options import Options
@@ -20,10 +20,6 @@ from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFa
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.waker import Waker
-
-# Its own annotations are partial.
-Client = Any
-Future = Any
 
 __all__ = ["Cluster"]
 
@@ -93,7 +89,7 @@ class Cluster:
         self._options, self._log = options, log
         self._address = options.cluster or ""
         self._run = secrets.token_hex(4)
-        self._client = _client(self._address)
+        self._client = connect(self._address, timeout_s=_CONNECT_S)
         self._events: deque[tuple[Any, ...]] = deque()
         self._waker = Waker()
         self._members: dict[str, _Member] = {}
@@ -304,23 +300,6 @@ class Cluster:
         if (member := self._members.get(result.worker)) is not None:
             member.done += 1
         return [Done(job, result.took_s)]
-
-
-def _client(address: str) -> Client:
-    try:
-        import distributed  # noqa: PLC0415  another package, and not always there
-    except ImportError as error:
-        raise DeviceError(
-            "a scheduler is given, and dask.distributed is not installed; run 'pip install ertis-numba[cluster]'"
-        ) from error
-    try:
-        make: Any = distributed.Client
-        return make(address, timeout=_CONNECT_S, set_as_default=False, name="ertis")
-    except (OSError, ValueError, TimeoutError) as error:
-        told = " ".join(str(error).split())[:200]
-        raise NetworkError(
-            f"no dask scheduler answers at {address} ({told}); give the address that 'dask scheduler' has printed"
-        ) from error
 
 
 def _taken(future: Future, slot: Slot) -> tuple[Any, str]:

@@ -1,0 +1,181 @@
+"""Many recordings at once: what further workers gain, on this machine and as a dask cluster."""
+
+import itertools
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ertis_bench import checks, machine, subject
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table as _table
+from ertis_numba import cluster
+from ertis_numba.campaign import Begun, Campaign, Ended, Wanted, find
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.storage import open_energyscapes, open_recording, write_recording
+
+__all__ = ["many", "run"]
+
+_MEASUREMENTS: Final = 20  # of each recording
+_EPOCH: Final = "1700000000"  # what would differ between files is when they were made
+
+
+def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Process the same recordings by all crews in turns, compare all files, and return the report.
+
+    Parameters
+    ----------
+    count : int
+        Recordings.
+    rounds : int
+    say : callable
+
+    Raises
+    ------
+    DataError
+        A recording failed, an image is wrong, or files differ.
+    """
+    before = os.environ.get("SOURCE_DATE_EPOCH")
+    os.environ["SOURCE_DATE_EPOCH"] = _EPOCH
+    try:
+        with tempfile.TemporaryDirectory(prefix="ertis-") as place, ExitStack() as stack:
+            say(f"writing {count} recordings")
+            folder, source = _recordings(Path(place) / "runs", count)
+            address = stack.enter_context(cluster.local(_cores()))
+            times_s = _measured(folder, Path(place) / "out", _crews(address), rounds, say)
+            size_bytes = sum(path.stat().st_size for path in folder.iterdir())
+    finally:
+        if before is None:
+            del os.environ["SOURCE_DATE_EPOCH"]
+        else:
+            os.environ["SOURCE_DATE_EPOCH"] = before
+    return {
+        "machine": machine.describe(),
+        "recordings": count,
+        "measurements": _MEASUREMENTS,
+        "rounds": rounds,
+        "source": source,
+        "bytes": size_bytes,
+        "rows": [_row(name, times_s) for name in times_s],
+    }
+
+
+def _cores() -> int:
+    cores: int = machine.describe()["cores"]
+    return cores
+
+
+def _crews(address: str) -> dict[str, dict[str, Any]]:
+    """Return what is compared, by what it is called: arguments of a campaign."""
+    cores = _cores()
+    crews: dict[str, dict[str, Any]] = {"1 worker of 1 thread": {"workers": 1, "threads": 1}}
+    if cores > 1:
+        crews |= {
+            f"1 worker of {cores} threads": {"workers": 1, "threads": cores},
+            f"{cores} workers of 1 thread": {"workers": cores, "threads": 1},
+            f"{cores} workers of {cores} threads": {"workers": cores, "threads": cores},
+        }
+    return crews | {f"dask's LocalCluster, {cores} workers of 1 thread": {"scheduler": address}}
+
+
+def _recordings(folder: Path, count: int) -> tuple[Path, str]:
+    """Write recordings whose measurements all differ, of one that was simulated; return also what that is."""
+    folder.mkdir()
+    first, source = subject.measurement()
+    for number in range(count):
+        write_recording(folder / f"{number:03}.h5", _measurements(first, number))
+    return folder, source
+
+
+def _measurements(first: Measurement, number: int) -> Iterator[Measurement]:
+    """Yield a measurement again and again, a little later in its record each time."""
+    for index in range(_MEASUREMENTS):
+        stamp = replace(first.stamp, sequence=index, sync_count=index, timestamp_ns=50_000_000 * index)
+        yield replace(first, words=np.roll(first.words, number * _MEASUREMENTS + index), stamp=stamp)
+
+
+def _measured(
+    folder: Path, out: Path, crews: dict[str, dict[str, Any]], rounds: int, say: Callable[[str], None]
+) -> dict[str, list[tuple[float, float]]]:
+    """Return how long each crew took in each round: in all, and from the first recording that it began."""
+    times_s: dict[str, list[tuple[float, float]]] = {name: [] for name in crews}
+    wanted: dict[str, bytes] = {}
+    for turn, (name, chosen) in itertools.product(range(rounds + 1), crews.items()):
+        say(f"round {turn} of {rounds}: {name}" if turn else f"to warm up: {name}")
+        with tempfile.TemporaryDirectory(dir=out.parent) as target:
+            took_s = _timed(folder, Path(target), **chosen)
+            files = {path.name: path.read_bytes() for path in sorted(Path(target).iterdir())}
+            if not wanted:
+                _require_exact(folder, Path(target))
+                wanted = files
+        if files != wanted:
+            others = sorted(each for each in files | wanted if files.get(each) != wanted.get(each))
+            raise DataError(f"{name} made other files than 1 worker of 1 thread ({', '.join(others)}); do not trust it")
+        if turn:  # files and kernels come from memory from now on
+            times_s[name].append(took_s)
+    return times_s
+
+
+def _timed(folder: Path, target: Path, *, threads: int | None = None, **crew: Any) -> tuple[float, float]:
+    begin_s = first_s = time.perf_counter()
+    for event in Campaign(find([folder]), target, Wanted(threads=threads), **crew).run():
+        if isinstance(event, Begun) and first_s == begin_s:
+            first_s = time.perf_counter()
+        if isinstance(event, Ended) and event.outcome != "made":
+            raise DataError(f"{event.recording} is {event.outcome} ({event.error}); it is not timed")
+    end_s = time.perf_counter()
+    return end_s - begin_s, end_s - first_s
+
+
+def _require_exact(folder: Path, target: Path) -> None:
+    path = min(folder.iterdir())
+    with open_recording(path) as recording, open_energyscapes(target / f"{path.stem}.energy.h5") as images:
+        image = images[1]
+        checks.require_exact(image, replace(recording[1], settings=image.settings))
+
+
+def _row(name: str, times_s: dict[str, list[tuple[float, float]]]) -> dict[str, Any]:
+    """Return medians, and the medians of the ratios in each round, whose halves had the machine alike."""
+    base = next(iter(times_s.values()))
+    ratios = [(one[0] / mine[0], one[1] / mine[1]) for one, mine in zip(base, times_s[name], strict=True)]
+    return {
+        "crew": name,
+        "seconds": round(statistics.median(took[0] for took in times_s[name]), 2),
+        "working_s": round(statistics.median(took[1] for took in times_s[name]), 2),
+        "times_faster": round(statistics.median(ratio[0] for ratio in ratios), 2),
+        "working_times_faster": round(statistics.median(ratio[1] for ratio in ratios), 2),
+    }
+
+
+def many(report: dict[str, Any]) -> str:
+    """Return the times and ratios, and how they were measured."""
+    each = report["recordings"] * report["measurements"]
+    head = ["processed by", "s", "times faster", "without the start, s", "times faster", "measurements/s"]
+    rows = [
+        [
+            row["crew"],
+            f"{row['seconds']:.1f}",
+            f"{row['times_faster']:.2f}×",
+            f"{row['working_s']:.1f}",
+            f"{row['working_times_faster']:.2f}×",
+            f"{each / row['working_s']:.0f}",
+        ]
+        for row in report["rows"]
+    ]
+    conditions = (
+        f"{report['recordings']} recordings of {report['measurements']} measurements of {report['source']}, "
+        f"{report['bytes'] / 1e6:.0f} MB in all, each measurement a little later in its record than the one before. "
+        f"Medians of {report['rounds']} rounds, in which all take turns; ratios are to the first line, round by round. "
+        "Included: starting processes, reading and checking, planning, images, writing them and reading them back. "
+        "The start is what comes before the first recording is begun; that of the LocalCluster itself is in neither. "
+        "The files of all lines were equal, byte by byte, and an image was checked against the exact one."
+    )
+    return "\n\n".join([_table(head, rows), f"Measured on {sentence(report['machine'])}", conditions])

@@ -1,0 +1,26 @@
+"""Campaigns: many recordings to energyscapes, on all cores or on a cluster.
+
+Each recording becomes a file of its own, complete or not at all, so that a campaign that was ended at any moment goes
+on where it stopped. Workers are processes that know nothing of each other: one that dies takes its recording with it
+and no other one.
+"""
+
+from ertis_numba.campaign.campaign import Campaign
+from ertis_numba.campaign.events import Advanced, Begun, Ended, Event
+from ertis_numba.campaign.orders import Wanted
+from ertis_numba.campaign.recordings import Found, find, outputs
+from ertis_numba.campaign.sensor_run import SensorRun, faults_of
+
+__all__ = [
+    "Advanced",
+    "Begun",
+    "Campaign",
+    "Ended",
+    "Event",
+    "Found",
+    "SensorRun",
+    "Wanted",
+    "faults_of",
+    "find",
+    "outputs",
+]

@@ -1,0 +1,269 @@
+"""The course of a campaign: who does what next, and what became of each recording."""
+
+import os
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from ertis_numba import checks
+from ertis_numba.campaign.events import Advanced, Begun, Ended, Event, Outcome
+from ertis_numba.campaign.folder import clear_parts, sole
+from ertis_numba.campaign.made import difference
+from ertis_numba.campaign.orders import MOST_BYTES, Crew, News, Order, Wanted
+from ertis_numba.campaign.plans import Plans
+from ertis_numba.campaign.recordings import Found, outputs
+from ertis_numba.errors import ArgumentError, ErtisError
+from ertis_numba.geometry import self_contained
+from ertis_numba.settings import Accuracy, Settings
+
+__all__ = ["Campaign"]
+
+_WAIT_S: Final = 0.5
+_AHEAD: Final = 2  # recordings that are looked at while others are made, so that nobody waits
+
+
+@dataclass(slots=True, eq=False)
+class _Case:
+    """A recording in hand."""
+
+    found: Found
+    target: Path
+    measurements: int = 0
+    wanted: dict[str, Settings] = field(default_factory=dict)
+
+    def ended(self, outcome: Outcome, **more: Any) -> Ended:
+        return Ended(self.found.path, self.target, outcome, **more)
+
+
+class Campaign:
+    """Makes an energyscape file of each recording in a folder.
+
+    Whatever the number of workers, the files are the same, bit by bit but for the date in them: a plan is settled once
+    for all recordings with the same settings, and neither depends on threads. One that is there already is left alone
+    if it was made of the same recording by the same settings and versions.
+
+    Parameters
+    ----------
+    recordings : sequence of Found
+    folder : Path
+        It is made if there is none.
+    wanted : Wanted, optional
+    workers : int, optional
+        Processes on this machine; one for each core by default, of which each has one thread, and one for a GPU.
+    scheduler : str, optional
+        Address of a dask scheduler whose workers do it instead.
+
+    Raises
+    ------
+    ArgumentError
+        Two recordings would become the same file, or no files can be put there.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Found],
+        folder: str | Path,
+        wanted: Wanted | None = None,
+        *,
+        workers: int | None = None,
+        scheduler: str | None = None,
+    ) -> None:
+        if workers is not None:
+            checks.whole("workers", workers, 1)
+            if scheduler is not None:
+                raise ArgumentError("workers are given and a scheduler, which has its own; give one of both")
+        self.folder, self._wanted = Path(folder), wanted or Wanted()
+        targets = outputs(recordings, self.folder)
+        self._names = {target.name for target in targets}
+        self._waiting = deque(_Case(*pair) for pair in zip(recordings, targets, strict=True))
+        self._workers, self._scheduler = workers, scheduler
+        self._plans = Plans()
+        self._unplanned: deque[_Case] = deque()
+        self._ready: deque[_Case] = deque()
+        self._given: dict[int, tuple[Order, _Case]] = {}
+        self._n_orders = 0
+
+    @property
+    def workers(self) -> int:
+        """How many processes of this machine share it: no more than there are recordings."""
+        cores = _n_cores()
+        chosen = self._workers or (1 if self._wanted.device == "cuda" else cores // (self._wanted.threads or 1))
+        return max(1, min(chosen, len(self._names)))
+
+    def run(self) -> Generator[Event]:
+        """Process, and yield what happens; close the iterator to end all work at once.
+
+        Raises
+        ------
+        ArgumentError
+            Another campaign writes into the folder.
+        DeviceError
+            No process can be started, or dask.distributed is missing.
+        NetworkError
+            The scheduler does not answer, or not any more.
+        """
+        with sole(self.folder):
+            clear_parts(self.folder, self._names)
+            try:
+                with closing(self._crew()) as crew:
+                    while self._feed(crew):
+                        for news in crew.wait(_WAIT_S):
+                            yield from self._heard(crew, news)
+            finally:
+                clear_parts(self.folder, self._names)
+
+    def _crew(self) -> Crew:
+        if self._scheduler is not None:
+            from ertis_numba.campaign.members import Members  # noqa: PLC0415  it loads dask
+
+            return Members(self._scheduler)
+        from ertis_numba.campaign.processes import Processes  # noqa: PLC0415
+
+        return Processes(self.workers)
+
+    def _feed(self, crew: Crew) -> bool:
+        """Give orders to whoever is free; return whether there is anything to wait for."""
+        while crew.free and (pair := self._next(crew)) is not None:
+            self._given[pair[0].number] = pair
+            crew.give(pair[0])
+        return bool(self._given)
+
+    def _next(self, crew: Crew) -> tuple[Order, _Case] | None:
+        """Return what is to be done next: what is nearest to its end comes first."""
+        if self._ready:
+            case = self._ready.popleft()
+            return self._order("make", self._to_make(case, crew.size)), case
+        if (planned := self._to_plan(crew.size)) is not None:
+            return planned
+        in_hand = len(self._given) + len(self._unplanned)
+        if self._waiting and in_hand < crew.size + _AHEAD:
+            case = self._waiting.popleft()
+            return self._order("look", self._paths(case) | {"sensor": self._wanted.sensor}), case
+        return None
+
+    def _to_plan(self, n_workers: int) -> tuple[Order, _Case] | None:
+        """Return an order to plan, unless all that is to be planned for has to wait."""
+        for case in self._unplanned:
+            settings = next(each for each in case.wanted.values() if self._plans.of(each) is None)
+            if (kind := self._plans.begin(settings)) is not None:
+                self._unplanned.remove(case)
+                about = {"settings": settings.to_toml(), "warm": kind == "new", **self._shares(n_workers)}
+                return self._order("plan", about), case
+        return None
+
+    def _order(self, do: Literal["look", "plan", "make"], about: dict[str, Any]) -> Order:
+        self._n_orders += 1
+        return Order(self._n_orders, do, about)
+
+    def _paths(self, case: _Case) -> dict[str, Any]:
+        far = self._scheduler is not None  # where the current folder is another one
+        path, target = (each.absolute() if far else each for each in (case.found.path, case.target))
+        return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._wanted.dtype}
+
+    def _shares(self, n_workers: int) -> dict[str, Any]:
+        share = 1 if self._scheduler is not None else n_workers
+        return {"device": self._wanted.device, "threads": self._wanted.threads, "share": share}
+
+    def _to_make(self, case: _Case, n_workers: int) -> dict[str, Any]:
+        wanted = self._wanted
+        planned = {}
+        for name, settings in case.wanted.items():
+            plan = self._plans.of(settings)
+            if isinstance(plan, Accuracy):
+                planned[name] = settings.replace(accuracy=plan).to_toml()
+        return {
+            **self._paths(case),
+            **self._shares(n_workers),
+            "sensors": planned,
+            "batch": wanted.batch,
+            "most_bytes": MOST_BYTES / n_workers,
+            "strict": wanted.strict,
+            # Dask starts again what a worker had that was lost, even if all but the news of it had been done.
+            "overwrite": wanted.overwrite or self._scheduler is not None,
+            "examine": wanted.examine,
+            "examine_with": dict(wanted.examine_with),
+        }
+
+    def _heard(self, crew: Crew, news: News) -> Iterator[Event]:
+        if news.number not in self._given:
+            return
+        order, case = self._given[news.number]
+        if news.result is None:
+            if news.done:
+                yield Advanced(case.found.path, news.done)
+            return
+        del self._given[news.number]
+        if order.do == "plan":
+            self._plans.end(Settings.from_toml(order.about["settings"], "settings"), news.result)
+            if "by_chance" not in news.result:
+                yield from self._planned(crew, case, news.result)
+                return
+        if "error" in news.result:
+            self._clear(case)
+            yield case.ended("failed", error=news.result["error"])
+        elif order.do == "look":
+            yield from self._looked(case, news.result)
+        else:
+            yield case.ended("made", made=news.result)
+
+    def _clear(self, case: _Case) -> None:
+        """Remove what a worker that was killed has left."""
+        clear_parts(self.folder, {case.target.name})
+
+    def _looked(self, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
+        if told.get("passed_over"):
+            yield case.ended("passed over")
+            return
+        try:
+            for name, text in told["sensors"].items():
+                recorded = Settings.from_toml(text, f"{case.found.path}: settings")
+                case.wanted[name] = self_contained(_absolute(self._wanted.settings(recorded)))
+            case.measurements = told["measurements"]
+            made = told["made"]
+            differs = "" if made is None else difference(made, case.wanted)
+        except (ErtisError, OSError) as error:
+            yield case.ended("failed", error=" ".join(str(error).split()))
+            return
+        if made is not None and not differs:
+            yield case.ended("there")
+        elif made is not None and (made.get("recording") or not self._wanted.overwrite):
+            remedy = "give another folder" + ("" if made.get("recording") else ", or ask to replace it (--force)")
+            yield case.ended("failed", error=f"output {case.target} exists and {differs}; {remedy}")
+        else:
+            yield from self._forward(case)
+
+    def _planned(self, crew: Crew, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
+        if told.get("device") == "cuda" and self._workers is None and self._scheduler is None:
+            crew.limit(1)  # a GPU serves one recording faster than it serves several
+        cases = [case, *self._unplanned]
+        self._unplanned.clear()
+        for each in cases:
+            yield from self._forward(each)
+
+    def _forward(self, case: _Case) -> Iterator[Event]:
+        """Bring a case to where it is made, as far as its plans are known."""
+        plans = [self._plans.of(settings) for settings in case.wanted.values()]
+        failed = [plan for plan in plans if isinstance(plan, str)]
+        if failed:
+            yield case.ended("failed", error=f"{case.found.path}: {failed[0]}")
+        elif None in plans:
+            self._unplanned.append(case)
+        else:
+            self._ready.append(case)
+            yield Begun(case.found.path, case.measurements)
+
+
+def _absolute(settings: Settings) -> Settings:
+    """Return settings whose directions can be found from any folder."""
+    directions = settings.processing.directions
+    if not directions.lower().endswith(".csv"):
+        return settings
+    return settings.replace(processing=settings.processing.replace(directions=str(Path(directions).absolute())))
+
+
+def _n_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

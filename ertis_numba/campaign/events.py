@@ -1,0 +1,50 @@
+"""What happens in a campaign."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+__all__ = ["Advanced", "Begun", "Ended", "Event", "Outcome"]
+
+Outcome = Literal["made", "there", "passed over", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """A recording is processed from now on."""
+
+    recording: Path
+    measurements: int
+
+
+@dataclass(frozen=True, slots=True)
+class Advanced:
+    """So many measurements of a recording are done."""
+
+    recording: Path
+    done: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """What became of a recording.
+
+    Attributes
+    ----------
+    recording, output : Path
+    outcome : {"made", "there", "passed over", "failed"}
+        ``there`` is what had been made before, by the same settings and versions.
+    error : str
+        Why it failed, in a line.
+    made : dict
+        Measurements, times and more of what was made.
+    """
+
+    recording: Path
+    output: Path
+    outcome: Outcome
+    error: str = ""
+    made: dict[str, Any] = field(default_factory=dict)
+
+
+Event = Begun | Advanced | Ended

@@ -1,0 +1,56 @@
+"""The folder that a campaign writes into: one campaign at a time, and nothing half-written stays."""
+
+import errno
+import os
+import re
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["clear_parts", "sole"]
+
+_PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # as `atomic.replacing` names them
+
+
+@contextmanager
+def sole(folder: Path) -> Iterator[None]:
+    """Make a folder unless it is there, and be the only campaign that writes into it until the block ends.
+
+    The system forgets it when the process ends, however it does.
+
+    Raises
+    ------
+    ArgumentError
+        Another one writes into it.
+    """
+    folder.mkdir(exist_ok=True)
+    if os.name != "posix":  # a folder cannot be opened there
+        yield
+        return
+    import fcntl  # noqa: PLC0415  not on every system
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in {errno.EWOULDBLOCK, errno.EACCES}:
+                raise ArgumentError(
+                    f"output {folder} is written into by another campaign; wait for it, or give another folder"
+                ) from None
+            # Some file systems of a network have no locks: better none than no campaign.
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def clear_parts(folder: Path, targets: Collection[str]) -> None:
+    """Remove what writers that were killed have left of files of these names."""
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries]
+    for name in names:
+        part = _PART.fullmatch(name)
+        if part and part[1] in targets:
+            (folder / name).unlink(missing_ok=True)

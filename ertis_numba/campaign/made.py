@@ -1,0 +1,102 @@
+"""Whether an energyscape file that is there already is what would be made."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from ertis_numba.errors import ErtisError
+from ertis_numba.geometry import direction_grid, self_contained
+from ertis_numba.settings import Accuracy, Settings
+from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
+from ertis_numba.storage.schema import software_versions
+
+__all__ = ["difference", "look_at"]
+
+_OPEN = (None, "auto")  # what settings leave to the planner
+
+
+class _Made(EnergyscapeReader):
+    """What a file has to tell of how it was made."""
+
+    @property
+    def dtype(self) -> str:
+        """Type of its images."""
+        return str(self._group["energy"].dtype.name)
+
+    @property
+    def axes(self) -> str:
+        return _digest(self.azimuth_rad.tobytes(), self.elevation_rad.tobytes())
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
+    """Return what there is of an energyscape file that was made of a recording: its sensors' settings and axes.
+
+    ``differs`` in it says why it is something else; it is empty where only settings can be different. None is returned
+    where there is no file. A ``recording`` is never to be replaced.
+    """
+    if not target.exists():
+        return None
+    try:
+        if file_kind(target) == "recording":
+            return {"differs": "is a recording", "recording": True}
+        sensors = {}
+        for name in sensor_names(target):
+            with _Made(target, sensor=name) as made:
+                differs = _differs(made, recording, dtype)
+                if differs:
+                    return {"differs": differs}
+                sensors[name] = {"settings": made.settings.to_toml(), "axes": made.axes, "measurements": len(made)}
+    except ErtisError:
+        return {"differs": "is no energyscape file that can be read"}
+    return {"differs": "", "sensors": sensors}
+
+
+def _differs(made: _Made, recording: RecordingReader, dtype: str) -> str:
+    if made.attributes.get("recording_uuid") != recording.uuid:
+        return "was made of another recording"
+    for name, wanted in software_versions().items():
+        came = made.attributes.get(f"{name.replace('-', '_')}_version", "unknown")
+        if came != wanted:
+            return f"was made by {name} {came}, this is {wanted}"
+    if made.dtype != dtype:
+        return f"holds {made.dtype}, wanted {dtype}"
+    if made.attributes.get("recording_sha256") != recording.sha256():  # last, as it reads all of it
+        return "was made of another file of the same recording"
+    return ""
+
+
+def difference(made: dict[str, Any], wanted: dict[str, Settings]) -> str:
+    """Return why a file is not what these settings would make of its sensors; empty if it is."""
+    if made["differs"]:
+        return str(made["differs"])
+    if list(made["sensors"]) != list(wanted):
+        return f"holds sensor {', '.join(made['sensors'])}, wanted {', '.join(wanted)}"
+    for name, settings in wanted.items():
+        held = made["sensors"][name]
+        found = _changed(Settings.from_toml(held["settings"], "settings"), self_contained(settings))
+        if not found and settings.processing.directions.lower().endswith(".csv"):  # whose content may be another one
+            grid = direction_grid(settings.processing)
+            found = "" if _digest(grid.azimuth_rad.tobytes(), grid.elevation_rad.tobytes()) == held["axes"] else "grid"
+        if found:
+            return f"was made with other settings ({found} of sensor {name})"
+    return ""
+
+
+def _changed(made: Settings, wanted: Settings) -> str:
+    """Return what is different; a plan may have settled whatever was left open."""
+    opened = made.replace(accuracy=_reopened(made.accuracy, wanted.accuracy))
+    for table in Settings.__struct_fields__:
+        came, asked = getattr(opened, table), getattr(wanted, table)
+        if came != asked:
+            fields = [name for name in came.__struct_fields__ if getattr(came, name) != getattr(asked, name)]
+            return f"{table}.{fields[0]}"
+    return ""
+
+
+def _reopened(made: Accuracy, wanted: Accuracy) -> Accuracy:
+    asked = {name: getattr(wanted, name) for name in Accuracy.__struct_fields__}
+    return made.replace(**{name: value for name, value in asked.items() if value in _OPEN})

@@ -1,0 +1,156 @@
+"""Workers of a dask cluster that is there already, for more than one machine."""
+
+import queue
+import secrets
+import time
+from concurrent.futures import CancelledError
+from typing import Any, Final
+
+from ertis_numba import cluster
+from ertis_numba.campaign.orders import News, Order
+from ertis_numba.campaign.work import follow
+from ertis_numba.errors import NetworkError
+from ertis_numba.storage.schema import software_versions
+
+__all__ = ["Members", "follow_there"]
+
+_CONNECT_S: Final = 10.0
+_LOOK_S: Final = 1.0
+_TELL_S: Final = 0.5
+
+
+class Members:
+    """See `Crew`: the workers of a dask scheduler, one recording each at a time.
+
+    They need this package and what it computes with, of the same versions, and have to see the files under the same
+    names. What a lost worker had, dask starts again on another, a few times. Whoever reaches a scheduler can run code
+    on its workers: keep it among machines that trust each other, or use dask's TLS.
+
+    Parameters
+    ----------
+    address : str
+
+    Raises
+    ------
+    DeviceError
+        dask.distributed is not installed.
+    NetworkError
+        No scheduler answers, or it has no workers; later, if it is gone.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._topic = f"ertis-{secrets.token_hex(4)}"
+        self._told: queue.SimpleQueue[News] = queue.SimpleQueue()
+        self._futures: dict[int, cluster.Future] = {}
+        self._client = cluster.connect(address, timeout_s=_CONNECT_S)
+        try:
+            cluster.require_workers(self._client, address, timeout_s=_CONNECT_S)
+            self._size = len(self._client.nthreads())
+            self._client.subscribe_topic(self._topic, self._advance)
+        except BaseException:
+            self._client.close(timeout=2)
+            raise
+        self._looked_s = time.monotonic()
+
+    @property
+    def size(self) -> int:
+        """See `Crew`."""
+        return self._size
+
+    @property
+    def free(self) -> int:
+        """See `Crew`."""
+        return self._size - len(self._futures)
+
+    def limit(self, size: int) -> None:
+        """See `Crew`; each worker of a cluster has its own device."""
+
+    def give(self, order: Order) -> None:
+        """See `Crew`."""
+        future = self._client.submit(
+            follow_there,
+            order.do,
+            {**order.about, "versions": software_versions()},
+            self._topic,
+            order.number,
+            key=f"{self._topic}-{order.number}",
+            pure=False,
+        )
+        self._futures[order.number] = future
+        future.add_done_callback(lambda done, number=order.number: self._told.put(_news(number, done)))
+
+    def wait(self, timeout_s: float) -> list[News]:
+        """See `Crew`."""
+        if self._client.status != "running":
+            raise NetworkError(
+                f"the dask scheduler at {self._address} is gone; what is made stays, give another to go on"
+            )
+        self._look()
+        try:
+            news = [self._told.get(timeout=timeout_s)]
+        except queue.Empty:
+            return []
+        while not self._told.empty():
+            news.append(self._told.get())
+        for each in news:
+            if each.result is not None:
+                self._futures.pop(each.number, None)
+        return news
+
+    def close(self) -> None:
+        """See `Crew`: dask cannot end a thread, but the work notices that nobody wants it any more."""
+        if self._client.status == "running":
+            self._client.cancel(list(self._futures.values()), force=True)
+        self._client.close(timeout=2)
+
+    def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
+        """Take what a task tells; in a thread of the client."""
+        _, told = event
+        self._told.put(News(told["number"], told["done"]))
+
+    def _look(self) -> None:
+        """Count the workers again, now and then."""
+        if time.monotonic() < self._looked_s + _LOOK_S:
+            return
+        self._looked_s = time.monotonic()
+        try:
+            self._size = max(1, len(self._client.nthreads()))
+        except (OSError, TimeoutError):  # it may come back; if not, the client's status says so
+            return
+
+
+def _news(number: int, future: cluster.Future) -> News:
+    """Return what a task has come to; in a thread of the client."""
+    try:
+        return News(number, result=future.result(timeout=_CONNECT_S))
+    except CancelledError:
+        return News(number, result={"error": "the cluster has let go of it; process again", "by_chance": True})
+    except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        return News(number, result={"error": text, "by_chance": True})
+
+
+class _UnwantedError(Exception):
+    """Nobody waits for what a task does."""
+
+
+def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
+    """Follow an order as `work.follow` does, on a worker of the cluster; ``topic`` is where it tells how far it is."""
+    here = cluster.worker()
+    for name, wanted in about["versions"].items():
+        came = software_versions()[name]
+        if came != wanted:
+            return {"error": f"worker {here.address} has {name} {came}, wanted {wanted}; install the same everywhere"}
+    told_s = 0.0
+
+    def tell(done: int) -> None:
+        nonlocal told_s
+        task = here.state.tasks.get(f"{topic}-{number}")
+        if task is None or task.state == "cancelled":
+            raise _UnwantedError
+        if time.monotonic() > told_s + _TELL_S:
+            told_s = time.monotonic()
+            here.log_event(topic, {"number": number, "done": done})
+
+    return follow(do, {**about, "at_most": here.state.nthreads}, tell)

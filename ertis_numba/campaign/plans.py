@@ -1,0 +1,58 @@
+"""What settings leave open is settled once, for all recordings that share them."""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from ertis_numba.settings import Accuracy, Air, Settings
+
+__all__ = ["Plans"]
+
+
+class Plans:
+    """Plans by the settings that they are for, and which are being made.
+
+    Were it not for them, workers that have measured other costs could choose other plans, and files would depend on who
+    made them.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[bytes, Accuracy | str] = {}
+        self._kinds: set[bytes] = set()  # of settings whose kernels are compiled
+        self._under_way: dict[bytes, bool] = {}  # settings, and whether their kind is new
+
+    def of(self, settings: Settings) -> Accuracy | str | None:
+        """Return the plan for settings, or why there can be none, or None as long as it is not known."""
+        return self._found.get(_key(settings))
+
+    def begin(self, settings: Settings) -> Literal["new", "known"] | None:
+        """Say that settings are planned for from now on; return whether their kind is new, None if they have to wait.
+
+        A kind is all but the air. New ones come one after the other: kernels that are compiled by several processes at
+        once could spoil each other's cache.
+        """
+        key, new = _key(settings), _kind(settings) not in self._kinds
+        if key in self._under_way or (new and any(self._under_way.values())):
+            return None
+        self._under_way[key] = new
+        return "new" if new else "known"
+
+    def end(self, settings: Settings, told: Mapping[str, Any]) -> None:
+        """Take what came of it; what went wrong by chance is tried again by whoever wants the same plan."""
+        key = _key(settings)
+        self._under_way.pop(key)
+        if "by_chance" in told:
+            return
+        if "error" in told:
+            self._found[key] = str(told["error"])
+        else:
+            self._found[key] = Settings.from_toml(told["settings"], "settings").accuracy
+            self._kinds.add(_kind(settings))
+
+
+def _key(settings: Settings) -> bytes:
+    return hashlib.sha256(settings.to_toml().encode()).digest()
+
+
+def _kind(settings: Settings) -> bytes:
+    return _key(settings.replace(air=Air()))

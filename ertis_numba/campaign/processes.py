@@ -1,0 +1,198 @@
+"""Workers of this machine: processes that are started, fed, and started again when they have died."""
+
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import IO, Any, Final
+
+from ertis_numba.campaign.orders import News, Order
+from ertis_numba.errors import DeviceError
+
+__all__ = ["Processes"]
+
+_MODULE: Final = "ertis_numba.campaign._process"
+_MOST_STILLBORN: Final = 3  # that end in a row before they have done anything
+_LAST_WORDS: Final = 20  # lines
+
+
+@dataclass(slots=True, eq=False)
+class _Worker:
+    """A process, and what it does at present."""
+
+    process: "subprocess.Popen[str]"
+    order: Order | None = None
+    begun: bool = False
+    ready: bool = False
+    said: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_WORDS))
+    threads: list[threading.Thread] = field(default_factory=list)
+
+
+class Processes:
+    """See `Crew`: Python processes that are new interpreters, not forks, which OpenMP and HDF5 would not survive.
+
+    Ctrl-C in a terminal does not reach them; they end with this process, however that ends.
+
+    Parameters
+    ----------
+    size : int
+
+    Raises
+    ------
+    DeviceError
+        Later, if processes end before they do anything.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._told: queue.SimpleQueue[tuple[_Worker, str | None]] = queue.SimpleQueue()
+        self._workers: list[_Worker] = []
+        self._stillborn = 0
+        try:
+            for _ in range(size):
+                self._start()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def size(self) -> int:
+        """See `Crew`."""
+        return self._size
+
+    @property
+    def free(self) -> int:
+        """See `Crew`."""
+        return self._size - sum(worker.order is not None for worker in self._workers)
+
+    @property
+    def doing(self) -> dict[int, str]:
+        """What each process works on, by its number in the system: the path of a recording, or nothing."""
+        return {worker.process.pid: _path(worker.order) for worker in self._workers}
+
+    def limit(self, size: int) -> None:
+        """See `Crew`."""
+        self._size = min(self._size, size)
+        for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
+            self._end(worker)
+
+    def give(self, order: Order) -> None:
+        """See `Crew`."""
+        worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
+        worker.order, worker.begun = order, False
+        stdin = worker.process.stdin
+        if stdin is not None:
+            with suppress(OSError):  # it has died; who reads what it tells will find out
+                stdin.write(json.dumps({"number": order.number, "do": order.do, "about": order.about}) + "\n")
+                stdin.flush()
+
+    def wait(self, timeout_s: float) -> list[News]:
+        """See `Crew`."""
+        try:
+            told = [self._told.get(timeout=timeout_s)]
+        except queue.Empty:
+            return []
+        while not self._told.empty():
+            told.append(self._told.get())
+        return [news for worker, line in told if (news := self._heard(worker, line)) is not None]
+
+    def close(self) -> None:
+        """See `Crew`."""
+        for worker in self._workers:
+            worker.process.kill()  # all of them first
+        for worker in list(self._workers):
+            self._end(worker)
+
+    def _start(self) -> _Worker:
+        # -P: a file in the current folder that is named like one of Python's must not be taken for it.
+        process = subprocess.Popen(  # noqa: S603  this very package
+            [sys.executable, "-P", "-m", _MODULE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            errors="backslashreplace",
+            start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
+        )
+        worker = _Worker(process)
+        for work, stream in ((self._listen, process.stdout), (self._overhear, process.stderr)):
+            thread = threading.Thread(target=work, args=(worker, stream), daemon=True)
+            thread.start()
+            worker.threads.append(thread)
+        self._workers.append(worker)
+        return worker
+
+    def _listen(self, worker: _Worker, stream: IO[str]) -> None:
+        for line in stream:
+            self._told.put((worker, line))
+        self._told.put((worker, None))
+
+    @staticmethod
+    def _overhear(worker: _Worker, stream: IO[str]) -> None:
+        worker.said.extend(line.strip() for line in stream if line.strip())
+
+    def _heard(self, worker: _Worker, line: str | None) -> News | None:
+        if line is None:
+            return self._died(worker)
+        try:
+            told: dict[str, Any] = json.loads(line)
+        except ValueError:  # what is killed may have told half of it
+            return None
+        if "number" not in told:
+            worker.ready, self._stillborn = True, 0
+            return None
+        worker.begun = True
+        news = News(told["number"], told.get("done", 0), told.get("result"))
+        if news.result is not None:
+            worker.order = None
+        return news
+
+    def _died(self, worker: _Worker) -> News | None:
+        if worker not in self._workers:
+            return None
+        order = worker.order
+        self._end(worker)
+        how = _how_it_ended(worker)
+        if not worker.ready:
+            self._stillborn += 1
+        if self._stillborn >= _MOST_STILLBORN:
+            raise DeviceError(f"processes to work in end at once: the last one {how}; try 'ertis process' on one file")
+        if order is not None and not worker.begun:
+            self.give(order)
+            return None
+        if order is None:
+            return None
+        text = f"{_path(order)}: the process that worked on it {how}; where memory runs out, give fewer --workers"
+        return News(order.number, result={"error": text, "by_chance": True})
+
+    def _end(self, worker: _Worker) -> None:
+        """End a process at once and let go of it."""
+        self._workers.remove(worker)
+        worker.process.kill()
+        worker.process.wait()
+        for thread in worker.threads:
+            thread.join()
+        for stream in (worker.process.stdin, worker.process.stdout, worker.process.stderr):
+            if stream is not None:
+                with suppress(OSError):  # what it has not read
+                    stream.close()
+
+
+def _path(order: Order | None) -> str:
+    return "" if order is None else str(order.about.get("path", ""))
+
+
+def _how_it_ended(worker: _Worker) -> str:
+    code = worker.process.returncode
+    if code < 0:
+        with suppress(ValueError):
+            return f"was ended by {signal.Signals(-code).name}"
+    said = f", saying {worker.said[-1]!r}" if worker.said else ""
+    return f"ended with {code}{said}"

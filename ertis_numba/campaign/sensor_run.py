@@ -1,0 +1,109 @@
+"""The measurements of one sensor, through its pipeline, into a file."""
+
+import itertools
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ertis_numba.campaign.orders import MOST_BYTES
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+from ertis_numba.stages.health import health
+from ertis_numba.storage import EnergyscapeWriter, RecordingReader
+
+__all__ = ["SensorRun", "faults_of"]
+
+
+def faults_of(name: str, measurement: Measurement) -> str:
+    """Return what is wrong with the microphones, and what to do about it, in a line; it is empty if nothing is."""
+    report = health(measurement)
+    if not report.faults:
+        return ""
+    every = all(channel.faults for channel in report.channels)
+    remedy = "check its cable and supply" if every else "put them under 'disabled' in a layout file for --settings"
+    return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
+
+
+class SensorRun:
+    """The pipeline of one sensor, what was told of it, and how long it took for each measurement.
+
+    Parameters
+    ----------
+    pipeline : Pipeline
+    batch : int
+        Measurements worked on at the same time, fewer where images are large.
+    most_bytes : float, optional
+        Of images that wait to be written; `MOST_BYTES` by default.
+
+    Attributes
+    ----------
+    pipeline : Pipeline
+    times_ms : list of float
+    told : dict
+    """
+
+    def __init__(self, pipeline: Pipeline, *, batch: int, most_bytes: float | None = None) -> None:
+        self.pipeline = pipeline
+        self.times_ms: list[float] = []
+        self.told: dict[str, Any] = {}
+        image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
+        self._size = max(1, min(batch, int((most_bytes or MOST_BYTES) / image_bytes)))
+
+    def known(self, measurement: Measurement) -> Measurement:
+        """Return a measurement as it is now known: a settings file may know better what array, call or air it was."""
+        return replace(measurement, settings=self.pipeline.settings)
+
+    def write(self, recording: RecordingReader, writer: EnergyscapeWriter) -> Iterator[None]:
+        """Process a recording and write its images; yield after each.
+
+        Raises
+        ------
+        DataError
+            A measurement was taken in other air than the recording says, and nothing else is known of it.
+        """
+        settings = self.pipeline.settings
+        as_recorded = settings.air == recording.settings.air
+        measurements = iter(recording)
+        while group := list(itertools.islice(measurements, self._size)):
+            if as_recorded:
+                for measurement in group:
+                    _require_same_air(measurement, settings)
+            images = self._processed([self.known(measurement) for measurement in group])
+            images.reverse()
+            while images:  # none is kept: a GPU's images lie in memory that the next ones need
+                writer.write(images.pop())
+                yield
+
+    def _processed(self, measurements: Sequence[Measurement]) -> list[Energyscape]:
+        start_s = time.perf_counter()
+        if len(measurements) == 1:
+            images = [self.pipeline.process(measurements[0])]
+        else:
+            images = self.pipeline.process_batch(measurements)
+        self.times_ms += [1000 * (time.perf_counter() - start_s) / len(images)] * len(images)
+        return images
+
+    def report(self) -> dict[str, Any]:
+        """Return what was done, as ``--json`` has it."""
+        return {
+            "measurements": len(self.times_ms),
+            "directions": len(self.pipeline.grid),
+            "ranges": len(self.pipeline.range_m),
+            "median_ms": round(statistics.median(self.times_ms), 3),
+            **self.told,
+        }
+
+
+def _require_same_air(measurement: Measurement, settings: Settings) -> None:
+    """Refuse a measurement in other air, whose ranges would not be those of the axis."""
+    came, wanted = measurement.settings.air, settings.air
+    if came != wanted:
+        raise DataError(
+            f"measurement {measurement.stamp.sequence} was taken at {came.temperature_c:g} °C, "
+            f"{came.humidity_percent:g} %, {came.pressure_pa:g} Pa, others at {wanted.temperature_c:g} °C, "
+            f"{wanted.humidity_percent:g} %, {wanted.pressure_pa:g} Pa; give one air for all with --settings"
+        )

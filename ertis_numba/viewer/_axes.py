@@ -1,0 +1,181 @@
+"""The axes of a picture of range and azimuth: where things are in it, and rings, rays and names, drawn once."""
+
+import io
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+__all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes"]
+
+PAGE: Final = (11, 13, 18)
+"""Colour of what is not the image: red, green, blue."""
+SIDE_PX: Final = 44
+"""On either side of the sector, for names."""
+
+_FAINT: Final = "#9aa0b0"
+_DPI: Final = 100
+_LETTERS_PT: Final = 8.5
+_ROOF_PX, _FLOOR_PX = 26, 66  # above and below the sector, for the names of rays, and of rings and the scale of colours
+_SCALE_PX: Final = 10  # height of the scale of colours
+_RING_PX: Final = 36  # between rings at least, so that their names have room
+_LEAST_RATIO, _MOST_RATIO = 0.25, 1.0  # of the sector's height to its width
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the sector is in the picture.
+
+    Attributes
+    ----------
+    sensor_px : (x, y)
+        Of the sensor, from the upper left corner of the picture; it may lie outside.
+    scale_px_m : float
+        Pixels of a metre.
+    width_px, height_px : int
+        Of the picture.
+    box_px : (left, top, right, bottom)
+        Of the sector.
+    """
+
+    sensor_px: tuple[float, float]
+    scale_px_m: float
+    width_px: int
+    height_px: int
+    box_px: tuple[int, int, int, int]
+
+    @classmethod
+    def of(cls, azimuth_rad: NDArray[np.float64], range_m: tuple[float, float], width_px: int) -> "Place":
+        """Return where a sector fits into a picture of a width."""
+        arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
+        right_m = -np.outer(range_m, np.sin(arc))
+        ahead_m = np.outer(range_m, np.cos(arc))
+        west, east = float(right_m.min()), float(right_m.max())
+        low, high = float(ahead_m.min()), float(ahead_m.max())
+        inner_px = width_px - 2 * SIDE_PX
+        scale_px_m = min(inner_px / (east - west), inner_px * _MOST_RATIO / (high - low))
+        tall_px = max(inner_px * _LEAST_RATIO, (high - low) * scale_px_m)
+        middle_px = width_px / 2
+        sensor_px = (
+            middle_px - (west + east) / 2 * scale_px_m,
+            _ROOF_PX + tall_px / 2 + (low + high) / 2 * scale_px_m,
+        )
+        height_px = _ROOF_PX + round(tall_px) + _FLOOR_PX
+        box_px = (
+            math.floor(sensor_px[0] + west * scale_px_m),
+            math.floor(sensor_px[1] - high * scale_px_m),
+            math.ceil(sensor_px[0] + east * scale_px_m),
+            math.ceil(sensor_px[1] - low * scale_px_m),
+        )
+        return cls(sensor_px, scale_px_m, width_px, height_px, box_px)
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """Where the sector begins and ends to the right of the sensor and ahead of it."""
+        left, top, right, bottom = self.box_px
+        (x, y), scale = self.sensor_px, self.scale_px_m
+        return (left - x) / scale, (right - x) / scale, (y - bottom) / scale, (y - top) / scale
+
+    def pixel_of(self, azimuth_deg: float, range_m: float) -> tuple[float, float]:
+        """Return where a place is in the picture, in pixels from its upper left corner: x to the right, y down."""
+        (x, y), scale = self.sensor_px, self.scale_px_m
+        azimuth_rad = math.radians(azimuth_deg)
+        return x - range_m * math.sin(azimuth_rad) * scale, y - range_m * math.cos(azimuth_rad) * scale
+
+    def place_of(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """Return azimuth in degrees and range in metres of a place in the picture; the inverse of `pixel_of`."""
+        (x, y), scale = self.sensor_px, self.scale_px_m
+        right_m, ahead_m = (x_px - x) / scale, (y - y_px) / scale
+        return math.degrees(math.atan2(-right_m, ahead_m)), math.hypot(right_m, ahead_m)
+
+    @property
+    def scale_px(self) -> tuple[int, int, int, int]:
+        """Left, right, top and bottom of the scale of colours."""
+        across_px = min(240, self.width_px - 2 * SIDE_PX)
+        left = (self.width_px - across_px) // 2
+        return left, left + across_px, self.height_px - 32, self.height_px - 32 + _SCALE_PX
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ink:
+    """What is drawn over a picture.
+
+    Attributes
+    ----------
+    places : (drawn,) intp
+        Pixels of the flat picture.
+    colours : (drawn, 3) float32
+    cover : (drawn, 1) float32
+        How much of the picture they cover, 0 to 1.
+    """
+
+    places: NDArray[np.intp]
+    colours: NDArray[np.float32]
+    cover: NDArray[np.float32]
+
+    def onto(self, flat: NDArray[np.uint8]) -> None:
+        """Draw over a flat picture: (pixel, 3) uint8."""
+        under = flat[self.places] * (1 - self.cover)
+        flat[self.places] = (under + self.colours * self.cover + 0.5).astype(np.uint8)
+
+
+def draw_axes(place: Place, fan_rad: NDArray[np.float64], range_m: tuple[float, float], dynamic_range_db: float) -> Ink:
+    """Draw rings in metres, rays in degrees, the sensor, and the numbers of the scale of colours.
+
+    Parameters
+    ----------
+    place : Place
+    fan_rad : (azimuth,) float64
+        Rising.
+    range_m : (first, last)
+    dynamic_range_db : float
+    """
+    rows, columns = place.height_px, place.width_px
+    figure = Figure(figsize=(columns / _DPI, rows / _DPI), dpi=_DPI)
+    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
+    axes.set_xlim(0, columns)
+    axes.set_ylim(rows, 0)
+    axes.set_axis_off()
+    text: dict[str, Any] = {"color": _FAINT, "fontsize": _LETTERS_PT}
+    line: dict[str, Any] = {"color": _FAINT, "alpha": 0.4, "linewidth": 0.7}
+    first_deg, last_deg = math.degrees(fan_rad[0]), math.degrees(fan_rad[-1])
+    arc_deg = np.linspace(first_deg, last_deg, 181)
+    named_deg = first_deg if last_deg - first_deg < 350 else -135  # where no ray has its name
+    level = abs(first_deg + 90) < 20  # then the names of rings stand under the edge, else beside it
+    (low_m, high_m), half_m = range_m, 0.5 / place.scale_px_m
+    rings = max(1, min(6, int((high_m - low_m) * place.scale_px_m / _RING_PX)))
+    for ring_m in MaxNLocator(nbins=rings, steps=[1, 2, 5, 10]).tick_values(low_m, high_m):
+        if not low_m - half_m <= ring_m <= high_m + half_m or ring_m <= 0:
+            continue
+        axes.plot(*np.array([place.pixel_of(at, ring_m) for at in arc_deg]).T, **line)
+        x, y = place.pixel_of(named_deg, ring_m)
+        at_px = (x, y + 5) if level else (x + 6, y + 4)
+        axes.text(*at_px, f"{ring_m:g} m", ha="center" if level else "left", va="top", **text)
+    step_deg = 15 if last_deg - first_deg < 100 else 30
+    for ray_deg in range(-180, 181, step_deg):
+        if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6 or (ray_deg == -180 and last_deg > 180 - 1e-6):
+            continue
+        axes.plot(*np.array([place.pixel_of(ray_deg, at_m) for at_m in (low_m, high_m)]).T, **line)
+        x, y = place.pixel_of(ray_deg, high_m + 4 / place.scale_px_m)
+        across = -math.sin(math.radians(ray_deg))
+        side = "center" if abs(across) < 0.3 else "left" if across > 0 else "right"
+        below = "top" if math.cos(math.radians(ray_deg)) < -0.3 else "bottom"
+        axes.text(x, y, f"{ray_deg:+d}°".replace("-", "−").replace("+0", "0"), ha=side, va=below, **text)
+    x, y = place.sensor_px
+    if 0 <= x <= columns and 0 <= y <= rows - _FLOOR_PX + 1:
+        axes.plot(x, y, marker="^", markersize=8, color="#e8eaf0")
+    left, right, _, bottom = place.scale_px
+    for share in (0.0, 0.5, 1.0):
+        name = f"{-dynamic_range_db * (1 - share):g}".replace("-", "−").replace("−0", "0")
+        axes.text(left + share * (right - left), bottom + 3, name, ha="center", va="top", **text)
+    axes.text(right + 14, bottom - _SCALE_PX / 2, "dB", ha="left", va="center", **text)
+    file = io.BytesIO()
+    figure.savefig(file, format="rgba", dpi=_DPI, transparent=True)
+    drawn = np.frombuffer(file.getvalue(), np.uint8).reshape(-1, 4)
+    places = np.flatnonzero(drawn[:, 3])
+    cover = drawn[places, 3:].astype(np.float32) / np.float32(255)
+    return Ink(places, drawn[places, :3].astype(np.float32), cover)

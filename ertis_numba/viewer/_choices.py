@@ -1,0 +1,75 @@
+"""What can be chosen while looking, and the colours of levels."""
+
+import functools
+from dataclasses import dataclass
+from typing import Final
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+
+__all__ = [
+    "COLOURS",
+    "DYNAMIC_RANGE_DB",
+    "LOWEST_THRESHOLD_DB",
+    "MOST_DECAY_S",
+    "Choices",
+    "colour_table",
+]
+
+COLOURS: Final = ("inferno", "viridis", "cividis", "magma")
+"""Maps of colours that are perceptually uniform, by their names in Matplotlib."""
+
+LOWEST_THRESHOLD_DB: Final = -60.0
+"""Level of the weakest points that can be shown."""
+
+DYNAMIC_RANGE_DB: Final = (10.0, 80.0)
+"""Least and most dynamic range of pictures."""
+
+MOST_DECAY_S: Final = 10.0
+"""Longest time for which points stay."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """What can be chosen while looking.
+
+    Attributes
+    ----------
+    threshold_db : float
+        Level below the strongest of an image, from which on points are shown; at most 0.
+    dynamic_range_db : float
+        What lies further below the strongest has the colour of silence.
+    range_m : (first, last), optional
+        Window of the range axis; all of it by default.
+    decay_s : float
+        For how long points stay while they fade; 0 for those of the latest image alone.
+    colours : {"inferno", "viridis", "cividis", "magma"}
+
+    Raises
+    ------
+    ArgumentError
+        A number is out of its bounds, or the map of colours is unknown.
+    """
+
+    threshold_db: float = -20.0
+    dynamic_range_db: float = 40.0
+    range_m: tuple[float, float] | None = None
+    decay_s: float = 0.0
+    colours: str = COLOURS[0]
+
+    def __post_init__(self) -> None:
+        checks.between("threshold_db", self.threshold_db, LOWEST_THRESHOLD_DB, 0.0)
+        checks.between("dynamic_range_db", self.dynamic_range_db, *DYNAMIC_RANGE_DB)
+        if self.range_m is not None:
+            checks.interval("range_m", self.range_m, 0.0, 10_000.0)
+        checks.between("decay_s", self.decay_s, 0.0, MOST_DECAY_S)
+        checks.choice("colours", self.colours, COLOURS)
+
+
+@functools.cache
+def colour_table(colours: str) -> NDArray[np.uint8]:
+    """Return the colours of a map from silence to the strongest: (256, 3) uint8."""
+    return np.asarray(mpl.colormaps[colours](np.arange(256), bytes=True)[:, :3], dtype=np.uint8)

@@ -1,0 +1,72 @@
+"""Small recordings, and a crew in this process, that the tests of campaigns share."""
+
+from collections import deque
+
+from ertis_numba.campaign import Campaign, Ended, find
+from ertis_numba.campaign.orders import News
+from ertis_numba.campaign.work import follow
+from ertis_numba.settings import Air
+from ertis_numba.storage import write_recording
+from tests.files import SMALL, noise
+
+NAMES = ("a", "b", "c", "d")
+
+
+def write_recordings(folder, names=NAMES, count=3, **more):
+    """Write recordings that all differ, in two kinds of air."""
+    folder.mkdir(exist_ok=True)
+    found = []
+    for number, name in enumerate(names):
+        settings = SMALL.replace(air=Air(temperature_c=20.0 + number % 2))
+        found.append(write_recording(folder / f"{name}.h5", noise(settings, count=count, seed=number), **more))
+    return found
+
+
+class Here:
+    """A crew that follows orders in this process, when it is asked for news."""
+
+    def __init__(self, size=2):
+        self.size, self.orders, self.given, self.most = size, deque(), [], 0
+
+    @property
+    def free(self):
+        return self.size - len(self.orders)
+
+    def limit(self, size):
+        self.size = min(self.size, size)
+
+    def give(self, order):
+        self.orders.append(order)
+        self.given.append(order)
+
+    def wait(self, _):
+        order = self.orders.popleft()
+        advanced = []
+        result = follow(order.do, order.about, lambda done: advanced.append(News(order.number, done)))
+        return [*advanced, News(order.number, result=result)]
+
+    def close(self):
+        self.orders.clear()
+
+
+def run_here(monkeypatch, paths, folder, wanted=None, size=2):
+    """Process in this process; return what became of each recording, by its name, and the crew."""
+    crew = Here(size)
+    with monkeypatch.context() as patch:
+        patch.setattr(Campaign, "_crew", lambda _: crew)
+        return ended(Campaign(find(paths), folder, wanted).run()), crew
+
+
+def ended(events):
+    """What became of each recording, by the name of its file."""
+    return {event.recording.name: event for event in events if isinstance(event, Ended)}
+
+
+def outcomes(found):
+    """The bare outcomes."""
+    return {name: event.outcome for name, event in found.items()}
+
+
+def names_in(folder):
+    """The names of all files in a folder."""
+    return sorted(item.name for item in folder.iterdir())

@@ -1,0 +1,303 @@
+"""What becomes of many recordings: made, there already, or failed; and what is made is what one recording becomes."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.campaign import Campaign, Found, Wanted, campaign, find, made, work
+from ertis_numba.settings import Air
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
+from tests.files import SMALL, line, noise
+
+RANGE_M = (0.5, 0.8)
+
+
+def narrow(settings):
+    return settings.replace(processing=settings.processing.replace(range_m=RANGE_M))
+
+
+def other(settings):
+    return settings.replace(processing=settings.processing.replace(range_m=(0.5, 0.7)))
+
+
+def exact(settings):
+    return narrow(settings).replace(accuracy=settings.accuracy.replace(oversampling=48))
+
+
+def warm(settings):
+    return narrow(settings).replace(air=Air(temperature_c=30.0))
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
+    monkeypatch.chdir(tmp_path)
+    write_recordings(tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+def states(folder):
+    return {item.name: (item.stat().st_ino, item.stat().st_mtime_ns) for item in folder.iterdir()}
+
+
+def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
+    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=narrow))
+    assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
+    assert [order.about["warm"] for order in crew.given if order.do == "plan"] == [True, False]  # one for each air
+    assert found["a.h5"].made["measurements"] == 3
+    for name in "abcd":
+        single = out / "single.h5"
+        arguments = [str(runs / f"{name}.h5"), "-o", str(single), "--range", "0.5:0.8", "--force"]
+        assert CliRunner().invoke(cli, ["process", *arguments]).exit_code == 0
+        assert single.read_bytes() == (out / f"{name}.energy.h5").read_bytes()
+
+
+def test_what_is_there_is_left_alone(runs, out, monkeypatch):
+    run_here(monkeypatch, [runs], out, Wanted(settings=narrow))
+    before = states(out)
+    (out / "b.energy.h5").unlink()
+    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=narrow, overwrite=True))
+    assert outcomes(found) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
+    assert [order.about["path"] for order in crew.given if order.do == "make"] == [str(runs / "b.h5")]
+    after = states(out)
+    assert {name: after[name] for name in after if name != "b.energy.h5"} == {
+        name: before[name] for name in before if name != "b.energy.h5"
+    }
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"),
+    [
+        (Wanted(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
+        (Wanted(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
+        (Wanted(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
+        (Wanted(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
+    ],
+)
+def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, said):
+    run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, Wanted(settings=narrow))
+    before = states(out)
+    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
+    for event in found.values():
+        assert event.outcome == "failed"
+        assert f"output {event.output} exists and " in event.error
+        assert re.search(said, event.error)
+    assert states(out) == before
+    replaced = Wanted(settings=wanted.settings, dtype=wanted.dtype, overwrite=True)
+    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, replaced)
+    assert set(outcomes(found).values()) == {"made"}
+    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
+    assert set(outcomes(found).values()) == {"there"}
+
+
+def test_another_recording_of_the_same_name(runs, out, monkeypatch):
+    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    write_recording(runs / "a.h5", noise(count=3, seed=9), overwrite=True)
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    assert "exists and was made of another recording" in found["a.h5"].error
+
+
+def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
+    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    with h5py.File(runs / "a.h5", "r+") as file:
+        file.attrs["remark"] = "written to"
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    assert "exists and was made of another file of the same recording" in found["a.h5"].error
+
+
+def test_another_version(runs, out, monkeypatch):
+    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    newer = {"ertis-numba": "99.0"}
+    monkeypatch.setattr(made, "software_versions", lambda: newer)
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    assert "exists and was made by ertis-numba 0" in found["a.h5"].error
+    assert "this is 99.0" in found["a.h5"].error
+
+
+@pytest.mark.parametrize("content", [b"", b"mine", None])
+def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, content):
+    out.mkdir()
+    recording = content is None
+    content = (runs / "b.h5").read_bytes() if recording else content
+    (out / "a.energy.h5").write_bytes(content)
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(overwrite=recording))
+    said = "is a recording; give another folder" if recording else "is no energyscape file that can be read"
+    assert f"exists and {said}" in found["a.h5"].error
+    assert (out / "a.energy.h5").read_bytes() == content
+
+
+def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
+    grid = tmp_path / "grid.csv"
+
+    def by_file(settings):
+        return settings.replace(processing=settings.processing.replace(range_m=RANGE_M, directions="grid.csv"))
+
+    grid.write_text("-10,0\n10,0\n")
+    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
+    assert outcomes(found) == {"a.h5": "there"}
+    grid.write_text("-10,0\n11,0\n")
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
+    assert "other settings (grid of sensor eRTIS-7)" in found["a.h5"].error
+
+
+def test_one_that_fails_does_not_stop_the_rest(runs, out, monkeypatch):
+    with h5py.File(runs / "b.h5", "r+") as file:
+        file["sensors/eRTIS-7/pdm"][1, 777] ^= 1 << 9
+    (runs / "c.h5").write_bytes((runs / "c.h5").read_bytes()[:50_000])
+    found, _ = run_here(monkeypatch, [runs, runs / "none.h5"], out, Wanted(settings=narrow))
+    assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made", "none.h5": "failed"}
+    assert "b.h5: measurement 1 has CRC-32" in found["b.h5"].error
+    assert "c.h5 is cut short or damaged" in found["c.h5"].error
+    assert "none.h5: No such file" in found["none.h5"].error
+    assert names_in(out) == ["a.energy.h5", "d.energy.h5"]
+
+
+def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch):
+    def hopeless(settings):
+        return narrow(settings).replace(accuracy=settings.accuracy.replace(max_error_db=-199.0))
+
+    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=hopeless))
+    assert set(outcomes(found).values()) == {"failed"}
+    for name, event in found.items():
+        assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, and the best")
+    assert [order.do for order in crew.given].count("plan") == 2  # each tried once
+    assert names_in(out) == []
+
+
+def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
+    run_here(monkeypatch, [runs / "a.h5"], runs, Wanted(settings=narrow))  # beside the recordings
+    found, _ = run_here(monkeypatch, [runs], runs, Wanted(settings=narrow))
+    assert found["a.energy.h5"].outcome == "passed over"
+    assert outcomes(found)["a.h5"] == "there"
+    found, _ = run_here(monkeypatch, [runs / "a.energy.h5"], out)
+    assert "a.energy.h5 is an energyscape file, wanted a recording" in found["a.energy.h5"].error
+
+
+def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
+    left = (replace(each, stamp=replace(each.stamp, sensor="left")) for each in noise(line(8, 8), count=2, seed=5))
+    several = [*noise(count=2), *left]
+    write_recording(tmp_path / "two.h5", several)
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Wanted(settings=narrow))
+    assert [row["sensor"] for row in found["two.h5"].made["sensors"]] == ["eRTIS-7", "left"]
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Wanted(settings=narrow, sensor="left"))
+    assert "exists and holds sensor eRTIS-7, left, wanted left" in found["two.h5"].error
+
+
+def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
+    measurements = noise(count=2)
+    for measurement in measurements:
+        measurement.words[:] &= np.uint32(0xFFFFFFFE)
+    write_recording(tmp_path / "worn.h5", measurements)
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Wanted(settings=narrow, strict=True))
+    assert "stuck at 0: channel 0" in found["worn.h5"].error
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Wanted(settings=narrow))
+    assert "stuck at 0: channel 0" in found["worn.h5"].made["warnings"][0]
+
+
+def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, out, monkeypatch):
+    most_kept, most_in_hand = [], []
+    follow = work.follow
+
+    def watched(*arguments):
+        result = follow(*arguments)
+        most_kept.append(len(vars(work)["_kept"]))
+        return result
+
+    monkeypatch.setattr("tests.campaigns.follow", watched)
+    for number in range(12):  # each has air of its own, and so a pipeline of its own
+        settings = SMALL.replace(air=Air(temperature_c=float(number)))
+        write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
+    found, crew = run_here(monkeypatch, [tmp_path], out, Wanted(settings=narrow))
+    assert set(outcomes(found).values()) == {"made"}
+    assert max(most_kept) == 1
+    place = {"look": 0, "make": 0}
+    for order in crew.given:
+        if order.do in place:
+            place[order.do] += 1
+            most_in_hand.append(place["look"] - place["make"])
+    assert max(most_in_hand) <= crew.size + 3
+
+
+def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
+    chances = [{"error": "no memory", "by_chance": True}]
+
+    def short_of_memory(do, *arguments):
+        return chances.pop() if do == "plan" and chances else work.follow(do, *arguments)
+
+    monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
+    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "c.h5"], out, Wanted(settings=narrow))  # in the same air
+    assert outcomes(found) == {"a.h5": "failed", "c.h5": "made"}
+    assert found["a.h5"].error == "no memory"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])
+def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr(work, "sensor_names", fails)
+    told = work.follow("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
+    assert told == {"error": str(error) or "MemoryError", "by_chance": True}
+
+
+@pytest.mark.parametrize(("workers", "size"), [(None, 1), (3, 3)])
+def test_a_gpu_serves_one_at_a_time(runs, out, monkeypatch, workers, size):
+    def on_a_gpu(*arguments):
+        return {name: "cuda" if name == "device" else value for name, value in work.follow(*arguments).items()}
+
+    crew = Here(3)
+    monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
+    monkeypatch.setattr(Campaign, "_crew", lambda _: crew)
+    found = ended(Campaign(find([runs]), out, Wanted(settings=narrow), workers=workers).run())
+    assert set(outcomes(found).values()) == {"made"}
+    assert crew.size == size
+
+
+@pytest.mark.parametrize(
+    ("wanted", "workers", "count", "found"),
+    [
+        (Wanted(), None, 9, 4),
+        (Wanted(), None, 3, 3),
+        (Wanted(), 6, 9, 6),
+        (Wanted(threads=2), None, 9, 2),
+        (Wanted(threads=9), None, 9, 1),
+        (Wanted(device="cuda"), None, 9, 1),
+        (Wanted(device="cuda"), 2, 9, 2),
+    ],
+)
+def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
+    monkeypatch.setattr(campaign, "_n_cores", lambda: 4)
+    recordings = [Found(Path(f"{number}.h5")) for number in range(count)]
+    assert Campaign(recordings, tmp_path / "out", wanted, workers=workers).workers == found
+
+
+def test_half_files_go_before_and_after(runs, out, monkeypatch):
+    out.mkdir()
+    (out / "a.energy.h5.0123abcd.part").write_bytes(b"half")
+    (out / "z.energy.h5.0123abcd.part").write_bytes(b"of another campaign")
+    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    assert names_in(out) == ["a.energy.h5", "z.energy.h5.0123abcd.part"]
+    with open_energyscapes(out / "a.energy.h5") as images:
+        assert len(images) == 3
+
+
+def test_other_errors_of_settings_end_the_campaign(runs, out, monkeypatch):
+    def wrong(_):
+        raise KeyError("a mistake in the program")
+
+    with pytest.raises(KeyError, match="a mistake in the program"):
+        run_here(monkeypatch, [runs], out, Wanted(settings=wrong))
+    assert names_in(out) == []

@@ -1,0 +1,70 @@
+"""``ertis bench many`` measures what it says, and times nothing that differs."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from ertis_bench import many
+from ertis_cli.main import cli
+
+from ertis_numba.campaign import Campaign
+from ertis_numba.errors import DataError
+from tests.campaigns import Here
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    monkeypatch.setattr(many, "_MEASUREMENTS", 2)
+    monkeypatch.setattr(many, "_cores", lambda: 1)
+
+
+def test_all_crews_are_timed_and_compared(tmp_path, monkeypatch):
+    crew = Campaign._crew  # noqa: SLF001
+    chosen = lambda campaign: crew(campaign) if vars(campaign)["_scheduler"] else Here()  # noqa: E731
+    monkeypatch.setattr(Campaign, "_crew", chosen)  # of processes, which take long to start, other tests know
+    target = tmp_path / "page.md"
+    target.write_text("<!-- ertis bench many -->\nold\n<!-- /ertis bench many -->\n", "utf-8")
+    done = CliRunner().invoke(
+        cli, ["bench", "many", "--count", "2", "--rounds", "1", "--json", "--quiet", "--update", str(target)]
+    )
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    rows = {row["crew"]: row for row in json.loads(done.stdout)["rows"]}
+    assert list(rows) == ["1 worker of 1 thread", "dask's LocalCluster, 1 workers of 1 thread"]
+    assert rows["1 worker of 1 thread"]["times_faster"] == 1.0
+    assert all(0 < row["working_s"] <= row["seconds"] for row in rows.values())
+    text = target.read_text("utf-8")
+    assert "| 1 worker of 1 thread | " in text
+    assert "2 recordings of 2 measurements of data/synthetic/reflectors.h5" in text
+
+
+def test_more_cores_have_more_crews(monkeypatch):
+    monkeypatch.setattr(many, "_cores", lambda: 4)
+    crews = many._crews  # noqa: SLF001
+    assert [tuple(crew.values()) for crew in crews("tcp://x:1").values()] == [
+        (1, 1),
+        (1, 4),
+        (4, 1),
+        (4, 4),
+        ("tcp://x:1",),
+    ]
+
+
+def test_files_that_differ_are_not_timed(tmp_path, monkeypatch):
+    def timed(_, target, *, workers, threads):
+        (target / "000.energy.h5").write_text(f"{workers} {threads}")
+        return 1.0, 1.0
+
+    monkeypatch.setattr(many, "_timed", timed)
+    monkeypatch.setattr(many, "_require_exact", lambda *_: None)
+    crews = {"one": {"workers": 1, "threads": 1}, "two": {"workers": 2, "threads": 1}}
+    with pytest.raises(DataError, match=r"two made other files than 1 worker of 1 thread \(000\.energy\.h5\)"):
+        many._measured(  # noqa: SLF001
+            tmp_path, tmp_path / "out", crews, 1, lambda _: None
+        )
+
+
+def test_a_recording_that_fails_is_not_timed(tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "torn.h5").write_bytes(b"torn")
+    with pytest.raises(DataError, match=r"torn\.h5 is failed \(.*not an HDF5 file.*\); it is not timed"):
+        many._timed(tmp_path / "runs", tmp_path / "out", workers=1)  # noqa: SLF001

@@ -1,0 +1,147 @@
+"""Many recordings on a real dask cluster of this machine: the same files."""
+
+import os
+import re
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from distributed import Client, LocalCluster
+from ertis_cli.main import cli
+
+from ertis_numba import cluster
+from ertis_numba.campaign import Advanced, Begun, Campaign, Wanted, find, members
+from ertis_numba.errors import NetworkError
+from ertis_numba.storage import write_recording
+from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
+from tests.files import noise
+
+LONG = 150
+PATIENCE_S = 60.0
+
+
+def narrow(settings):
+    return settings.replace(processing=settings.processing.replace(range_m=(0.5, 0.8), directions="2d:300"))
+
+
+WANTED = Wanted(settings=narrow, batch=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _same_date():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        yield
+
+
+@pytest.fixture(scope="module")
+def scheduler(_same_date):
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", worker_dashboard_address=":0", silence_logs=50
+    ) as local:
+        yield local.scheduler_address
+
+
+@pytest.fixture
+def runs(tmp_path):
+    write_recordings(tmp_path / "runs")
+    write_recording(tmp_path / "runs" / "b.h5", noise(count=LONG, seed=1), overwrite=True)
+    return tmp_path / "runs"
+
+
+def test_files_are_those_of_this_process(scheduler, runs, tmp_path, monkeypatch):
+    run_here(monkeypatch, [runs], tmp_path / "here", WANTED)
+    (runs / "broken.h5").write_bytes(b"broken")
+    monkeypatch.chdir(tmp_path)  # workers are elsewhere
+    events = list(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    found = ended(events)
+    assert outcomes(found) == {**dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made"), "broken.h5": "failed"}
+    assert "broken.h5 is not an HDF5 file" in found["broken.h5"].error
+    assert names_in(tmp_path / "out") == names_in(tmp_path / "here")
+    for name in names_in(tmp_path / "here"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+    again = ended(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    assert set(outcomes(again).values()) == {"there", "failed"}
+
+
+def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(members, "_TELL_S", 0.0)
+    out = tmp_path / "out"
+    events = Campaign(find([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
+    kinds = []
+    for event in events:
+        kinds.append(type(event))
+        if isinstance(event, Advanced):
+            break
+    events.close()
+    assert kinds[0] is Begun
+    assert kinds[-1] is Advanced
+    with Client(scheduler, set_as_default=False) as client:
+        end_s = time.monotonic() + PATIENCE_S
+        while any(client.call_stack().values()) and time.monotonic() < end_s:
+            time.sleep(0.05)
+    assert names_in(out) == []
+
+
+def test_workers_that_are_killed_lose_nothing(scheduler, runs, tmp_path):
+    out = tmp_path / "out"
+    found = {}
+    with Client(scheduler, set_as_default=False) as client:
+        pids = client.run(os.getpid)
+        for event in Campaign(find([runs]), out, WANTED, scheduler=scheduler).run():
+            if isinstance(event, Begun) and event.measurements == LONG:
+                for pid in pids.values():
+                    os.kill(pid, signal.SIGKILL)
+            found |= ended([event])
+    assert set(outcomes(found).values()) == {"made"}
+    assert names_in(out) == [f"{name}.energy.h5" for name in "abcd"]
+
+
+def test_the_line_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[1] / "docs" / "many.md").read_text("utf-8")
+    (line,) = re.findall(r"\$ ertis (.* --scheduler .*)", page)
+    monkeypatch.chdir(tmp_path)
+    (runs / "b.h5").unlink()
+    words = line.replace("'", "").replace("tcp://127.0.0.1:8786", scheduler).split()
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 0, done.output
+    assert names_in(tmp_path / "images") == [f"{name}.energy.h5" for name in "acd"]
+
+
+def test_other_versions_are_told(monkeypatch):
+    class Elsewhere:
+        address = "tcp://far:1"
+
+    monkeypatch.setattr(cluster, "worker", Elsewhere)
+    told = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
+    assert "worker tcp://far:1 has numpy " in told["error"]
+    assert "wanted 0.1; install the same everywhere" in told["error"]
+
+
+def test_no_scheduler(monkeypatch, runs, tmp_path):
+    monkeypatch.setattr(members, "_CONNECT_S", 0.5)
+    with pytest.raises(NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        list(Campaign(find([runs]), tmp_path / "out", scheduler="tcp://127.0.0.1:9").run())
+
+
+def test_no_workers(monkeypatch, runs, tmp_path):
+    monkeypatch.setattr(members, "_CONNECT_S", 1.0)
+    with (
+        LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as local,
+        pytest.raises(NetworkError, match=r"has no workers; start some with 'dask worker tcp://"),
+    ):
+        list(Campaign(find([runs]), tmp_path / "out", scheduler=local.scheduler_address).run())
+
+
+def test_a_scheduler_that_goes_is_told(runs, tmp_path):
+    for name in "efgh":  # more than can be done before it is gone
+        shutil.copy(runs / "b.h5", runs / f"{name}.h5")
+    local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
+    events = Campaign(find([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()
+    next(events)
+    local.close()
+    with pytest.raises(NetworkError, match=r"is gone; what is made stays"):
+        list(events)

@@ -1,0 +1,82 @@
+"""What docs/many.md says runs, word by word but for times; what it says of clusters, test_many_cluster.py runs."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.campaign import Campaign
+from tests.campaigns import Here
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "many.md").read_text("utf-8")
+BLOCKS = re.findall(r"```\n\$ (ertis .*?)\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    place = tmp_path_factory.mktemp("many")
+    (place / "runs").mkdir()
+    for name in ("front", "left"):
+        shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", place / "runs" / f"{name}.h5")
+    return place
+
+
+@pytest.fixture(autouse=True)
+def _there(place, monkeypatch):
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())  # which takes less to start
+
+
+def run(command, code=0):
+    done = CliRunner().invoke(cli, command.removeprefix("ertis ").replace("'", "").split())
+    assert done.exit_code == code, (command, done.stderr, done.exception)
+    return done
+
+
+def shape(text):
+    """A text without its figures, widths and order of lines."""
+    return sorted(re.sub(r"[\d.]+|─+| +", " ", line).strip() for line in text.splitlines() if line.strip())
+
+
+def test_commands_in_their_order(place):
+    first, again, as_json = BLOCKS[:3]
+    assert shape(run(first[0]).stderr) == shape(first[1])
+    assert shape(run(again[0]).stderr) == shape(again[1])
+    (place / "runs" / "left.h5").unlink()
+    (place / "runs" / "torn.h5").write_bytes((place / "runs" / "front.h5").read_bytes()[:90_000])
+    shutil.rmtree(place / "images")
+    told = [json.loads(line) for line in run(as_json[0], code=1).stdout.splitlines()]
+    wanted = [json.loads(line.replace(", …}", "}").replace(" …", "")) for line in as_json[1].splitlines()]
+    for mine, theirs in zip(
+        sorted(told[:-1], key=lambda one: one["recording"]),
+        sorted(wanted[:-1], key=lambda one: one["recording"]),
+        strict=True,
+    ):
+        assert mine.items() >= {key: value for key, value in theirs.items() if key != "error"}.items()
+        assert mine.get("error", "").startswith(theirs.get("error", ""))
+    assert told[-1] | {"seconds": 0} == wanted[-1] | {"seconds": 0}
+    assert list(told[-1]) == list(wanted[-1])
+
+
+def test_python_lines(place):
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    (place / "runs" / "torn.h5").unlink(missing_ok=True)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "runs/front.h5 made" in done.stdout
+
+
+def test_the_table_is_there():
+    table = PAGE.partition("<!-- ertis bench many -->")[2].partition("<!-- /ertis bench many -->")[0]
+    assert "| 1 worker of 1 thread |" in table
+    assert "LocalCluster" in table

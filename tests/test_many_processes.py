@@ -1,0 +1,208 @@
+"""Workers of this machine: they give the same bits, die by themselves, and end when nobody wants them any more."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ertis_numba.campaign import Advanced, Begun, Campaign, Wanted, find, processes
+from ertis_numba.campaign.orders import Order
+from ertis_numba.campaign.processes import Processes
+from ertis_numba.errors import DeviceError
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
+from tests.files import noise
+
+PATIENCE_S = 60.0
+LONG = 150  # measurements: a recording that is not done at once
+
+
+def narrow(settings):
+    return settings.replace(processing=settings.processing.replace(range_m=(0.5, 0.8), directions="2d:300"))
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    write_recordings(tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def long_runs(runs):
+    for seed, name in enumerate(("b", "c")):
+        write_recording(runs / f"{name}.h5", noise(count=LONG, seed=seed), overwrite=True)
+    return runs
+
+
+@pytest.fixture
+def crews(monkeypatch):
+    """All that are started."""
+    made, begin = [], Processes.__init__
+
+    def kept(self, size):
+        made.append(self)
+        begin(self, size)
+
+    monkeypatch.setattr(Processes, "__init__", kept)
+    return made
+
+
+def contents(folder):
+    return {item.name: item.read_bytes() for item in folder.iterdir()}
+
+
+def gone(pid):
+    """Whether a process has ended, which may take a moment; one that nobody has waited for has."""
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except OSError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
+    wanted = Wanted(settings=narrow, batch=2)
+    run_here(monkeypatch, [runs], tmp_path / "here", wanted)
+    found = ended(Campaign(find([runs]), tmp_path / "out", wanted, workers=2).run())
+    assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
+    assert contents(tmp_path / "out") == contents(tmp_path / "here")
+
+
+def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, crews):
+    out, killed, found = tmp_path / "out", [], {}
+    campaign = Campaign(find([long_runs]), out, Wanted(settings=narrow, batch=1), workers=2)
+    for event in campaign.run():
+        if isinstance(event, Advanced) and event.recording.name == "b.h5" and not killed:
+            (crew,) = crews
+            (pid,) = [pid for pid, path in crew.doing.items() if path.endswith("b.h5")]
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+        found |= ended([event])
+    assert killed
+    assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
+    assert f"{long_runs / 'b.h5'}: the process that worked on it was ended by SIGKILL" in found["b.h5"].error
+    assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
+    again = ended(Campaign(find([long_runs]), out, Wanted(settings=narrow), workers=1).run())
+    assert outcomes(again) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
+
+
+def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
+    events = Campaign(find([long_runs]), tmp_path / "out", Wanted(settings=narrow, batch=1), workers=2).run()
+    for event in events:
+        if isinstance(event, Begun) and event.measurements == LONG:
+            break
+    pids = list(crews[0].doing)
+    begin_s = time.monotonic()
+    events.close()
+    assert time.monotonic() - begin_s < 2.0
+    assert all(gone(pid) for pid in pids)
+    assert not [name for name in names_in(tmp_path / "out") if name.endswith(".part")]
+
+
+def test_a_worker_that_dies_of_nothing_is_replaced():
+    crew = Processes(1)
+    try:
+        (pid,) = crew.doing
+        os.kill(pid, signal.SIGKILL)
+        assert gone(pid)
+        crew.give(Order(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
+        news = []
+        while not (news and news[-1].result):
+            news += crew.wait(PATIENCE_S)
+        assert "none.h5: No such file" in news[-1].result["error"]
+    finally:
+        crew.close()
+
+
+def test_fewer_are_wanted_after_all():
+    crew = Processes(3)
+    try:
+        pids = list(crew.doing)
+        crew.limit(1)
+        assert (crew.size, crew.free, list(crew.doing)) == (1, 1, pids[:1])
+        assert all(gone(pid) for pid in pids[1:])
+    finally:
+        crew.close()
+
+
+def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
+    with pytest.raises(DeviceError, match=r"end at once: the last one ended with 1, saying .*no_such_module"):
+        list(Campaign(find([runs]), tmp_path / "out", workers=1).run())
+
+
+def command(runs, out, *more):
+    return [
+        *(sys.executable, "-m", "ertis_cli", "process", str(runs / "*.h5"), "-o", str(out), "--workers", "2"),
+        *("--range", "0.5:0.8", "--directions", "2d:300", "--batch", "1", "--json", *more),
+    ]
+
+
+def started(runs, out):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.Popen(
+        command(runs, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+
+
+def children_of(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def until_a_part_grows(out):
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        if out.is_dir() and any(item.suffix == ".part" and item.stat().st_size > 50_000 for item in out.iterdir()):
+            return
+        time.sleep(0.005)
+    pytest.fail("nothing was begun")
+
+
+def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp_path, monkeypatch):
+    run_here(monkeypatch, [long_runs], tmp_path / "here", Wanted(settings=narrow, batch=1))
+    wanted, out = contents(tmp_path / "here"), tmp_path / "out"
+    for wait_s in (0.0, 0.15):
+        with started(long_runs, out) as process:
+            until_a_part_grows(out)
+            time.sleep(wait_s)
+            workers = children_of(process.pid)
+            process.kill()
+        assert all(gone(pid) for pid in workers)
+        left = contents(out)
+        assert {name: content for name, content in left.items() if wanted.get(name) != content} == {}
+        assert set(left) < set(wanted)
+        (out / "b.energy.h5").unlink(missing_ok=True)
+    with started(long_runs, out) as process:
+        told = [json.loads(line) for line in process.stdout]
+        assert process.wait(PATIENCE_S) == 0
+    assert contents(out) == wanted
+    assert told[-1]["made"] + told[-1]["there"] == 4
+    assert told[-1]["there"] == len(left) - ("b.energy.h5" in left)
+
+
+def test_ctrl_c_ends_all_at_once(long_runs, tmp_path):
+    out = tmp_path / "out"
+    with started(long_runs, out) as process:
+        until_a_part_grows(out)
+        workers = children_of(process.pid)
+        begin_s = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert time.monotonic() - begin_s < 5.0
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == "ertis: error: interrupted"
+    assert len(workers) == 2
+    assert all(gone(pid) for pid in workers)
+    for name in names_in(out):
+        with open_energyscapes(out / name) as images:
+            assert len(images) in {3, LONG}

@@ -1,0 +1,105 @@
+"""Which recordings are meant by names, folders and patterns, and what is refused before anything is made."""
+
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from ertis_numba.campaign import Campaign, Found, find, outputs
+from ertis_numba.campaign.folder import clear_parts, sole
+from ertis_numba.errors import ArgumentError, DataError
+from tests.campaigns import names_in
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("runs/b.h5", "runs/a.h5", "runs/notes.txt", "runs/deep/c.h5", "more/a.h5", "odd[1].h5"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    return tmp_path
+
+
+def names(*given):
+    return [str(found.path) for found in find(given)]
+
+
+def test_files_folders_and_patterns():
+    assert names("runs/b.h5", "more/a.h5") == ["runs/b.h5", "more/a.h5"]
+    assert names("runs") == ["runs/a.h5", "runs/b.h5"]
+    assert names("runs/*") == ["runs/a.h5", "runs/b.h5", "runs/notes.txt"]
+    assert names("runs/**/*.h5") == ["runs/a.h5", "runs/b.h5", "runs/deep/c.h5"]
+    assert names("odd[1].h5") == ["odd[1].h5"]
+
+
+def test_a_file_that_is_named_twice_is_processed_once():
+    Path("link.h5").symlink_to("runs/b.h5")
+    assert names("runs/b.h5", "runs", "runs/../runs/*.h5", "link.h5") == ["runs/b.h5", "runs/a.h5"]
+
+
+def test_only_what_is_named_is_meant_for_sure():
+    assert [found.named for found in find(["runs/b.h5", "runs"])] == [True, False]
+
+
+def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
+    assert names("none.h5") == ["none.h5"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [("runs/*.hdf", "no file is named like runs/"), ("empty", r"folder empty has no \*\.h5 in it")],
+)
+def test_nothing_meant(given, said):
+    Path("empty").mkdir()
+    with pytest.raises(DataError, match=said):
+        find([given])
+
+
+def test_each_has_its_own_output():
+    assert outputs(find(["runs/**/*.h5"]), Path("out")) == [Path(f"out/{name}.energy.h5") for name in "abc"]
+
+
+@pytest.mark.parametrize(
+    ("given", "folder", "said"),
+    [
+        (["runs/a.h5", "more"], "out", r"runs/a\.h5 and more/a\.h5 would both become out/a\.energy\.h5"),
+        (["runs"], "runs/a.h5", r"output runs/a\.h5 is a file, and several recordings need a folder"),
+        (["runs"], "none/out", r"output none/out: there is no folder none"),
+    ],
+)
+def test_refused_before_anything_is_made(place, given, folder, said):
+    with pytest.raises(ArgumentError, match=said):
+        Campaign(find(given), folder)
+    assert names_in(place) == ["more", "odd[1].h5", "runs"]
+
+
+def test_no_recording_is_replaced():
+    Path("runs/a.energy.h5").touch()
+    with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is to be processed itself"):
+        outputs([Found(Path("runs/a.h5")), Found(Path("runs/a.energy.h5"))], Path("runs"))
+
+
+def test_workers_and_a_scheduler():
+    with pytest.raises(ArgumentError, match="workers are given and a scheduler"):
+        Campaign(find(["runs"]), "out", workers=2, scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(ArgumentError, match="workers is 0; give a whole number of at least 1"):
+        Campaign(find(["runs"]), "out", workers=0)
+
+
+def test_one_campaign_at_a_time(place):
+    with sole(place / "out"):
+        with pytest.raises(ArgumentError, match="is written into by another campaign"), sole(place / "out"):
+            pytest.fail("two had the folder")
+        with sole(place / "other"):
+            pass
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(sole(place / "out"))
+    assert names_in(place / "out") == []
+
+
+def test_parts_of_others_are_left_alone(place):
+    kept = ["a.energy.h5", "a.energy.h5.12345678", "b.energy.h5.12345678.part", "xa.energy.h5.12345678.part"]
+    for name in (*kept, "a.energy.h5.12345678.part", "a.energy.h5.abcdef01.part"):
+        (place / "runs" / "deep" / name).touch()
+    clear_parts(place / "runs" / "deep", {"a.energy.h5"})
+    assert names_in(place / "runs" / "deep") == sorted(["c.h5", *kept])

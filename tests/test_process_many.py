@@ -1,0 +1,180 @@
+"""``ertis process`` of several recordings: what it prints, and how it ends."""
+
+import io
+import json
+import re
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from ertis_cli import _process_many
+from ertis_cli.main import cli
+
+from ertis_numba import verification
+from ertis_numba.campaign import Advanced, Begun, Campaign, Ended, Wanted
+from tests.campaigns import Here, names_in, write_recordings
+
+FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_recordings(tmp_path / "runs", names="ab")
+    (tmp_path / "runs" / "broken.h5").write_bytes(b"broken")
+    return tmp_path / "runs"
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, ["process", *(str(argument) for argument in arguments)])
+    assert done.exit_code == code, (done.stderr, done.exception)
+    return done
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """No processes, which takes less to start."""
+    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())
+
+
+@pytest.mark.usefixtures("here")
+def test_each_is_told_as_it_ends_and_all_at_the_end(runs, tmp_path):
+    done = run("runs/*.h5", "-o", "out/", *FAST, "--json", code=1)
+    *each, total = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {one["recording"]: one["outcome"] for one in each} == {
+        "runs/a.h5": "made",
+        "runs/b.h5": "made",
+        "runs/broken.h5": "failed",
+    }
+    (made,) = [one for one in each if one["recording"] == "runs/a.h5"]
+    assert (made["output"], made["measurements"], made["sensors"][0]["directions"]) == ("out/a.energy.h5", 3, 9)
+    (failed,) = [one for one in each if one["outcome"] == "failed"]
+    assert failed["error"].startswith("runs/broken.h5 is not an HDF5 file")
+    assert total.pop("seconds") > 0
+    assert total == {"recordings": 3, "made": 2, "there": 0, "passed_over": 0, "failed": 1, "measurements": 6}
+    lines = done.stderr.splitlines()
+    assert any(line.startswith("out/a.energy.h5: 3 measurements, 9 directions × ") for line in lines)
+    assert any(line.startswith("ertis: failed: runs/broken.h5 is not an HDF5 file") for line in lines)
+    assert [line.split()[:2] for line in lines if line.split()[:1] == ["runs/broken.h5"]] == [
+        ["runs/broken.h5", "failed"]
+    ]
+    assert "3 recordings: 2 made, 1 failed; 6 measurements in " in lines[-2]
+    assert lines[-1].startswith("ertis: error: 1 of 3 recordings failed")
+    assert names_in(tmp_path / "out") == ["a.energy.h5", "b.energy.h5"]
+    done = run("runs", "-o", "out", *FAST, "--quiet", code=1)
+    assert done.stdout == ""
+    assert [line.partition(" is ")[0] for line in done.stderr.splitlines()[:-1]] == ["ertis: failed: runs/broken.h5"]
+    (runs / "broken.h5").unlink()
+    done = run("runs", "-o", "out", *FAST)
+    assert "out/a.energy.h5: made before" in done.stderr.splitlines()
+    assert "2 recordings: 2 there; 0 measurements in " in done.stderr
+
+
+def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
+    (runs / "broken.h5").unlink()
+    done = run("runs", "-o", "out", *FAST, "--explain", "--verify", "--json")
+    *each, _ = [json.loads(line) for line in done.stdout.splitlines()]
+    for one in each:
+        (sensor,) = one["sensors"]
+        assert sensor["verified"]["error_db"] <= sensor["verified"]["max_error_db"]
+        assert sensor["plan"]["safe_db"] <= -35.0
+        assert "lines" not in sensor
+    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())
+    done = run("runs", "-o", "more", *FAST, "--explain")
+    assert done.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
+
+
+@pytest.mark.usefixtures("here")
+def test_what_errs_too_much_is_not_written(runs, monkeypatch):
+    measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
+    monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
+    done = run("runs", "-o", "out", *FAST, "--verify", code=1)
+    for name in "ab":
+        assert (
+            f"ertis: failed: runs/{name}.h5: image of sensor eRTIS-7 errs by -30.0 dB, allowed are -35" in done.stderr
+        )
+    assert names_in(runs.parent / "out") == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["runs/a.h5", "runs/b.h5"], 2, "several recordings need a folder for their energyscapes; give one with -o"),
+        (["runs"], 2, "several recordings need a folder"),
+        (["runs/a.h5", "--workers", "2"], 2, "--workers is for several recordings; give more, a folder or a pattern"),
+        (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler is for several recordings"),
+        (["none/*.h5", "-o", "out"], 1, "no file is named like none/*.h5; give another pattern"),
+        (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, and several recordings need a folder"),
+        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of both"),
+        (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have limits of their own"),
+        (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain is for --method fast"),
+    ],
+)
+def test_wrong_usage(runs, arguments, code, said):
+    done = run(*arguments, code=code)
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (runs.parent / "out").exists() or names_in(runs.parent / "out") == []
+
+
+def test_a_folder_for_one_recording(runs, tmp_path):
+    run(runs / "a.h5", "-o", "out/", *FAST)
+    assert names_in(tmp_path / "out") == ["a.energy.h5"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.usefixtures("here")
+def test_bars_on_a_terminal(runs, monkeypatch, capsys):
+    terminal = Terminal()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr(sys, "stderr", terminal)
+    (runs / "broken.h5").unlink()
+    with click.Context(click.Command("process")):
+        _process_many.process_many(["runs"], "out", Wanted(), workers=None, scheduler=None, quiet=False, as_json=True)
+    shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # less colours
+    assert re.search(r"recordings ━+ \d/2", shown)
+    assert "out/a.energy.h5: 3 measurements" in shown
+    assert len(capsys.readouterr().out.splitlines()) == 3  # and nothing of the bars
+
+
+def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    bars = vars(_process_many)["_Bars"](3)
+
+    def drawn():
+        return [(task.description, task.completed, task.total) for task in bars.progress.tasks]
+
+    paths = [Path(f"runs/{name}.h5") for name in "ab"]
+    bars.follow(Advanced(paths[0], 3))  # of one that it has never heard of
+    for path in paths:
+        bars.follow(Begun(path, 7))
+    bars.follow(Advanced(paths[1], 4))
+    assert drawn() == [("recordings", 0, 3), ("a.h5", 0, 7), ("b.h5", 4, 7)]
+    bars.follow(Ended(paths[1], Path("out/b.energy.h5"), "failed"))
+    assert drawn() == [("recordings", 1, 3), ("a.h5", 0, 7)]
+
+
+def test_a_table_of_very_many_has_those_that_failed(monkeypatch, capsys):
+    monkeypatch.setattr(_process_many, "_MOST_ROWS", 2)
+    monkeypatch.setattr(_process_many, "_MOST_FAILED", 2)
+    paths = [Path(f"runs/{number}.h5") for number in range(5)]
+    report = vars(_process_many)["_Report"](paths, quiet=False, as_json=False)
+    shown = vars(_process_many)["_Hidden"]()
+    for path in paths:
+        outcome = "there" if path == paths[1] else "failed"
+        report.follow(Ended(path, Path("out"), outcome, error="torn" if outcome == "failed" else ""), shown)
+    with pytest.raises(click.ClickException, match="4 of 5 recordings failed"):
+        report.close()
+    table = capsys.readouterr().err.partition("outcome")[2]
+    assert [line.split()[0] for line in table.splitlines() if "failed" in line] == [
+        *("runs/0.h5", "runs/2.h5", "…"),
+        "5",
+    ]
+    assert "… and 2 more" in table

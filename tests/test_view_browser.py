@@ -1,0 +1,353 @@
+"""The live view as its users have it: a process that serves a page, and a browser that shows it and is offline."""
+
+import io
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+from PIL import Image
+from playwright.sync_api import sync_playwright
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.journal import Entry
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.simulation import Scene, Sensor
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.targets import Point
+from ertis_numba.storage import open_recording, write_energyscapes
+from ertis_numba.viewer import Polar
+from ertis_numba.viewer._choices import colour_table
+from tests.test_serve import LOOPBACK, serving
+
+REFLECTORS = Path("data/synthetic/reflectors.h5")
+TABLE = colour_table("inferno").astype(int)
+TIMEOUT_S = 60.0
+RATE_HZ = 5.0
+OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
+FLAGS = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", OFFLINE),
+)
+
+
+class Page:
+    """A page of the viewer in a browser that loads nothing from elsewhere, and remembers what it was asked to."""
+
+    def __init__(self, browser, url):
+        self.context = browser.new_context(
+            viewport={"width": 1300, "height": 760}, device_scale_factor=1, accept_downloads=True
+        )
+        self.abroad = []
+        self.context.route(lambda asked: not self.is_here(asked, url), self.refuse)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(1e3 * TIMEOUT_S)
+        self.page.on("websocket", lambda asked: self.is_here(asked.url, url) or self.abroad.append(asked.url))
+        self.page.goto(url)
+
+    @staticmethod
+    def is_here(asked, url):
+        here = url if url.startswith("file:") else re.escape(url.removeprefix("http:").rstrip("/"))
+        if url.startswith("file:"):
+            return asked == here or asked.startswith(("blob:", "data:"))
+        return re.match(rf"(blob:http|http|ws):?{here}(/|$)".replace(":?//", "://"), asked) or asked.startswith("data:")
+
+    def refuse(self, route):
+        self.abroad.append(route.request.url)
+        route.abort()
+
+    def told(self, name):
+        return self.page.inner_text(f"[data-name={name}]")
+
+    def wait_until(self, name, condition):
+        """Wait until what is told of something, ``text``, fulfils a condition in JavaScript."""
+        cell = f"document.querySelector('[data-name={name}]')"
+        self.page.wait_for_function(f"() => {{ const text = {cell}?.innerText ?? ''; return {condition} }}")
+
+    def control(self, label):
+        """What stands beside a label."""
+        return self.page.locator("label", has_text=label).locator("xpath=ancestor::div[.//input or .//div[@id]][1]")
+
+    def slide(self, label, value):
+        box = self.control(label).locator("input:not([type=hidden])").last
+        box.fill(str(value))
+        box.press("Enter")
+
+    def press(self, label):
+        self.page.get_by_role("button", name=label, exact=True).click()
+
+    def picture(self):
+        """The first picture as it is shown, and how its pixels are by those that were drawn."""
+        shown = self.page.locator("img").first
+        drawn_px = shown.evaluate("image => image.decode().then(() => image.naturalWidth)")
+        pixels = np.asarray(Image.open(io.BytesIO(shown.screenshot())).convert("RGB")).astype(int)
+        return pixels, pixels.shape[1] / drawn_px
+
+    def saved(self, label):
+        with self.page.expect_download() as download:
+            self.press(label)
+        return Path(download.value.path()).read_bytes(), download.value.suggested_filename
+
+    def close(self):
+        self.context.close()
+        assert self.abroad == []
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None and not os.environ.get("CI"):
+        pytest.skip("there is no Chromium; install it (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def viewing(*arguments):
+    """A process of ``ertis view``, and where its page is."""
+    command = [sys.executable, "-m", "ertis_cli", "view", *map(str, arguments)]
+    command += ["--port", "0", "--no-open", "--quiet", "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            yield process, json.loads(line)["url"]
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def film(browser, tmp_path_factory):
+    """The page of a file with three images of the same reflectors."""
+    with open_recording(REFLECTORS) as recording, Pipeline(recording.settings) as pipeline:
+        image = pipeline.process(recording[0])
+    several = [
+        image.replace(stamp=Stamp(sequence=number, timestamp_ns=round(1e18 + number * 1e8))) for number in range(3)
+    ]
+    path = write_energyscapes(tmp_path_factory.mktemp("film") / "img.h5", several)
+    with viewing(path) as (_, url):
+        page = Page(browser, url)
+        page.image = image
+        page.wait_until("state", "text.startsWith('0.20 s')")
+        yield page
+        page.close()
+
+
+def reflectors():
+    (sensor,) = json.loads(REFLECTORS.with_suffix(".json").read_text())["sensors"]
+    return sensor["reflectors"]
+
+
+def spots(film):
+    """The reflectors in the first picture: x, y and level of each, in the pixels that were drawn."""
+    pixels, zoom = film.picture()
+    away, levels = KDTree(TABLE).query(pixels[: -round(66 * zoom)])  # but for the scale of colours
+    levels[away > 25] = 0
+    joined = ndimage.binary_closing(levels > 205, np.ones((3, 3)))
+    regions, count = ndimage.label(joined, np.ones((3, 3)))
+    found = []
+    for number in range(1, count + 1):
+        level = levels[regions == number].max()
+        rows, columns = np.nonzero((regions == number) & (levels >= level - 3))
+        found.append(((columns.mean() + 0.5) / zoom, (rows.mean() + 0.5) / zoom, level))
+    return found
+
+
+def eventually(holds):
+    end_s = time.monotonic() + TIMEOUT_S
+    while not holds():
+        assert time.monotonic() < end_s, "it never was"
+
+
+def test_the_reflectors_drawn_are_where_the_scene_put_them(film):
+    polar = Polar(film.image)
+    places = [(*polar.place_of(x, y), level) for x, y, level in spots(film)]
+    assert len(places) == len(reflectors())
+    for each in reflectors():
+        found = min(places, key=lambda place: abs(place[1] - each["range_m"]))
+        assert found[0] == pytest.approx(each["azimuth_deg"], abs=1.0)
+        assert found[1] == pytest.approx(each["range_m"], abs=0.02)
+        assert found[2] == pytest.approx(255 * (1 + each["level_db"] / 40), abs=6)
+
+
+def test_a_higher_threshold_leaves_fewer_points(film):
+    film.slide("Dynamic range (dB)", 5)  # which cannot be
+    film.slide("Dynamic range (dB)", 40)
+    film.slide("Threshold (dB)", -30)
+    film.wait_until("points", "Number(text) >= 5")
+    many = int(film.told("points"))
+    film.slide("Threshold (dB)", -1)
+    film.wait_until("points", f"Number(text) < {many}")
+    assert int(film.told("points")) == sum(each["level_db"] > -1 for each in reflectors())
+
+
+def test_the_window_of_ranges_moves_the_axes(film):
+    thumb = film.control("Range (m)").locator(".multi-slider-thumb").last
+    box, track = thumb.bounding_box(), film.control("Range (m)").locator(".multi-slider-track").bounding_box()
+    y = box["y"] + box["height"] / 2
+    film.page.mouse.move(box["x"] + box["width"] / 2, y)
+    film.page.mouse.down()
+    film.page.mouse.move(track["x"] + 0.4 * track["width"], y, steps=4)
+    film.page.mouse.up()
+    # The window now ends at 2 m of 5: what is nearer lies 2.5 times as far from the sensor as before.
+    polar = Polar(film.image)
+    foot_px = np.array(polar.pixel_of(0, 0))
+    near = [each for each in reflectors() if each["range_m"] < 1.9]
+    wanted = [foot_px + 2.5 * (polar.pixel_of(each["azimuth_deg"], each["range_m"]) - foot_px) for each in near]
+
+    def moved():
+        places = [place[:2] for place in spots(film)]
+        return len(places) == len(near) and all(
+            np.linalg.norm(places - place, axis=1).min() < 0.05 * np.linalg.norm(place - foot_px) for place in wanted
+        )
+
+    eventually(moved)
+
+
+def test_the_time_line_chooses_what_is_shown(film):
+    film.slide("Measurement", 1)
+    film.wait_until("sequence", "text === '1'")
+    film.press("back")
+    film.wait_until("sequence", "text === '0'")
+    shown = int(film.told("frames"))
+    film.press("Play")
+    film.wait_until("state", "text.startsWith('0.20 s')")
+    assert int(film.told("frames")) > shown
+    assert film.told("captured") == "2001-09-09 01:46:40.200 UTC"
+
+
+def test_colours_are_of_the_map_that_was_chosen(film):
+    film.control("Colours").locator("input:not([type=hidden])").first.click()
+    film.page.get_by_role("option", name="viridis").click()
+    wanted = colour_table("viridis")[255].astype(int)
+    eventually(lambda: np.abs(film.picture()[0] - wanted).sum(axis=2).min() < 40)
+
+
+def test_what_is_saved_can_be_read(film, browser, tmp_path):
+    picture, name = film.saved("Picture (PNG)")
+    assert name == "img.png"
+    image = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
+    assert image.shape[1] == 520
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
+    film.slide("Threshold (dB)", -1)
+    film.wait_until("points", "Number(text) === 2")
+    points, name = film.saved("Points (PLY)")
+    assert name == "img.ply"
+    vertex = plyfile.PlyData.read(io.BytesIO(points))["vertex"]
+    assert len(vertex) == 2
+    strongest = max(reflectors(), key=lambda each: each["level_db"])
+    azimuth = math.radians(strongest["azimuth_deg"])
+    wanted = (strongest["range_m"] * math.cos(azimuth), strongest["range_m"] * math.sin(azimuth), 0.0)
+    nearest = min(np.linalg.norm([vertex["x"][i] - wanted[0], vertex["y"][i] - wanted[1]]) for i in range(2))
+    assert nearest < 0.02
+    film.press("Begin HTML recording")
+    film.press("Play")
+    film.wait_until("state", "text.startsWith('0.20 s')")
+    recording, name = film.saved("End HTML recording")
+    assert name == "img.html"
+    (tmp_path / name).write_bytes(recording)
+    page = Page(browser, (tmp_path / name).as_uri())
+    page.page.wait_for_selector("canvas")
+
+    def is_drawn():
+        """Whether the image on the ground is there, in colours that nothing else has."""
+        drawn = np.asarray(Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")).astype(int)
+        return (np.ptp(drawn, axis=2) > 60).sum() > 200
+
+    eventually(is_drawn)
+    page.close()
+
+
+@contextmanager
+def measuring(address):
+    """A sensor node that measures a simulated reflector again and again until the block ends."""
+    processing = Processing(directions="2d:61", range_m=(0.5, 1.2))
+    settings = Settings(recording=Recording(n_samples=40_960), processing=processing)
+    sensor = Sensor(name="front", recording=settings.recording, processing=processing)
+    words = Simulator(Scene(sensors=(sensor,), points=(Point(azimuth_deg=20.0, range_m=0.9),))).render(0).words
+    ended = threading.Event()
+
+    def measure(node):
+        number = 0
+        while not ended.wait(1 / RATE_HZ):
+            stamp = Stamp(sensor="front", sequence=number, sync_count=number, epoch=3, timestamp_ns=time.time_ns())
+            node.append([Entry(Measurement(words, settings, stamp), time.monotonic_ns())])
+            number += 1
+
+    with SensorNode(address) as node:
+        node.add_sensor("front", settings, translation_m=(0.2, 0.0, 0.0))
+        thread = threading.Thread(target=measure, args=(node,))
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+
+LAG = """() => new Promise(resolve => {
+    const lags = [], cell = document.querySelector('[data-name=captured]');
+    let last = cell.innerText;
+    const look = () => {
+        if (cell.isConnected && cell.innerText !== last) last = cell.innerText;
+        const now = document.querySelector('[data-name=captured]').innerText;
+        if (now !== look.before) {
+            look.before = now;
+            lags.push((Date.now() - Date.parse(now.replace(' UTC', 'Z').replace(' ', 'T'))) / 1000);
+        }
+        lags.length > 10 ? resolve(lags.slice(1)) : setTimeout(look, 5);
+    };
+    look();
+})"""
+
+
+def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
+    with ExitStack() as stack:
+        served = stack.enter_context(serving(*LOOPBACK, "--workers", "1", "--device", "cpu"))
+        stack.enter_context(measuring(served.listen))
+        process, url = stack.enter_context(viewing(served.publish))
+        live = Page(browser, url)
+        live.wait_until("frames", "Number(text) > 3")
+        first = int(live.told("frames"))
+        lags_s = live.page.evaluate(LAG)
+        assert int(live.told("frames")) >= first + 10
+        assert 0 < np.median(lags_s) < 1, lags_s
+        assert 0 < float(live.told("latency").removesuffix(" ms")) < 1000
+        assert live.told("state") == "live"
+        assert float(live.told("rate").removesuffix(" Hz")) > 1
+        assert live.told("dropped").startswith("0, ")  # at the beginning some come faster than tables are made
+        assert int(live.told("points")) >= 1
+        live.press("Pause")
+        live.page.get_by_role("button", name="Play", exact=True).wait_for()
+        shown, sequence = int(live.told("frames")), int(live.told("sequence"))
+        live.press("Step")
+        live.wait_until("frames", f"Number(text) === {shown + 1}")
+        assert int(live.told("sequence")) > sequence
+        live.press("Play")
+        live.wait_until("frames", f"Number(text) > {shown + 1}")
+        begun_s = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT_S) == 0, process.stderr.read()
+        assert time.monotonic() - begun_s < 1
+        live.close()
