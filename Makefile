@@ -64,6 +64,7 @@ bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench factorisation --update docs/accuracy.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 	$(BIN)/ertis bench simulation --update bench/README.md
+	$(BIN)/ertis bench many --update docs/many.md
 	$(BIN)/ertis bench network --update docs/network.md
 
 soak: $(VENV)/ready  ## hours of faults, kills and full disks; SEED=N for the same ones again

@@ -15,7 +15,7 @@ from ertis_numba.network.keys import KeyPair
 from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
 from tests.central import running
 from tests.publishing import Publisher, cloud, group, image, measurement, status
-from tests.test_readme import environment
+from tests.pages import environment
 
 
 def listen(*arguments):

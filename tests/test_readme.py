@@ -27,6 +27,7 @@ PAGES = (
     "docs/formats.md",
     "docs/gallery.md",
     "docs/health.md",
+    "docs/many.md",
     "docs/network.md",
     "docs/plots.md",
     "docs/reliability.md",
