@@ -296,7 +296,7 @@ def test_ended_from_outside(tmp_path, number, code):
         assert time.monotonic() < deadline_s
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == code
+    assert process.returncode == code, errors
     assert errors.strip() == ("ertis: error: interrupted" if number == signal.SIGINT else "")
     assert [item.name for item in tmp_path.iterdir()] == ["long.bin"]
 

@@ -14,8 +14,8 @@ from ertis_cli.main import cli
 from ertis_numba.network.keys import KeyPair
 from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
 from tests.central import running
-from tests.publishing import Publisher, cloud, group, image, measurement, status
 from tests.pages import environment
+from tests.publishing import Publisher, cloud, group, image, measurement, status
 
 
 def listen(*arguments):
