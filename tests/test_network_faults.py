@@ -72,7 +72,7 @@ def wrong_in(part, found):
 
 
 def test_killed_central_nodes(tmp_path):
-    found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"])
+    found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"], rate_hz=faults.SHORT.rate_hz)
     assert wrong_in("centrals", found) == {}
     assert (found["orphans"], found["unsettled"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]

@@ -28,6 +28,8 @@ class Extent:
     ----------
     n_kills : int
         Of central nodes, and as many of sensor nodes.
+    rate_hz : float
+        Of each sensor whose central node is killed.
     n_seal_kills, n_worker_kills : int
     away_s : float
         How long a central node is away.
@@ -44,6 +46,7 @@ class Extent:
     """
 
     n_kills: int
+    rate_hz: float
     n_seal_kills: int
     n_worker_kills: int
     away_s: float
@@ -58,12 +61,12 @@ class Extent:
 
 
 SHORT = Extent(
-    n_kills=20, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2, n_hostile=200,
-    n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40,
+    n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
+    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40,
 )  # fmt: skip
 LONG = Extent(
-    n_kills=1_000, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0, n_captures=50,
-    n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
+    n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
+    n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
 )  # fmt: skip
 
 
@@ -84,7 +87,9 @@ def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
 PARTS: Parts[Extent] = {
     "centrals": (
         "{n_kills} central nodes killed",
-        lambda extent, folder, seed: faults_kills.centrals(folder, seed=seed, count=extent.n_kills),
+        lambda extent, folder, seed: faults_kills.centrals(
+            folder, seed=seed, count=extent.n_kills, rate_hz=extent.rate_hz
+        ),
     ),
     "nodes": (
         "{n_kills} sensor nodes killed",

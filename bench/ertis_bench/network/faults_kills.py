@@ -23,7 +23,6 @@ _LINES_TO_BEGIN: Final = 1_000  # and a sensor node until it sends
 _LINES_OF_A_LIFE: Final = 12_000  # in a second of either, about
 _LIFE_S: Final = 1.0  # of a process that has not come so far
 _RING_BYTES: Final = 500_000_000
-_RATE_HZ: Final = 10.0  # of each sensor: what comes while there is no central node must go while there is one
 Found = dict[str, Any]
 
 
@@ -104,15 +103,16 @@ def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path]
     }
 
 
-def centrals(folder: Path, *, seed: int, count: int) -> Found:
+def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
     """Kill a central node while two sensors send to it, also while it starts, rotates and seals.
 
-    Half of the kills come at a random moment, the others before a random line of code.
+    Half of the kills come at a random moment, the others before a random line of code. What comes while there is no
+    central node must go while there is one: in the long run, sensors are slower.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     record = Record(folder, "--rotate-size", str(_ROTATE_MB))
     diary, by_line = folder / "sender.ndjson", 0
-    job = Job(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=_RATE_HZ, seed=seed)
+    job = Job(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=rate_hz, seed=seed)
     with job.replace(ring_bytes=_RING_BYTES, patience_s=60.0).start() as sender:
         sender.wait_for("begun")
         for _ in range(count):
