@@ -16,6 +16,7 @@ from ertis_bench.network.processes import Process, central, survivors, until
 from ertis_bench.network.receiver import Look, read_received
 from ertis_bench.network.sender import SETTINGS, Job
 from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
+from ertis_numba import cluster
 from ertis_numba.errors import DataError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair
@@ -26,6 +27,8 @@ __all__ = ["PARTS", "processing", "run", "storage"]
 _WARM_UP_S: Final = 3.0
 _STORAGE_S: Final = 300.0
 _OTHERS_S: Final = 60.0
+_CALIBRATION_S: Final = 8.0
+_CLUSTER_WORKERS: Final = 2
 _SENDERS: Final = 2  # processes that are sensor nodes: each has its share of the sensors
 _BYTES: Final = 4 * SETTINGS.recording.n_samples
 Found = dict[str, Any]
@@ -166,10 +169,13 @@ def processing(
     goal: str,
     part: str = "processing",
     credit: int = 2,
+    scheduler: str | None = None,
 ) -> Found:
-    """Make images of what sensors send, and compare them in an application."""
+    """Make images of what sensors send, here or on a dask cluster, and compare them in an application."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, boss = _keys(folder, sensors)
+    if scheduler is not None:
+        options += ["--scheduler", scheduler]
     settings = _settings(directions)
     words = some_words(SETTINGS, folder / "words.npy", seed=seed)
     expected = expected_of(settings, np.load(words), folder / "expected.npz")
@@ -251,9 +257,28 @@ def _overload(folder: Path, duration_s: float, seed: int) -> Found:
     (folder / "overload").mkdir()
     goal = "received = published + dropped; latency bounded"
     options: dict[str, Any] = {"directions": "3000", "n_sensors": 4, "goal": goal, "part": "overload 2×", "credit": 8}
-    most = processing(folder / "calibration", 8.0, seed, rate_hz=40.0, **options)
+    most = processing(folder / "calibration", _CALIBRATION_S, seed, rate_hz=40.0, **options)
     rate_hz = round(2 * 40.0 * most["published"] / max(1, most["sent"]), 1)
     return processing(folder / "overload", duration_s, seed, rate_hz=rate_hz, **options)
+
+
+def _cluster(folder: Path, duration_s: float, seed: int) -> Found:
+    """Make the same images by workers of `ertis serve` and by those of a cluster, and as many as the cluster can."""
+    options: dict[str, Any] = {"directions": "90", "n_sensors": 4, "goal": "its added latency and rate are told"}
+    places = {name: folder / name for name in ("here", "there", "most")}
+    for place in places.values():
+        place.mkdir()
+    here = processing(places["here"], duration_s, seed, rate_hz=10.0, **options)
+    options["part"] = f"a dask cluster on this machine, {_CLUSTER_WORKERS} workers"
+    with cluster.local(_CLUSTER_WORKERS) as scheduler:
+        there = processing(places["there"], duration_s, seed, rate_hz=10.0, scheduler=scheduler, **options)
+        most = processing(places["most"], _CALIBRATION_S, seed, rate_hz=40.0, scheduler=scheduler, **options)
+    return there | {
+        "added_p50_ms": there["p50_ms"] - here["p50_ms"],
+        "added_p99_ms": there["p99_ms"] - here["p99_ms"],
+        "offered_hz": most["sent"] / _CALIBRATION_S,
+        "most_hz": most["published"] / _CALIBRATION_S,
+    }
 
 
 PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
@@ -277,5 +302,6 @@ PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
         ),
     ),
     "overload": ("twice as much as can be done", _overload),
+    "cluster": ("90 directions, 4 sensors × 10 Hz, here and on a dask cluster", _cluster),
 }
 """What is measured: what to say of it, and how."""

@@ -185,4 +185,9 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
             f"{row['images']:,} images here, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
             f"{row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms"
         )
+    if "most_hz" in row:
+        found += (
+            f"; beside workers of its own in the same run p50 {row['added_p50_ms']:+.1f} ms, p99 "
+            f"{row['added_p99_ms']:+.1f} ms; {row['most_hz']:.0f} images/s of {row['offered_hz']:.0f} that were offered"
+        )
     return {"what": what, "goal": goal, "found": f"{found}. Of a core: {cpu}"}
