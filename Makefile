@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 GPU ?= cu12
+WORKERS ?= 3
+unexport PYTHONDONTWRITEBYTECODE  # hundreds of processes would compile every module anew
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
@@ -30,8 +32,8 @@ test: $(VENV)/ready-to-test
 test-kernels: $(VENV)/ready-to-test  # compiles all of them: processes that did so at once could spoil each other's cache
 	$(PYTEST) -m "not alone" $(KERNELS)
 
-test-host: test-kernels
-	$(PYTEST) -m "not alone" --numprocesses 2 --dist worksteal $(KERNELS:%=--ignore=%) $(ELSEWHERE)
+test-host: test-kernels  # one more worker than two cores: some tests wait for sockets and disks
+	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(KERNELS:%=--ignore=%) $(ELSEWHERE)
 
 test-simulator: test-kernels
 	NUMBA_ENABLE_CUDASIM=1 $(PYTEST) tests/cuda $(KERNELS) -k cuda

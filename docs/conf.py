@@ -16,6 +16,7 @@ smartquotes = False
 html_theme = "furo"
 html_title = "ertis-numba"
 html_show_sphinx = False
+html_show_copyright = False  # LICENSE has it
 html_copy_source = False
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
@@ -24,10 +25,10 @@ copybutton_prompt_is_regexp = True
 numpydoc_show_class_members = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings say them, with shapes and units
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 suppress_warnings = ["misc.highlighting_failure"]  # fragments of code in tables of formats
 
-MARKS = re.compile(r"(?<=\w)_(?!\w)|\*")
+MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # an address of a node is no link
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./((?!docs/)[^)#\s]+)\)")
 
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ertis_numba.figures import plot
     from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
-    from ertis_numba.interop import export, open_raw, open_rtis_folder
+    from ertis_numba.interop import export, open_pcm, open_raw, open_rtis_folder
     from ertis_numba.journal import Entry
     from ertis_numba.network.allow_list import AllowList, Permission
     from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
@@ -105,6 +105,7 @@ __all__ = [
     "load_layout",
     "load_scene",
     "open_energyscapes",
+    "open_pcm",
     "open_raw",
     "open_recording",
     "open_rtis_folder",
@@ -135,7 +136,7 @@ _HOMES = {
     "figures": ("plot",),
     "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
-    "interop": ("export", "open_raw", "open_rtis_folder"),
+    "interop": ("export", "open_pcm", "open_raw", "open_rtis_folder"),
     "journal": ("Entry",),
     "network.allow_list": ("AllowList", "Permission"),
     "network.keys": ("ClientKeys", "KeyPair", "ServerKeys"),

@@ -1,19 +1,36 @@
 """A file appears under its name complete, or not at all."""
 
+import errno
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["SPARE_BYTES", "check_target", "part_of", "replacing", "require_room", "sync"]
+__all__ = ["SPARE_BYTES", "check_target", "part_of", "remedy", "replacing", "require_room", "sync"]
 
 # HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
 # 914), so writing stops while there is still room for its tables.
 SPARE_BYTES = 8_000_000
+
+_ELSEWHERE = "free some space or write elsewhere"
+_PERMITTED = "see who may use it and its folder, or choose another"
+_THERE = "see whether its folder is there, or choose another"
+_REMEDIES = {
+    errno.EACCES: _PERMITTED,
+    errno.EPERM: _PERMITTED,
+    errno.EROFS: _PERMITTED,
+    errno.ENOENT: _THERE,
+    errno.ENOTDIR: _THERE,
+    errno.ENAMETOOLONG: "give a shorter name",
+    errno.EDQUOT: _ELSEWHERE,
+    errno.EFBIG: _ELSEWHERE,
+    errno.ENOSPC: _ELSEWHERE,
+}
 
 
 def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
@@ -42,6 +59,13 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
         raise ArgumentError(f"output {path} is the input itself; give another name")
     if path.exists() and not overwrite:
         raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+
+
+def remedy(error: Exception) -> str:
+    """Return what helps against an error of the system, whose number HDF5 has in the middle of its own words."""
+    inner = re.search(r"errno = (\d+)", str(error))
+    number = int(inner[1]) if inner else getattr(error, "errno", None)
+    return _REMEDIES.get(number or 0, "look at the disk, or write elsewhere")
 
 
 def require_room(folder: Path, n_bytes: int) -> None:
@@ -83,6 +107,8 @@ def replacing(path: Path, *, overwrite: bool = False, token: str | None = None) 
     ------
     ArgumentError
         As `check_target`, before the block and again before the file takes its name.
+    OSError
+        The file cannot be written; its ``filename`` is ``path``.
     """
     check_target(path, overwrite=overwrite)
     part = part_of(path, token or secrets.token_hex(4))
@@ -91,8 +117,11 @@ def replacing(path: Path, *, overwrite: bool = False, token: str | None = None) 
         sync(part)
         check_target(path, overwrite=overwrite)
         part.replace(path)
-    except BaseException:  # Ctrl-C, too, must leave nothing behind
-        part.unlink(missing_ok=True)
+    except BaseException as error:  # Ctrl-C, too, must leave nothing behind
+        with suppress(OSError):  # where nothing can be written, nothing can be removed: what came first is to be told
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and str(error.filename) == str(part):
+            error.filename = str(path)  # nobody else knows the name of a part
         raise
     sync(path.parent)
 

@@ -98,7 +98,9 @@ def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
 def sensor_name(name: str) -> str:
     """Return the name of a sensor if it can be that of a group in a file."""
     if not _SENSOR_NAME.fullmatch(name):
-        raise ArgumentError(f"sensor name {name!r} cannot stand in a file; give letters, digits and _ . @ + -")
+        raise ArgumentError(
+            f"sensor name {name!r} cannot stand in a file; give letters, digits and _, after the first also . @ + -"
+        )
     return name
 
 

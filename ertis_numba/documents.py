@@ -6,7 +6,7 @@ A structure checks itself once, when it is made, in its ``__post_init__``. Unkno
 import bisect
 import re
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import msgspec
 import tomli_w
@@ -38,7 +38,15 @@ class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Document(Table, frozen=True, kw_only=True):
-    """A whole TOML file."""
+    """A whole TOML file.
+
+    Attributes
+    ----------
+    former_keys : dict of str to str
+        Names that keys had, and have now: recordings hold documents, and those of before stay readable.
+    """
+
+    former_keys: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None) -> Self:
@@ -49,6 +57,8 @@ class Document(Table, frozen=True, kw_only=True):
         SettingsError
             The text is not TOML, has unknown keys, or a value cannot be used.
         """
+        for former, key in cls.former_keys.items():
+            text = re.sub(rf"\b{former}(?=\s*=)", key, text)
         try:
             return msgspec.toml.decode(text, type=cls)
         except msgspec.ValidationError as error:
@@ -77,12 +87,20 @@ class Document(Table, frozen=True, kw_only=True):
         try:
             text = Path(path).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(f"{path}: {error}; give a readable {cls.__name__.lower()} file") from error
+            reason = getattr(error, "strerror", None) or error
+            raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
         return cls.from_toml(text, str(path))
 
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""
-        return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
+        return tomli_w.dumps(_without_none(msgspec.to_builtins(self, enc_hook=_plain)))
+
+
+def _plain(value: Any) -> Any:
+    """Return a number of NumPy, such as a position that was computed, as Python's own."""
+    if hasattr(value, "item"):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} has no form in TOML")
 
 
 def _without_none(value: Any) -> Any:

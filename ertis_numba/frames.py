@@ -40,18 +40,19 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """One emission's PDM words.
+    """What the microphones gave for one emission.
 
     Attributes
     ----------
-    words : (sample,) or (sample, word) uint8, uint16, uint32 or uint64
-        One word per PDM clock; bit m (least significant first) is channel m. An array with more
-        channels than a word has bits has a second axis.
+    words : (sample,) or (sample, word) uint8, uint16, uint32 or uint64; of PCM (sample, channel) int16 or float32
+        Bits: one word per PDM clock; bit m (least significant first) is channel m. An array with more
+        channels than a word has bits has a second axis. PCM, where ``settings.recording.encoding`` says so: one
+        number per channel.
     settings : Settings
     stamp : Stamp
     """
 
-    words: NDArray[np.unsignedinteger[Any]]
+    words: NDArray[Any]
     settings: Settings
     stamp: Stamp = Stamp()
 

@@ -14,6 +14,7 @@ from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
+from ertis_numba.words import word_format
 
 __all__ = ["Pipeline"]
 
@@ -90,10 +91,8 @@ class Pipeline:
         settings = planner.complete(settings, kernel_set, threads=threads)
         self.settings = settings
         self.device = kernel_set.device
-        layout = microphones(settings.array)
         self._accepted = settings
-        self._words_shape = (settings.recording.n_samples, layout.n_words)
-        self._words_dtype = np.dtype(f"u{layout.word_bits // 8}")
+        self._format = word_format(settings)
         self._closed = False
         self._chain = self._made_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
@@ -166,7 +165,7 @@ class Pipeline:
         try:
             chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
             if not kernel_set.simulated:
-                chain.warm_up(np.zeros(self._words_shape, self._words_dtype))
+                chain.warm_up(np.zeros(self._format.rows, self._format.dtype))
         except DeviceError as error:
             failed = str(error)
         else:
@@ -191,7 +190,7 @@ class Pipeline:
     def _words_of(self, measurement: Measurement) -> NDArray[np.unsignedinteger[Any]]:
         self._require_open()
         self._require_same_sensor(measurement.settings)
-        return self._checked_words(measurement.words)
+        return self._format.checked(measurement.words)
 
     def _require_same_sensor(self, settings: Settings) -> None:
         """Refuse what the tables were not made for: only how to process may differ."""
@@ -207,17 +206,6 @@ class Pipeline:
                 f"{self.settings.array.layout!r}; make a pipeline from its settings"
             )
         self._accepted = settings
-
-    def _checked_words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
-        n_samples, n_words = self._words_shape
-        wanted = self._words_shape if n_words > 1 else (n_samples,)
-        if words.dtype != self._words_dtype or words.shape not in {wanted, self._words_shape}:
-            raise DataError(
-                f"measurement holds {words.dtype} words of shape {words.shape}; the settings want "
-                f"{self._words_dtype} of shape {wanted}: make the pipeline from the recording's own settings"
-            )
-        # Read-only or unaligned arrays would each be a type of their own to compile the kernels for.
-        return np.require(words, requirements=["C", "A", "W"]).reshape(self._words_shape)
 
     def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = (len(self.grid), len(self.range_m))

@@ -34,7 +34,8 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
 
     Hyperbolic frequency modulation, ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)``, whose phase is
     ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse
-    compression by means of linear-period modulation, Proc. IEEE 57, 1969).
+    compression by means of linear-period modulation, Proc. IEEE 57, 1969). Or linear, ``f(t) = f₀ + t (f₁ − f₀) / T``
+    with a phase of ``2π (f₀ t + t² (f₁ − f₀) / 2T)``.
 
     Parameters
     ----------
@@ -50,13 +51,20 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
 def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the call at any times, 0 outside ``[0, duration_s]``."""
     inside_s = np.clip(time_s, 0.0, call.duration_s)
-    period_s = 1 / call.start_frequency_hz
-    period_rise = (1 / call.stop_frequency_hz - period_s) / call.duration_s
-    phase_rad = 2 * math.pi / period_rise * np.log1p(inside_s * period_rise / period_s)
+    phase_rad = _phase_rad(call, inside_s)
     edge_s = np.minimum(inside_s, call.duration_s - inside_s)
     ramp_s = call.ramp_fraction * call.duration_s
     ramp = np.sin(math.pi / 2 * np.minimum(edge_s, ramp_s) / ramp_s) ** 2 if ramp_s else 1.0
     return np.where(inside_s == time_s, np.sin(phase_rad) * ramp, 0.0)
+
+
+def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    if call.modulation == "linear":
+        rise_hz_s = (call.stop_frequency_hz - call.start_frequency_hz) / call.duration_s
+        return 2 * math.pi * time_s * (call.start_frequency_hz + time_s * rise_hz_s / 2)
+    period_s = 1 / call.start_frequency_hz
+    period_rise = (1 / call.stop_frequency_hz - period_s) / call.duration_s
+    return 2 * math.pi / period_rise * np.log1p(time_s * period_rise / period_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +150,7 @@ def matched_spectrum(call: Call, *, n_waves: int) -> tuple[NDArray[np.float64], 
 
 
 def decimation_taps(
-    *, pdm_rate_hz: float, decimation: int, pass_hz: float, stop_band_db: float = _STOP_BAND_DB
+    *, sample_rate_hz: float, decimation: int, pass_hz: float, stop_band_db: float = _STOP_BAND_DB
 ) -> NDArray[np.float64]:
     """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
 
@@ -152,7 +160,7 @@ def decimation_taps(
 
     Parameters
     ----------
-    pdm_rate_hz : float
+    sample_rate_hz : float
     decimation : int
     pass_hz : float
         Upper edge of the band that must stay clean.
@@ -167,20 +175,20 @@ def decimation_taps(
     ArgumentError
         The decimated rate cannot hold ``pass_hz``.
     """
-    rate_hz = pdm_rate_hz / decimation
+    rate_hz = sample_rate_hz / decimation
     transition_hz = rate_hz - 2 * pass_hz
     if transition_hz < _LEAST_TRANSITION * rate_hz:
         raise ArgumentError(
             f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
         )
-    width_rad = 2 * math.pi * transition_hz / pdm_rate_hz
+    width_rad = 2 * math.pi * transition_hz / sample_rate_hz
     wanted = (stop_band_db - 7.95) / (2.285 * width_rad)
     half = decimation * math.ceil(wanted / 2 / decimation)
     taps = _windowed_sinc(half, decimation, width_rad)
     # Kaiser's formula is a fit; for some short filters it promises a few decibels too much.
-    folding_hz = np.linspace(rate_hz - pass_hz, min(rate_hz + pass_hz, pdm_rate_hz / 2), 256)
+    folding_hz = np.linspace(rate_hz - pass_hz, min(rate_hz + pass_hz, sample_rate_hz / 2), 256)
     enough = 10 ** ((_SLACK_DB - stop_band_db) / 20)
-    while decimation > 1 and np.abs(filter_response(taps, folding_hz / pdm_rate_hz)).max() > enough:
+    while decimation > 1 and np.abs(filter_response(taps, folding_hz / sample_rate_hz)).max() > enough:
         half += decimation
         taps = _windowed_sinc(half, decimation, width_rad)
     return taps

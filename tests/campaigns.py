@@ -30,7 +30,7 @@ class Here:
 
     @property
     def free(self):
-        return self.size - len(self.orders)
+        return max(0, self.size - len(self.orders))
 
     def limit(self, size):
         self.size = min(self.size, size)

@@ -4,6 +4,7 @@ import numpy as np
 
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.words import word_format
 
 LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
 SHORT = Settings(
@@ -35,6 +36,25 @@ CASES = {
             layout="line", positions_m=LINE_8, gain=(2.0, 1.0) * 4, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
         )
     ),
+    "PCM of 16 bits": SHORT.replace(
+        recording=Recording(sample_rate_hz=192_000.0, n_samples=1_748, encoding="int16"),
+        processing=SHORT.processing.replace(range_decimation=4),
+    ),
+    "PCM, calibrated": SHORT.replace(
+        array=Array(
+            layout="line",
+            positions_m=LINE_8,
+            enabled=(True, True, False, True) * 2,
+            gain=(2.0, 1.0) * 4,
+            delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2,
+        ),
+        recording=Recording(sample_rate_hz=125_000.0, n_samples=1_139, encoding="float32"),
+        processing=SHORT.processing.replace(range_decimation=2),
+    ),
+    "PCM, decimated": SHORT.replace(
+        recording=Recording(sample_rate_hz=1e6, n_samples=9_103, encoding="float32"),
+        processing=SHORT.processing.replace(range_decimation=20),
+    ),
     "decimated by 15": SHORT.replace(processing=SHORT.processing.replace(decimation=15, range_decimation=150)),
     "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30)),
     "every sample": SHORT.replace(processing=SHORT.processing.replace(range_decimation=10, range_m=(0.6, 0.62))),
@@ -44,12 +64,12 @@ CASES = {
 
 def noise(settings: Settings, seed: int = 1) -> Measurement:
     """White noise: it tells at all ranges and directions at once what echoes would."""
-    array = settings.array
-    n_words = -(-len(array.positions_m or range(32)) // array.word_bits)
-    shape = (settings.recording.n_samples, n_words) if n_words > 1 else (settings.recording.n_samples,)
-    random = np.random.default_rng(seed)
-    dtype = np.dtype(f"u{array.word_bits // 8}")
-    return Measurement(random.integers(0, 2**array.word_bits, shape, dtype=dtype), settings, Stamp(sequence=5))
+    words, random = word_format(settings), np.random.default_rng(seed)
+    if settings.recording.is_pdm:
+        numbers = random.integers(0, 2**settings.array.word_bits, words.shape, dtype=words.dtype)
+    else:
+        numbers = (0.1 * settings.recording.full_scale * random.standard_normal(words.shape)).astype(words.dtype)
+    return Measurement(numbers, settings, Stamp(sequence=5))
 
 
 def words_of(signals, seed: int = 1):

@@ -1,5 +1,6 @@
 """What all tests run under."""
 
+import logging
 import os
 
 import numpy as np
@@ -36,3 +37,12 @@ def _garbage_in_new_arrays_of_the_gpu():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cuda, "device_array", filled)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _log_as_before():
+    """Leave the log as it was: commands that a test runs in this process show it their own way from then on."""
+    log = logging.getLogger("ertis.network")
+    before = log.handlers[:], log.level, log.propagate
+    yield
+    log.handlers[:], log.level, log.propagate = before

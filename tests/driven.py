@@ -133,9 +133,15 @@ class Application:
         self.send(Subscribe(products=products, consumed=self.consumed, **values))
 
     def send(self, message):
-        self.socket.send(encode(message))
         self._said = message if isinstance(message, Subscribe) else None
         self._said_s = time.monotonic()
+        try:
+            # To wait here for a publisher would hold up the loop that starts it.
+            self.socket.send(encode(message), zmq.NOBLOCK)
+        except zmq.Again:
+            if self._said is None:
+                raise
+            self._said_s = 0.0  # it is said again with the next step
 
     def keep(self):
         """Say again what was said last, as a subscriber does, which is forgotten otherwise."""

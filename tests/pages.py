@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -11,9 +12,14 @@ from pathlib import Path
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-__all__ = ["commands_in", "environment", "in_background", "run", "run_here"]
+__all__ = ["DOCS", "ROOT", "commands_in", "environment", "in_background", "page", "python_in", "run", "run_here"]
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+def page(name):
+    return (DOCS / f"{name}.md").read_text("utf-8")
 
 
 def environment(place):
@@ -39,10 +45,14 @@ def in_background(place, command):
 def run_here(place, command):
     """Run a command in this process, which takes less to start."""
     with contextlib.chdir(place):
-        done = CliRunner().invoke(cli, command.split())
+        done = CliRunner().invoke(cli, shlex.split(command))
     assert done.exit_code == 0, (command, done.stderr, done.exception)
     return done.stdout
 
 
-def commands_in(page):
-    return re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
+def commands_in(text):
+    return re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", text, re.MULTILINE)
+
+
+def python_in(text):
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)

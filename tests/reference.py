@@ -29,7 +29,7 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
 
     Parameters
     ----------
-    words : (sample,) or (sample, word) unsigned
+    words : (sample,) or (sample, word) unsigned, or (sample, channel) PCM
     directions : (direction, axis) unit vectors
     range_m : (range,)
     spherical : bool
@@ -39,7 +39,7 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
     """
     given = [np.ascontiguousarray(values) for values in (words, directions, range_m)]
     # Devices and plans share the exact image of their words: plans are about how it is approximated.
-    sensor = settings.array, settings.call, settings.recording.pdm_rate_hz, settings.air
+    sensor = settings.array, settings.call, settings.recording, settings.air
     return _exact(*map(_Same, given), *sensor, spherical, delay_rate_hz)
 
 
@@ -58,12 +58,12 @@ class _Same:
 
 
 @functools.lru_cache(maxsize=32)
-def _exact(words, directions, range_m, array, call, rate_hz, air, spherical, delay_rate_hz):
+def _exact(words, directions, range_m, array, call, recording, air, spherical, delay_rate_hz):
     words, directions, range_m = words.values, directions.values, range_m.values
     layout = microphones(array)
     speed_m_s = sound_speed_m_s(air)
-    signals = unpack_bits(words, np.flatnonzero(layout.enabled))
-    spectra, frequency_hz = _matched_spectra(signals, call, rate_hz)
+    signals = signals_of(words, np.flatnonzero(layout.enabled), recording)
+    spectra, frequency_hz = _matched_spectra(signals, call, recording.sample_rate_hz)
     spectra = spectra * np.exp(2j * np.pi * frequency_hz * layout.delay_s[layout.enabled][:, None])
     spectra /= layout.gain[layout.enabled][:, None] * len(spectra)
     positions_m = layout.enabled_positions_m
@@ -113,10 +113,12 @@ def paper(words, settings: Settings, directions):
     layout = microphones(settings.array)
     rate_hz, speed_m_s = settings.signal_rate_hz, sound_speed_m_s(settings.air)
     step = settings.output_decimation
-    signals = unpack_bits(words, np.flatnonzero(layout.enabled)) / layout.gain[layout.enabled][:, None]
+    signals = (
+        signals_of(words, np.flatnonzero(layout.enabled), settings.recording) / layout.gain[layout.enabled][:, None]
+    )
     padded_s = settings.call.duration_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
     emitted = call_at(
-        settings.call, np.arange(int(padded_s * settings.recording.pdm_rate_hz)) / settings.recording.pdm_rate_hz
+        settings.call, np.arange(int(padded_s * settings.recording.sample_rate_hz)) / settings.recording.sample_rate_hz
     )
     call = _paper_filters(emitted, settings)
     low_pass, late = _paper_low_pass(settings)
@@ -144,7 +146,7 @@ def _paper_filters(signal, settings):
     """Demodulate: Butterworth low pass, every decimation-th sample, Butterworth band pass."""
     rate_hz, call = settings.signal_rate_hz, settings.call
     low_pass_hz = max(100e3 / 450e3 * rate_hz, call.high_frequency_hz)
-    low_pass = scipy.signal.butter(6, low_pass_hz, fs=settings.recording.pdm_rate_hz, output="sos")
+    low_pass = scipy.signal.butter(6, low_pass_hz, fs=settings.recording.sample_rate_hz, output="sos")
     band = (call.low_frequency_hz, call.high_frequency_hz)
     band_pass = scipy.signal.butter(6, band, "bandpass", fs=rate_hz, output="sos")
     slow = scipy.signal.sosfilt(low_pass, signal)[:: settings.decimation]
@@ -157,6 +159,11 @@ def _paper_low_pass(settings):
     sections = scipy.signal.butter(6, cutoff_hz, fs=settings.signal_rate_hz, output="sos")
     impulse = scipy.signal.sosfilt(sections, np.eye(1, 100_000)[0])
     return sections, round(float(np.arange(len(impulse)) @ impulse / impulse.sum()))  # delay of its centre of mass
+
+
+def signals_of(words, channels, recording):
+    """The signals of bits or numbers, full scale 1: (mic, sample) float64."""
+    return unpack_bits(words, channels) if recording.is_pdm else words[:, channels].T / recording.full_scale
 
 
 def unpack_bits(words, channels):

@@ -4,12 +4,13 @@ import select
 import shutil
 import time
 import zlib
+from datetime import datetime
 
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, InUseError
 from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor, seal_apart
-from ertis_numba.network.central_node import Archive
+from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._items import (
     Failed,
     Fault,
@@ -21,6 +22,7 @@ from ertis_numba.network.central_node._items import (
     Stored,
     Twin,
 )
+from ertis_numba.network.central_node._volumes import journal_name
 from ertis_numba.storage import open_recording, sensor_names
 from tests.central import stored, wanted
 from tests.journals import EPOCH, TINY, create, entries
@@ -354,6 +356,24 @@ def test_a_gap_before_any_measurement_is_told_by_the_recording_of_those(tmp_path
     assert len(recordings) == 2
     with open_recording(recordings[-1], sensor="left") as recording:
         assert not recording.gaps
+
+
+def test_names_tell_the_order_of_journals_of_one_second(tmp_path, monkeypatch):
+    class Stopped(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
+
+    monkeypatch.setattr(_volumes, "datetime", Stopped)
+    stem = "runs_20260102T030405Z"
+    assert journal_name(tmp_path, "runs") == f"{stem}.h5{SUFFIX}"
+    assert journal_name(tmp_path, "runs", taken=[f"{stem}.h5{SUFFIX}"]) == f"{stem}_002.h5{SUFFIX}"
+    (tmp_path / f"{stem}_002.h5").touch()  # what was before it has become no recording
+    assert journal_name(tmp_path, "runs") == f"{stem}_003.h5{SUFFIX}"
+    assert journal_name(tmp_path, "runs", end="_conflicts") == f"{stem}_conflicts.h5{SUFFIX}"
+    (tmp_path / f"{stem}_003.h5{SUFFIX}").touch()
+    assert journal_name(tmp_path, "runs") == f"{stem}_004.h5{SUFFIX}"
+    assert journal_name(tmp_path, "run") == f"run_20260102T030405Z.h5{SUFFIX}"
 
 
 def test_a_gap_of_a_sensor_beside_another_is_told_later(tmp_path):

@@ -111,6 +111,7 @@ def captures(tmp_path, words):
         yield lambda **options: Capture(stack, tmp_path, words, **options)
 
 
+@pytest.mark.alone
 def test_what_is_stored_is_what_was_sent(captures, words):
     capture = captures(n=6, rate_hz=20.0)
     capture.session.run(capture.journal)
@@ -132,6 +133,7 @@ def test_what_is_stored_is_what_was_sent(captures, words):
     assert capture.session.counts["one"].lost == 0
 
 
+@pytest.mark.alone
 def test_groups_of_a_sync_chain(captures, words):
     """Sensors are armed while pulses come, so their own counters differ."""
     names = ("a", "b", "c")
@@ -225,6 +227,7 @@ def test_a_sensor_may_hear_pulses_before_the_first_one_does(captures):
     assert capture.session.complete >= 4
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("trigger", ["command", "sync"])
 def test_an_unplugged_sensor_comes_back(captures, words, trigger):
     capture = captures(trigger=trigger, rate_hz=20.0)
@@ -254,6 +257,7 @@ def test_an_unplugged_sensor_comes_back(captures, words, trigger):
         assert all(zlib.crc32(measurement.words.tobytes()) in sent for measurement in recording)
 
 
+@pytest.mark.alone
 def test_a_counter_that_begins_anew_is_counted_on(captures):
     """As after a power cut that nobody has noticed."""
     capture = captures(trigger="sync")

@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.stages.cfar import METHODS, cfar, cfar_peaks, clean, threshold_factor
+from ertis_numba.stages.cfar import METHODS, _reference, cfar, cfar_peaks, clean, threshold_factor
 from ertis_numba.stages.detect import find_peaks
 from tests.cases import noise
 from tests.test_detect import image_of
@@ -142,29 +142,45 @@ def test_false_alarms_of_real_bits(false_alarm):
     assert np.mean(shares) == pytest.approx(false_alarm, abs=3 * deviation + 0.1 * false_alarm)
 
 
+def places_of(place, count, *, step=2, guard=11):
+    """Where the reference bins of a range are: as near as can be, half on each side where there is room."""
+    before = [place - guard - step * n for n in range(1, 200) if place - guard - step * n >= 0]
+    behind = [place + guard + step * n for n in range(1, 200) if place + guard + step * n < count]
+    n_behind = min(len(behind), N - min(len(before), N // 2))
+    return sorted(before[: N - n_behind] + behind[:n_behind])
+
+
+def test_reference_bins_are_as_near_as_can_be():
+    """At the usual spacing of ranges: every other bin, ten bins aside, and at both ends the same."""
+    image = image_of([], directions="2d:2", range_m=(0.8, 1.7))
+    count = image.energy.shape[1]
+    places = _reference(image, N)
+    for place in range(count):
+        assert places[:, place].tolist() == places_of(place, count), place
+        assert (places[:, place] == count - 1 - places[::-1, count - 1 - place]).all(), place  # halves, too
+    assert places[:, 0].min() == 13
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_is_the_reference(method):
-    """The same, bin by bin, at the usual spacing of ranges: every other bin, ten bins aside."""
+    """The same, bin by bin; where it is a matter of the last digit, either is right."""
     image = image_of([(12.0, 0.0, 1.3, 0.3)], directions="2d:5", range_m=(0.8, 1.7))
     values = np.random.default_rng(1).rayleigh(size=image.energy.shape) * 0.1
     image = image.replace(energy=(image.energy + values).astype(np.float32))
     alpha, count = threshold_factor(method, N, 1e-2), image.energy.shape[1]
-    wanted = np.zeros(image.energy.shape, dtype=bool)
-    step, guard = 2, 11
-    for direction, place in np.ndindex(wanted.shape):
-        before = [place - guard - step * n for n in range(1, 200) if place - guard - step * n >= 0]
-        behind = [place + guard + step * n for n in range(1, 200) if place + guard + step * n < count]
-        n_behind = min(len(behind), N - min(len(before), N // 2))
-        power = image.energy[direction, before[: N - n_behind] + behind[:n_behind]].astype(float) ** 2
+    above = np.zeros(image.energy.shape)
+    for direction, place in np.ndindex(above.shape):
+        power = image.energy[direction, places_of(place, count)].astype(float) ** 2
         told = {
             "ordered_statistic": np.sort(power)[23],
             "cell_averaging": power.mean(),
             "greatest_of": max(power[:16].mean(), power[16:].mean()),
         }[method]
-        wanted[direction, place] = image.energy[direction, place].astype(float) ** 2 > alpha * told
-    found = cfar(image, false_alarm=1e-2, method=method)
-    assert wanted.any()
-    assert np.count_nonzero(found != wanted) <= 1  # of rounding
+        above[direction, place] = image.energy[direction, place].astype(float) ** 2 / (alpha * told)
+    sure = np.abs(above - 1) > 1e-5
+    assert np.count_nonzero(~sure) <= 1
+    assert (above > 1).any()
+    np.testing.assert_array_equal(cfar(image, false_alarm=1e-2, method=method)[sure], above[sure] > 1)
 
 
 def test_weak_reflector_beside_a_strong_one():

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -23,6 +24,7 @@ from tests.files import SMALL, image, noise
 
 MODULE = [sys.executable, "-m", "ertis_cli"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+ROOT = Path(__file__).parents[1]
 LAYOUT = ["--layout", "eRTIS_v3D1", "--preset", "short_25_50"]
 FAST = ["--range", "0.5:1.2", "--directions", "2d:9"]
 
@@ -122,7 +124,8 @@ def test_info(recording, images):
 
 def test_info_of_unknown_times(tmp_path):
     write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].words, SMALL)])
-    assert report("info", tmp_path / "rec.h5")["first"] is None
+    told = report("info", tmp_path / "rec.h5")
+    assert (told["first"], told["last"]) == (None, None)
 
 
 def test_peaks_table(images):
@@ -301,6 +304,21 @@ def test_ended_from_outside(tmp_path, number, code):
     assert [item.name for item in tmp_path.iterdir()] == ["long.bin"]
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_a_callback_is_obeyed(number, code):
+    """Python itself prints what is raised in the callback of a weak reference, and goes on."""
+    program = (
+        "import signal, sys, weakref; from ertis_cli import main; main.obey_signals()\n"
+        "class Dropped: pass\n"
+        "item = Dropped()\n"
+        f"reference = weakref.ref(item, lambda _: signal.raise_signal({number.value}))\n"
+        "try:\n    del item\n    signal.sigtimedwait([], 60)\n    print('not obeyed')\n"
+        "except KeyboardInterrupt:\n    sys.exit(130)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
 def test_interrupt_waits_for_the_compiler():
     done = []
 
@@ -342,3 +360,31 @@ def test_slow_work_is_explained(capsys):
     with options.note_when_slow("still working", quiet=False):
         pass
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "command", ["process {} -o out.h5 --range 0.5:1 --directions 2d:3", "simulate scene.toml -o out.h5"]
+)
+def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypatch, command):
+    """That it took a second is all that is known."""
+    told = []
+
+    @contextmanager
+    def at_once(text, **_):
+        told.append(text)
+        yield
+
+    monkeypatch.setattr(options, "note_when_slow", at_once)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text("seed = 1\n")
+    done = CliRunner().invoke(cli, command.format(ROOT / "data" / "synthetic" / "reflectors.h5").split())
+    assert done.exit_code == 0, done.output
+    assert told[0] == "preparing (a first run compiles kernels, which takes longer) ..."
+
+
+def test_one_microphone_tells_no_directions(tmp_path):
+    alone = SMALL.replace(array=SMALL.array.replace(layout="one", positions_m=((0.0, 0.0, 0.0),)))
+    for settings, count in ((SMALL, 0), (alone, 1)):
+        path = write_energyscapes(tmp_path / f"{count}.h5", [image(settings=settings)])
+        said = run("peaks", path).stderr
+        assert said.count("note: sensor sensor has one microphone, which tells ranges but no directions") == count

@@ -2,6 +2,9 @@
 
 import os
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -31,7 +34,7 @@ CASES = {
     "missing layout file": (
         "import good.bin -o out.h5 --layout none.csv --preset short_25_50",
         1,
-        "layout none.csv: [Errno 2] No such file or directory",
+        "layout none.csv: No such file or directory",
     ),
     "NaN in layout": (
         "import good.bin -o out.h5 --layout nan.csv --preset short_25_50",
@@ -44,7 +47,7 @@ CASES = {
         "preset 'short_30_50' is unknown (did you mean 'short_25_50'?); known are short_20_80",
     ),
     "no layout": ("import good.bin -o out.h5 --preset short_25_50", 2, "Missing option '--layout'"),
-    "no raw file": ("import --layout eRTIS_v2 --preset short_25_50", 2, "Missing argument 'RAW.bin...'"),
+    "no raw file": ("import --layout eRTIS_v2 --preset short_25_50", 2, "Missing argument 'FILE...'"),
     "temperature": (
         RAW.format("good.bin") + " --temperature nan",
         1,
@@ -68,7 +71,7 @@ CASES = {
     "empty directions": ("process rec.h5 -o out.h5 --directions 3d:", 1, "directions '3d:' has no count; give for"),
     "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 1, "directions '4d:3' is no grid; give 90"),
     "empty CSV": ("process rec.h5 -o out.h5 --directions empty.csv", 1, "directions empty.csv has not two numbers"),
-    "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: [Errno 2] No such file"),
+    "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: No such file"),
     "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "processing.range_m ends at 50 m, but the record"),
     "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 1, "processing.range_m runs from 3 to 1; give the"),
     "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 1, "processing.range_m is nan; give a finite number"),
@@ -84,15 +87,15 @@ CASES = {
         "'tpu' is not one of 'auto', 'cpu', 'cuda', 'numpy'",
     ),
     "unknown method": ("process rec.h5 -o out.h5 --method quick", 2, "'quick' is not one of 'fast', 'paper'"),
-    "no threads": ("process rec.h5 -o out.h5 --threads 0", 1, "threads is 0; give a whole number from 1"),
+    "no threads": ("process rec.h5 -o out.h5 --threads 0", 1, "--threads is 0; give a whole number from 1"),
     "unknown key": (
         "process rec.h5 -o out.h5 --settings key.toml",
         1,
         "key.toml, line 2, air: unknown key `tempreature_c`",
     ),
     "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv: "),
-    "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: [Errno 2] No such file"),
-    "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "make the pipeline from the recording's own"),
+    "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: No such file"),
+    "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "give the settings that it was recorded with"),
     # outputs
     "output exists": ("process rec.h5 -o img.h5", 1, "output img.h5 exists; give another name, or ask to overwrite it"),
     "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
@@ -101,11 +104,11 @@ CASES = {
     # looking
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
     "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
-    "no peaks": ("peaks img.h5 --top 0", 1, "top is 0; give a whole number of at least 1"),
-    "peaks above": ("peaks img.h5 --min-level 3", 1, "min_level_db is 3; give a number from -1000 to 0"),
-    "nothing at that level": ("compare truth.h5 --min-level 3", 1, "min_level_db is 3; give a number from -1000 to 0"),
+    "no peaks": ("peaks img.h5 --top 0", 1, "--top is 0; give a whole number of at least 1"),
+    "peaks above": ("peaks img.h5 --min-level 3", 1, "--min-level is 3; give a number from -1000 to 0"),
+    "nothing at that level": ("compare truth.h5 --min-level 3", 1, "--min-level is 3; give a number from -1000 to 0"),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
-    "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "dynamic_range_db is -5; give a number above 0"),
+    "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "--dynamic-range is -5; give a number above 0"),
     # sensors and truth
     "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 holds 2 sensors; choose one of left, right (--sensor)"),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
@@ -191,6 +194,54 @@ def test_a_folder_that_cannot_be_written(tmp_path, folder):
     done = CliRunner().invoke(cli, ["process", str(folder / "rec.h5"), "-o", str(tmp_path / "out.h5")])
     assert done.exit_code == 1
     assert "Permission denied" in done.stderr
+
+
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="only Linux has folders that root cannot write either")
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (
+            "process rec.h5 -o /proc/x/",
+            "/proc/x: No such file or directory; see whether its folder is there, or choose",
+        ),
+        (
+            "process rec.h5 -o /sys/a/",
+            "/sys/a: Operation not permitted; see who may use it and its folder, or choose",
+        ),
+        ("process rec.h5 -o /sys/a.h5", "/sys/a.h5 cannot be written (Permission denied); see who may use it"),
+        (
+            "plot rec.h5 --kind signals -o /sys/a.png",
+            "/sys/a.png: Permission denied; see who may use it and its",
+        ),
+        ("export img.h5 -o /sys/a.csv", "/sys/a.csv cannot be written (Permission denied); see who may use it"),
+    ],
+)
+def test_the_remedy_fits_the_cause(folder, monkeypatch, command, message):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("ertis_numba.storage._writer.require_room", lambda *_: None)  # there is none in /sys
+    done = CliRunner().invoke(cli, command.split())
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"ertis: error: {message}"), done.stderr
+    assert "space" not in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_full_disk_behind_stdout_is_told_in_a_line(folder, more):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "ertis_cli", "info", folder / "rec.h5", *more],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (
+        1,
+        "ertis: error: the output is full (No space left on device); free some space or write elsewhere\n",
+    )
 
 
 def test_mistakes_of_the_program_keep_their_traceback(monkeypatch):

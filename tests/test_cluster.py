@@ -1,16 +1,19 @@
 """Jobs on a real dask cluster of this machine, through the interface that local workers have, too."""
 
+import gc
 import os
 import select
 import signal
+import socket
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 import ertis_numba as ertis
+from ertis_numba.cluster import connect
 from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.cluster import Cluster
 from ertis_numba.network.processing.options import Options
@@ -51,6 +54,25 @@ def events_of(runner, count=1):
     return found
 
 
+def give(runner, job):
+    """As soon as a worker takes it."""
+    end_s = time.monotonic() + LONG_S
+    while not runner.takes(job.kind) and time.monotonic() < end_s:
+        assert not runner.tick(time.monotonic(), 10.0)
+        time.sleep(0.01)
+    runner.submit(job)
+
+
+def get_all_ready(runner, n_workers, kind):
+    """Wait until a kind is ready on some workers, as one is enough for jobs to be taken."""
+    end_s = time.monotonic() + LONG_S
+    members = runner._members  # noqa: SLF001
+    while sum(kind.number in each.ready for each in members.values()) < n_workers:
+        assert time.monotonic() < end_s, "workers took longer than a minute"
+        assert not runner.tick(time.monotonic(), 10.0)
+        time.sleep(0.01)
+
+
 def kind_of(measurement, number=0, settings=None):
     return Kind(number, (settings or measurement.settings).to_toml(), measurement.words.nbytes)
 
@@ -72,6 +94,7 @@ def test_images_are_those_of_a_pipeline_here(cluster, measurement):
     with ertis.Pipeline(measurement.settings) as pipeline:
         wanted = pipeline.process(measurement).energy
     jobs = [job_of(measurement, number, kind, points=number == 1) for number in range(2)]
+    get_all_ready(cluster, 2, kind)
     for job in jobs:
         cluster.submit(job)
     done = events_of(cluster, 2)
@@ -88,13 +111,16 @@ def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
-    number = 0
-    while cluster.takes(kind):
+    get_all_ready(cluster, 2, kind)
+    for number in range(2):
+        assert cluster.takes(kind)
         cluster.submit(job_of(measurement, number, kind))
-        number += 1
-    assert number in {1, 2}  # the second worker may not have been seen yet
-    for event in events_of(cluster, number):
+    assert not cluster.takes(kind)
+    with pytest.raises(AssertionError, match=r"a job is submitted that no worker takes; ask takes\(\) first"):
+        cluster.submit(job_of(measurement, 2, kind))
+    for event in events_of(cluster, 2):
         cluster.give_back(event.job.slot)
+    assert cluster.takes(kind)
 
 
 def test_settings_that_no_pipeline_can_use_are_told(cluster, measurement):
@@ -120,32 +146,86 @@ def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
-    victim = cluster.status()[0].pid
-    cluster.submit(job_of(measurement, 0, kind))
-    os.kill(victim, signal.SIGKILL)
-    for number in range(1, 4):
-        (event, *_) = events_of(cluster)
-        assert isinstance(event, Done)
-        cluster.give_back(event.job.slot)
+    get_all_ready(cluster, 2, kind)
+    for number in range(2):  # both have one
         cluster.submit(job_of(measurement, number, kind))
-    (event, *_) = events_of(cluster)
-    assert isinstance(event, Done)
+    victim = cluster.status()[0].pid
+    os.kill(victim, signal.SIGKILL)
+    waiting, made = [job_of(measurement, number, kind) for number in range(2, 4)], set()
+    end_s = time.monotonic() + LONG_S
+    while len(made) < 4:
+        assert time.monotonic() < end_s, "it took longer than a minute"
+        while waiting and cluster.takes(kind):
+            cluster.submit(waiting.pop(0))
+        for event in cluster.tick(time.monotonic(), 10.0):
+            if isinstance(event, Lost):  # as by a worker of this machine: whoever asked for it tries again
+                assert event.again
+                waiting.insert(0, event.job)
+            else:
+                made.add(event.job.number)
+                cluster.give_back(event.job.slot)
+        time.sleep(0.01)
+    assert victim not in {worker.pid for worker in cluster.status()}
+    assert cluster.respawned == 1
+    get_all_ready(cluster, 2, kind)  # dask has started another, which is used from now on
 
 
 def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
-    runner = Cluster(Options(cluster=scheduler, deadline_s=1e-6), lambda _: None)
+    said = []
+    runner = Cluster(Options(cluster=scheduler, deadline_s=1e-6), said.append)
     kind = kind_of(measurement)
     runner.prepare(kind)
     events_of(runner)
-    runner.submit(job_of(measurement, 0, kind))
-    (event,) = runner.tick(time.monotonic(), 10.0)
+    give(runner, job_of(measurement, 0, kind))
+    (event,) = events_of(runner)
     assert isinstance(event, Lost)
     assert event.again
-    assert not runner.tick(time.monotonic(), 10.0)
+    assert "in time" in event.text
+    assert any("is given nothing more: it was not done in time" in text for text in said)
+    give(runner, job_of(measurement, 1, kind))  # it is reached again, or another takes it
     runner.close()
+
+
+def test_what_a_worker_raises_is_told_and_costs_no_worker(cluster, measurement, monkeypatch):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    events_of(cluster)
+    monkeypatch.setattr("ertis_numba.network.processing._cluster_worker.process", int)
+    cluster.submit(job_of(measurement, 0, kind))
+    (event,) = events_of(cluster)
+    assert isinstance(event, Lost)
+    assert event.again
+    assert "TypeError" in event.text
+    assert cluster.respawned == 0
+
+
+def test_a_kind_that_is_forgotten_can_be_prepared_again(cluster, measurement):
+    kind = kind_of(measurement)
+    cluster.prepare(kind)
+    cluster.forget(kind)
+    cluster.prepare(kind)
+    assert [type(event) for event in events_of(cluster)] == [KindReady]
+    cluster.forget(kind)
+    assert not cluster.takes(kind)
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_a_line(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.cluster._CONNECT_S", 0.5)
     with pytest.raises(ertis.NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
         Cluster(Options(cluster="tcp://127.0.0.1:9"), lambda _: None)
+
+
+@pytest.mark.parametrize("address", ["foo", "http://127.0.0.1:9", "silent"])
+def test_what_is_no_scheduler_is_told_and_nothing_goes_on(address):
+    """A client that is not closed would wait for an answer until the process ends, and print that none came."""
+
+    def unclosed():
+        clients = {each for each in gc.get_objects() if issubclass(type(each), Client)}
+        return {client for client in clients if client.status != "closed"}
+
+    before = unclosed()
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes calls, and says nothing
+        name = address.replace("silent", "tcp://{}:{}".format(*silent.getsockname()))
+        with pytest.raises(ertis.NetworkError, match=f"no dask scheduler answers at {name} "):
+            connect(name, timeout_s=0.1)
+        assert unclosed() <= before

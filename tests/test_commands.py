@@ -206,7 +206,7 @@ def test_what_a_sensor_is_told_by_default():
 
 
 def test_what_a_passive_sensor_is_told():
-    settings = Settings().replace(recording=Recording(n_samples=32_768, pdm_rate_hz=1_125_000.0), call=_slow())
+    settings = Settings().replace(recording=Recording(n_samples=32_768, sample_rate_hz=1_125_000.0), call=_slow())
     setup = Setup.of(settings, active=False, pin=2, emissions=3)
     assert b"".join(command.encode() for command in setup.before_call()[:3]) == b"!J,0,2,0\n!G,131072,0,0\n!F,1,0,0\n"
     assert b"".join(command.encode() for command in setup.after_call()) == b"!I,3,0,0\n!K,0,0,0\n!H,0,0,0\n"
@@ -239,7 +239,10 @@ REFUSED = [
     (_recording(n_samples=100_000), "recording.n_samples is 100000; a sensor measures multiples .*: give 98304"),
     (_recording(n_samples=100), "recording.n_samples is 100; a sensor measures multiples .*: give 32768"),
     (_recording(n_samples=2**25), "recording.n_samples is 33554432; .* up to 16777216: give 16777216"),
-    (_recording(pdm_rate_hz=4_000_000.0), "recording.pdm_rate_hz is 4000000; .* are 4500000 and 1125000: give one"),
+    (
+        _recording(sample_rate_hz=4_000_000.0),
+        "recording.sample_rate_hz is 4000000; .* are 4500000 and 1125000: give one",
+    ),
     (_call(sample_rate_hz=450_000.5), "call.sample_rate_hz is 450000.5; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=159_999.0), "call.sample_rate_hz is 159999; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=2e6 + 1), "call.sample_rate_hz is 2000001; give a whole number from 160000 to 2000000"),
@@ -285,7 +288,7 @@ CODES = call_codes(Call())
         ({"n_samples": 100_000}, "n_samples is 100000; a sensor measures multiples of 32768"),
         ({"n_samples": 0}, "n_samples is 0; give a whole number of at least 1"),
         ({"n_samples": 32_768.0}, "n_samples is 32768.0; give a whole number"),
-        ({"pdm_rate_hz": 4e6}, "pdm_rate_hz is 4000000; a sensor's clocks are 4500000 and 1125000"),
+        ({"pdm_rate_hz": 4e6}, "sample_rate_hz is 4000000; a sensor's clocks are 4500000 and 1125000"),
         ({"dac_rate_hz": 100_000}, "sample_rate_hz is 100000; give a whole number from 160000 to 2000000"),
         ({"codes": CODES[:63]}, "call has 63 samples; a sensor plays 64 to 65535"),
         ({"codes": CODES.astype(int)}, r"codes are int64 of shape \(1126,\); give \(sample,\) uint16"),

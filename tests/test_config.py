@@ -70,6 +70,54 @@ def test_some_variables_are_of_all_commands(images):
 
 
 @pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("ERTIS_PROCESS_DIRECTION", "did you mean 'ERTIS_PROCESS_DIRECTIONS'?"),
+        ("ERTIS_PROCES_DIRECTIONS", "did you mean 'ERTIS_PROCESS_DIRECTIONS'?"),
+        ("ERTIS_THREAD", "did you mean 'ERTIS_THREADS'?"),
+        ("ERTIS_CACHEDIR", "did you mean 'ERTIS_CACHE_DIR'?"),
+        ("ERTIS_KEYS_NEW_DIRR", "did you mean 'ERTIS_KEYS_NEW_DIR'?"),
+        ("ERTIS_PORT_5601_TCP", "unset it if nobody needs it"),  # which may be somebody else's
+    ],
+)
+def test_a_variable_of_nothing_is_warned_of(images, name, meant):
+    """In a line, and no more: others may name theirs so, too."""
+    folder, _ = images
+    done = ertis("info", "img.h5", "--json", folder=folder, **{name: "3"})
+    assert done.returncode == 0
+    assert json.loads(done.stdout)
+    assert done.stderr == f"ertis: warning: the variable {name} is known to no command; {meant}\n"
+
+
+def test_variables_that_are_no_options_are_known(images):
+    folder, _ = images
+    path = str(folder)
+    of_folders = dict.fromkeys(("ERTIS_CACHE_DIR", "ERTIS_EMULATED_DIR", "ERTIS_KEYS_DIR"), path)
+    given = {
+        "ERTIS_PROCESS_MAX_ERROR": "-40",
+        "ERTIS_SERVE_ALLOW": "x",
+        "ERTIS_KEYS_NEW_DIR": path,
+        "ERTIS_THREADS": "1",
+    }
+    done = ertis("info", "img.h5", folder=folder, **of_folders, **given, ERTIS_BENCH_MARK="1")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("proces a.h5", "No such command 'proces' (did you mean 'process'?); see 'ertis --help'"),
+        ("xyz", "No such command 'xyz' (there are bench, capture, compare, "),
+    ],
+)
+def test_a_command_that_is_not_known(tmp_path, line, message):
+    done = ertis(*line.split(), folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"ertis: error: {message}")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("[proces]\n", "'proces' is no command; did you mean 'process'?"),
@@ -98,6 +146,38 @@ def test_a_file_that_is_not_there(tmp_path):
     )
 
 
+def test_help_and_completion_do_without_it(tmp_path):
+    """Every new shell asks for the one, whoever is at a loss for the other."""
+    for line in ("--help", "completion bash"):
+        done = ertis(*line.split(), folder=tmp_path, ERTIS_CONFIG="none.toml")
+        assert done.returncode == 0, line
+        assert len(done.stdout.splitlines()) > 10
+        warned = (
+            done.stderr
+            == "ertis: warning: none.toml: No such file or directory; give a readable TOML file (--config)\n"
+        )
+        assert warned == (line != "--help")
+
+
+def test_what_does_not_fit_is_refused_where_it_was_typed_only(images, tmp_path):
+    folder, _ = images
+    text = "[process]\nworkers = 2\n[export]\ntop = 5\ntopic = ['points']\n[import]\nskip = 0.1\n"
+    (tmp_path / "mine.toml").write_text(text)
+    raw = tmp_path / "a.bin"
+    raw.write_bytes(bytes(4 * 65_536))
+    for given, typed, message in (
+        (("process", REFLECTORS, "-o", "p.h5", "--directions", "2d:5"), ("--workers", 2), "is for several recordings"),
+        (("export", folder / "img.h5", "-o", "a.npz"), ("--top", 5), "option --top is given, which format 'npz'"),
+        (("export", folder / "img.h5", "-o", "a.csv"), ("--topic", "points"), "option --topic is given, which form"),
+        (("import", raw, "--layout", "eRTIS_v3D1", "--preset", "short_25_50"), ("--skip", 1), "is for PCM (.wav, .h5)"),
+    ):
+        done = ertis(*given, *typed, folder=tmp_path)
+        assert done.returncode != 0
+        assert message in done.stderr
+        done = ertis("--config", "mine.toml", *given, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+
+
 def test_the_page_says_how(tmp_path):
     """Its file and its commands, word by word."""
     page = (ROOT / "docs" / "command-line.md").read_text("utf-8")
@@ -114,7 +194,14 @@ def test_the_page_says_how(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "wanted"), [("ertis proc", "process"), ("ertis process --max", "--max-error"), ("ertis keys n", "new")]
+    ("line", "wanted"),
+    [
+        ("ertis proc", "process"),
+        ("ertis process --max", "--max-error"),
+        ("ertis keys n", "new"),
+        ("ertis import --preset def", "default_25_50"),
+        ("ertis capture --layout uRT", "uRTIS_v1"),
+    ],
 )
 def test_a_shell_completes(tmp_path, line, wanted):
     """In a real one."""

@@ -55,6 +55,35 @@ def test_costs_are_kept(measured, caplog):
     assert measured == [("cpu", 1)]
 
 
+@pytest.mark.usefixtures("measured")
+def test_processes_that_measure_at_once_agree(monkeypatch):
+    """Whoever is first decides for all: by other costs, a plan and its bits may be others."""
+    found = costs.measure(CPU, 1)
+    path = costs.cache_file("cpu", 1)
+    theirs = {name: 2 * value for name, value in found.seconds.items()}
+
+    def overtaken(kernel_set, threads):  # noqa: ARG001
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(theirs), "utf-8")
+        return found
+
+    monkeypatch.setattr(costs, "measure", overtaken)
+    assert costs.costs_of(CPU, 1).seconds == theirs
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_disk_without_links_keeps_costs_as_well(measured, monkeypatch):
+    def refused(*_):
+        raise PermissionError("no links here")
+
+    monkeypatch.setattr(costs.os, "link", refused)
+    first = costs.costs_of(CPU, 1)
+    path = costs.cache_file("cpu", 1)
+    assert json.loads(path.read_text("utf-8")) == first.seconds
+    assert list(path.parent.iterdir()) == [path]
+    assert measured == [("cpu", 1)]
+
+
 def test_devices_and_threads_have_costs_of_their_own(measured):
     costs.costs_of(CPU, 1)
     costs.costs_of(CPU, 2)

@@ -2,6 +2,11 @@
 
 import json
 import os
+import re
+from configparser import ConfigParser
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -12,6 +17,8 @@ from ertis_numba import kernels
 from ertis_numba.devices.ports import Port
 from ertis_numba.errors import DeviceError
 from ertis_numba.network.keys import KeyPair
+
+permission = vars(_diagnosis)["_permission"]
 
 
 @pytest.fixture
@@ -75,7 +82,62 @@ def test_a_port_that_may_not_be_opened(doctor, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "access", lambda which, *how: which != str(path) and may(which, *how))
     state, text, remedy = doctor()["sensors"][0]
     assert (state, "may not be opened by you" in text) == ("bad", True)
-    assert remedy.startswith("run 'sudo usermod -aG ")
+    assert remedy == permission(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "getgid"), reason="groups are those of POSIX")
+@pytest.mark.parametrize(
+    ("group_id", "mode", "remedy"),
+    [
+        (20, 0o660, "run 'sudo usermod -aG serial $USER' and log in again"),
+        (0, 0o660, "udev"),  # to join the group of root is to be root
+        (20, 0o640, "udev"),  # whose members may not write
+        (20, 0o600, "udev"),
+        (77, 0o660, "udev"),  # which has no name
+        (os.getgid() or 21, 0o660, "udev"),  # of which one is a member, and may not all the same
+    ],
+)
+def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
+    import grp  # noqa: PLC0415  not on every system
+
+    def named(number):
+        return SimpleNamespace(gr_name={0: "root", 20: "serial", 21: "mine"}[number])
+
+    monkeypatch.setattr(grp, "getgrgid", named)
+    monkeypatch.setattr(os, "getgroups", lambda: [21, os.getgid()])
+    monkeypatch.setattr(_diagnosis.sys, "platform", "linux")
+    told = permission(SimpleNamespace(stat=lambda: SimpleNamespace(st_gid=group_id, st_mode=0o20000 | mode)))
+    if remedy != "udev":
+        assert told == remedy
+        return
+    assert "usermod -aG root" not in told
+    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' into /etc/udev/rules.d/\S+\.rules""", told)
+
+
+def test_all_extras_are_looked_at(doctor):
+    """Those that users have, by a module of each package that they bring."""
+    parser = ConfigParser()
+    parser.read(Path(__file__).parents[1] / "setup.cfg")
+    brought = {
+        extra: {re.split(r"[\[<>=]", line)[0] for line in lines.split("\n") if line}
+        for extra, lines in parser["options.extras_require"].items()
+        if extra not in {"cu12", "cu13", "test", "docs", "check"}  # a GPU is looked at, and the others are for authors
+    }
+    packages = packages_distributions()
+    looked_at = {
+        extra: {packages[name][0].replace("_", "-") for name in names}
+        for extra, names in vars(_diagnosis)["_EXTRAS"].items()
+    }
+    assert looked_at == brought
+    assert {f"extra {extra}" for extra in brought} <= set(doctor())
+
+
+def test_an_extra_that_is_not_there_in_full(doctor, monkeypatch):
+    there = _diagnosis.importlib.util.find_spec
+    monkeypatch.setattr(
+        _diagnosis.importlib.util, "find_spec", lambda name: None if name == "websockets" else there(name)
+    )
+    assert doctor()["extra view"] == [("note", "not installed", "pip install 'ertis-numba[view]', if you want it")]
 
 
 def test_a_gpu_that_cannot_be_used(doctor, monkeypatch):

@@ -132,8 +132,19 @@ CASES = {
     "several sensors": ("both.h5 -o a.npz", 1, "sensors left and right cannot share the axes of one npz"),
     "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement came; give one (--measurement)"),
     "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; give"),
-    "topics of a cloud": ("img.h5 -o a.ply --topic points", 1, "topics are chosen, which format 'ply' has none of"),
-    "text of a table": ("img.h5 -o a.csv --ascii", 1, "text is asked for, which format 'csv' knows nothing of"),
+    "topics of a cloud": (
+        "img.h5 -o a.ply --topic points",
+        1,
+        "option --topic is given, which format 'ply' does not have; leave it out, or write mcap",
+    ),
+    "text of a table": ("img.h5 -o a.csv --ascii", 1, "option --ascii is given, which format 'csv' does not have"),
+    "points of images": (
+        "img.h5 -o a.npz --top -3",
+        1,
+        "option --top is given, which format 'npz' does not have; leave it out, or write mcap, ply, pcd or csv",
+    ),
+    "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 1, "option --min-level is given, which format"),
+    "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
     "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: there is no folder none; make it or give another"),
@@ -151,6 +162,23 @@ def test_one_line_and_nothing_left(files, monkeypatch, name):
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert {path: path.stat().st_mtime_ns for path in files.iterdir()} == before
+
+
+GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, "text": True}
+
+
+@pytest.mark.parametrize("option", GIVEN)
+@pytest.mark.parametrize("kind", FORMATS)
+def test_options_are_those_of_the_format(tmp_path, kind, option):
+    """Taken where the format has them, and refused elsewhere rather than passed over."""
+    target = tmp_path / f"a{FORMATS[kind].ending}"
+    items = [noise(count=1)[0]] if kind == "acoular" else [image()]
+    if option in FORMATS[kind].options:
+        export(target, items, **{option: GIVEN[option]})
+        return
+    with pytest.raises(ArgumentError, match=f"option {option!r} is given, which format {kind!r} does not have; leave"):
+        export(target, items, **{option: GIVEN[option]})
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("kind", FORMATS)

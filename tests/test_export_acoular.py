@@ -20,8 +20,8 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.interop import export
-from ertis_numba.interop._acoular import signals_of
 from ertis_numba.settings import Settings
+from ertis_numba.stages.signals import signals_of
 from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image, line, noise
@@ -84,7 +84,7 @@ def test_acoular_finds_the_reflectors(tmp_path):
 def test_signals_are_those_of_the_words():
     """A call in one-bit words comes back, at its place and its level, within the noise of the bits."""
     settings = line(8, 8)
-    rate_hz, n_samples = settings.recording.pdm_rate_hz, settings.recording.n_samples
+    rate_hz, n_samples = settings.recording.sample_rate_hz, settings.recording.n_samples
     given = 0.5 * call_at(settings.call, np.arange(n_samples) / rate_hz - 2e-3)
     words = words_of(np.tile(given, (8, 1))).astype(np.uint8)
     array = settings.array.replace(gain=(1.0,) * 7 + (2.0,), enabled=(True, False) * 2 + (True,) * 4)
@@ -124,6 +124,9 @@ def test_what_is_refused(tmp_path, monkeypatch):
     ):
         with pytest.raises(ArgumentError, match=message):
             export(tmp_path / "a.h5", given)
+    for overwrite in (False, True):
+        with pytest.raises(ArgumentError, match=r"b.xml is where the array would be written, beside the sig"):
+            export(tmp_path / "b.xml", noise(count=1), file_format="acoular", overwrite=overwrite)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.xml").write_text("mine")
     with pytest.raises(ArgumentError, match=r"a.xml exists; give another name"):

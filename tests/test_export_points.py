@@ -105,6 +105,14 @@ def test_csv_comes_back(tmp_path):
     assert np.array_equal(np.column_stack([np.array(columns[name], dtype=np.float32) for name in names]), wanted)
 
 
+@pytest.mark.parametrize("timestamp_ns", [-1, 2_300_000_000_000_000_000])
+def test_csv_holds_any_time(tmp_path, timestamp_ns):
+    """Its times are nanoseconds, which those of ROS are not: there are none before 1970 nor after 2038."""
+    (path,) = export(tmp_path / "a.csv", images(count=1, timestamp_ns=timestamp_ns), top=1)
+    with path.open(newline="") as file:
+        assert [int(row["timestamp_ns"]) for row in csv.DictReader(file)] == [timestamp_ns]
+
+
 def test_the_nearest_reflector_is_where_it_is(tmp_path):
     """From the words of a scene to a cloud that another program reads."""
     with ertis.open_recording(REFLECTORS) as recording:
@@ -158,11 +166,14 @@ def test_of_an_unknown_mounting_the_frame_is_that_of_the_sensor(tmp_path):
         (images(sequence=2**32), {}, "sequence of a measurement is 4294967296, more than the format holds; use csv"),
         (images(timestamp_ns=-1), {}, "has the time -1 ns, wanted one from 1970 to 2038; use npz or csv"),
         (images(timestamp_ns=2**62), {}, "wanted one from 1970 to 2038"),
+        (images("Grüße"), {}, "sensor name 'Grüße' cannot stand in a file; give letters, digits and _"),
+        (images("a\nelement face 9"), {}, r"sensor name 'a\\nelement face 9' cannot stand in a file"),
         (images(), {"top": 0}, "top is 0; give a whole number of at least 1"),
         (images(), {"mounting": {"eRTIS-7": ((0, 0, 0), (0, 0, 0, 2))}}, "has length 2; give a unit quaternion"),
     ],
 )
-def test_what_cannot_be_in_a_cloud(tmp_path, given, options, message):
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_what_cannot_be_in_a_cloud(tmp_path, kind, given, options, message):
     with pytest.raises(ArgumentError, match=message):
-        export(tmp_path / "a.ply", given, **options)
+        export(tmp_path / f"a.{kind}", given, **options)
     assert list(tmp_path.iterdir()) == []

@@ -5,6 +5,7 @@ import pytest
 
 from ertis_numba import figures
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.figures._hearing import echoes, signals
 from ertis_numba.figures._signals import spectrogram
@@ -13,6 +14,7 @@ from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Array, Call, Settings
 from ertis_numba.waveform import call_at
 from tests.cases import words_of
+from tests.files import image
 from tests.test_figures_kinds import ONE, SETTINGS, STAMP, heard, solid
 
 
@@ -49,6 +51,25 @@ def test_slices_show_a_reflector_where_it_is():
     # Elsewhere there is nothing of it.
     other = figures.slices(given, height_m=float(up_m) + 1.0, left_m=float(left_m) - 1.0)
     assert [np.nanmax(axes.images[0].get_array()) for axes in other.axes[:2]] == pytest.approx([-40, -40], abs=1)
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 35.0])
+def test_slices_show_a_single_direction_as_a_narrow_beam(azimuth_deg):
+    """As wide as the sector draws it, not all of the plane."""
+    (axes, *_) = figures.slices(image([azimuth_deg], range_m=np.linspace(0.5, 5.0, 600))).axes
+    (shown,) = axes.images
+    rows, columns = np.nonzero(~np.ma.getmaskarray(np.ma.masked_invalid(shown.get_array())))
+    (left, right, bottom, top), (height, width) = shown.get_extent(), shown.get_array().shape
+    left_m = left + (columns + 0.5) * (right - left) / width
+    ahead_m = bottom + (rows + 0.5) * (top - bottom) / height
+    assert len(rows) > 1000
+    assert np.degrees(np.arctan2(left_m, ahead_m)) == pytest.approx(azimuth_deg, abs=1.01)
+    assert np.hypot(left_m, ahead_m).max() > 4.9
+
+
+def test_slices_beside_a_single_direction_show_nothing():
+    with pytest.raises(ArgumentError, match="height_m is 0, where the image shows nothing; give a plane that crosses"):
+        figures.slices(image([0.0], [30.0]))
 
 
 def test_projection_shows_a_reflector_where_it_is():
@@ -124,7 +145,7 @@ def test_matched_filter_takes_calibration_out():
     late_s, gain = (0.0, 40e-6), (1.0, 0.5)
     array = Array(layout="two", positions_m=((0, 0, 0), (0, 0.01, 0)), gain=gain, delay_s=late_s, word_bits=32)
     settings = SETTINGS.replace(array=array)
-    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     both = [0.6 * own * call_at(settings.call, time_s - 9e-3 - delay) for own, delay in zip(gain, late_s, strict=True)]
     given = echoes(Measurement(words_of(np.stack(both)), settings, STAMP))
     assert given.values.max(axis=1) == pytest.approx([0.6, 0.6], abs=0.05)
@@ -177,3 +198,56 @@ def test_one_microphone_has_no_beam():
     axes = figures.array(Settings(array=ONE)).axes[1]
     assert np.abs(axes.lines[0].get_ydata()).max() < 1e-9
     assert ": none" in axes.get_legend().get_texts()[0].get_text()
+
+
+def words_of_page(figure):
+    return " ".join(text.get_text() for text in figure.texts)
+
+
+@pytest.mark.parametrize("draw", [figures.plot, figures.polar, figures.projection, figures.slices])
+def test_an_image_of_nothing_says_so(draw):
+    """Its colours alone would not."""
+    given = image()
+    assert "silence" not in words_of_page(draw(given))
+    assert "silence: all values are 0" in words_of_page(draw(given.replace(energy=np.zeros_like(given.energy))))
+    faint = given.energy * np.float32(1e-6 / given.energy.max())
+    assert "the strongest is −120 dB of full scale" in words_of_page(draw(given.replace(energy=faint)))
+
+
+def test_bits_that_never_change_are_told():
+    still = heard()
+    still = Measurement(np.zeros_like(still.words), still.settings, still.stamp)
+    assert "dB of full scale" in words_of_page(figures.matched_filter(still))
+    assert "dB of full scale" not in words_of_page(figures.matched_filter(heard()))
+
+
+@pytest.mark.parametrize("look", [{}, {"theme": "paper"}, {"theme": "paper", "columns": 1}])
+@pytest.mark.parametrize("count", [0, 5, 9])
+def test_a_low_picture_has_a_whole_scale_and_list(look, count):
+    """The map of a planar image is a strip; its numbers mean nothing without the list."""
+    peaks = [Peak(azimuth_deg=10.0 * n, elevation_deg=0.0, range_m=1.0, level_db=-n) for n in range(count)]
+    figure = figures.projection(image(), peaks=peaks, **look)
+    figure.draw_without_rendering()
+    scale = next(axes for axes in figure.axes if "dB below" in axes.get_xlabel() + axes.get_ylabel())
+    length = max(scale.bbox.width, scale.bbox.height)
+    label = scale.xaxis.label if scale.get_xlabel() else scale.yaxis.label
+    extent = label.get_window_extent()
+    assert max(extent.width, extent.height) < length
+    listed = [text.get_text() for text in figure.texts if text.get_text().startswith(" #")]
+    assert [len(rows.splitlines()) for rows in listed] == [count + 1] * bool(count)
+    if count:
+        (text,) = [text for text in figure.texts if text.get_text().startswith(" #")]
+        assert text.get_window_extent().y0 > 0
+
+
+def test_both_parts_of_the_matched_filter_have_the_same_0_db():
+    """That of the strongest microphone; the mean of all is below it."""
+    given = heard()
+    figure = figures.matched_filter(given)
+    upper, lower, scale = figure.axes
+    assert upper.get_ylabel() == scale.get_ylabel() == "dB below the strongest"
+    assert lower.images[0].get_array().max() == pytest.approx(0.0, abs=0.01)
+    values = echoes(given).values
+    mean_db = 20 * np.log10(np.sqrt(np.mean(values.astype(float) ** 2, axis=0)).max() / values.max())
+    assert upper.lines[0].get_ydata().max() == pytest.approx(mean_db, abs=0.01)
+    assert "mean of 32 microphones" in words_of_page(figure)

@@ -7,10 +7,20 @@ import numpy as np
 import pytest
 
 from ertis_numba.settings import PRESETS, Settings
-from ertis_numba.storage.schema import CONVENTIONS, ENERGYSCAPE, FORMAT_VERSION, RECORDING, STAMPS, TRUTH
+from ertis_numba.storage.schema import (
+    CONVENTIONS,
+    ENERGYSCAPE,
+    FORMAT_VERSION,
+    RECORDING,
+    RECORDING_OF_PCM,
+    STAMPS,
+    TRUTH,
+)
 
 PAGE = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
 SHARED = [*STAMPS, *(variable for variable in RECORDING if variable.name == "settings")]
+PCM = next(variable for variable in RECORDING_OF_PCM if variable.name == "pcm")
+EITHER = [each for variable in RECORDING for each in ([variable, PCM] if variable.name == "pdm" else [variable])]
 
 
 def rows(first):
@@ -25,7 +35,7 @@ def rows(first):
     ("first", "table"),
     [
         ("time", SHARED),
-        ("temperature", [variable for variable in RECORDING if variable not in SHARED]),
+        ("temperature", [variable for variable in EITHER if variable not in SHARED]),
         ("scene", TRUTH),
         ("energy", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
     ],

@@ -13,11 +13,13 @@ from scipy.spatial import cKDTree
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import (
     PAPER_GRIDS,
+    azimuth_columns,
     direction_grid,
     far_field_delays,
     layout_names,
     load_layout,
     microphones,
+    spacing_rad,
     spherical_delays,
     unit_vectors,
 )
@@ -91,6 +93,9 @@ def test_layout_files(tmp_path):
     layout = load_layout(tmp_path / "mine.toml")
     assert (layout.name, layout.word_bits) == (str(tmp_path / "mine.toml"), 16)
     assert_allclose(layout.enabled_positions_m, [[0, -0.002, -0.001], [0, 0.002, 0.001]])
+    (tmp_path / "gains.toml").write_text("gain = [1.0, 0.5]\ndelay_s = [0.0, 1e-6]\npositions_mm = [[0, 0], [4, 2]]")
+    calibrated = load_layout(tmp_path / "gains.toml")
+    assert (calibrated.gain.tolist(), calibrated.delay_s.tolist()) == ([1.0, 0.5], [0.0, 1e-6])
     (tmp_path / "mine.csv").write_text("# x, y, z in millimetres\n1, 0, 0\n\n1, 4, 2  # the last\n")
     flat = load_layout(tmp_path / "mine.csv")
     assert flat.name == "mine"
@@ -124,6 +129,12 @@ def test_layout_files(tmp_path):
         ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; give a whole .* 0"),
         ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for every channel"),
         ("l.csv", b"1, 2\n3, x\n", r"layout .*l\.csv: could not convert .*x'; give rows of numbers parted by commas"),
+        (
+            "l.toml",
+            b"positions_mm = [[1, 2], [3, 4], [1, 2]]",
+            r"channels 0 and 2 are in one place; correct one, or name it under 'disabled'",
+        ),
+        ("l.toml", b"gain = [1.0]\npositions_mm = [[1, 2], [3, 4]]", r"l\.toml: array\.gain has shape \(1,\)"),
         ("l.csv", b"# nothing\n", r"layout .*l\.csv: positions_mm is not rows of 2 or 3 numbers"),
         ("l.csv", b"1, nan\n", r"layout .*l\.csv: positions_mm holds nan at \[0, 2\]"),
         ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
@@ -303,3 +314,31 @@ def test_spherical_delays_at_the_origin_and_on_a_microphone():
     assert_allclose(at_origin, [[0, 1e-4]])
     on_microphone = spherical_delays(positions_m, ahead, range_m=0.03, sound_speed_m_s=300.0)
     assert_allclose(on_microphone, [[0, -1e-4]], atol=1e-15)
+
+
+def test_spacing_is_that_of_the_grid():
+    for name, spacing_deg in (("2d:91", 2.0), ("2d:1", 180.0)):
+        grid = direction_grid(Processing(directions=name))
+        assert np.degrees(spacing_rad(unit_vectors(grid.azimuth_rad, grid.elevation_rad))) == pytest.approx(spacing_deg)
+
+
+@pytest.mark.parametrize("name", ["2d:7", "3d:500", "3d:1"])
+def test_azimuth_columns_hold_every_direction_once(name):
+    grid = direction_grid(Processing(directions=name))
+    shuffled = np.random.default_rng(1).permutation(len(grid))
+    azimuth_rad, elevation_rad = grid.azimuth_rad[shuffled], grid.elevation_rad[shuffled]
+    columns = azimuth_columns(azimuth_rad, elevation_rad)
+    assert sorted(columns.order) == list(range(len(grid)))
+    assert (np.diff(columns.azimuth_rad) > 0).all()
+    whose = np.searchsorted(columns.starts, np.arange(len(grid)), side="right") - 1
+    apart = np.abs(azimuth_rad[columns.order] - columns.azimuth_rad[whose])
+    assert apart.max() <= (0 if name == "2d:7" else spacing_rad(unit_vectors(azimuth_rad, elevation_rad)) / 2 + 1e-12)
+    strongest = np.maximum.reduceat(azimuth_rad[columns.order], columns.starts)
+    assert len(strongest) == len(columns.azimuth_rad)
+
+
+def test_metres_in_a_layout_are_refused(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("0.02, 0\n0, 0.02\n-0.02, 0\n")
+    with pytest.raises(ArgumentError, match=r"microphones lie within 0\.04 mm, too close .*; give millimetres"):
+        load_layout(path)

@@ -1,26 +1,58 @@
 """What the pages of the guide say runs, and they name everything that there is."""
 
+import ast
 import contextlib
+import pkgutil
 import re
+import subprocess
 import sys
-from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
+from scipy.io import wavfile
 
 import ertis_numba
-from ertis_numba.storage import open_recording
-from tests.pages import commands_in, in_background, run, run_here
+from ertis_numba import kernels
+from ertis_numba.storage import Truth, open_recording
+from tests.files import noise
+from tests.pages import DOCS, ROOT, commands_in, environment, in_background, page, python_in, run, run_here
+from tests.publishing import Publisher, cloud
 
-DOCS = Path(__file__).parents[1] / "docs"
-ROOT = DOCS.parent
-
-
-def page(name):
-    return (DOCS / f"{name}.md").read_text("utf-8")
-
-
-def python_in(text):
-    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+RUN_BY = {
+    ("accuracy", "$"): ["test_guide::test_commands_of_a_page"],
+    ("applications", "$"): ["test_applications_page::test_commands"],
+    ("applications", "python"): ["test_applications_page::test_loop"],
+    ("beamformers", "$"): ["test_guide::test_commands_of_a_page"],
+    ("command-line", "$"): ["test_config::test_the_page_says_how", "test_config::test_completion_for_each_shell"],
+    ("cuda", "$"): ["test_guide::test_commands_on_cuda"],
+    ("cuda", "python"): ["test_guide::test_python_on_cuda"],
+    ("devices", "$"): ["test_readme::test_page_on_devices"],
+    ("export", "$"): ["test_export::test_page"],
+    ("export", "python"): ["test_export::test_page"],
+    ("formats", "python"): ["test_guide::test_python_on_formats"],
+    ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
+    ("health", "$"): ["test_health::test_page_shows_what_the_commands_print"],
+    ("index", "$"): ["test_guide::test_start"],
+    ("index", "python"): ["test_guide::test_start"],
+    ("many", "$"): [
+        "test_many_docs::test_commands_in_their_order",
+        "test_many_cluster::test_the_line_of_the_page_runs",
+    ],
+    ("many", "python"): ["test_many_docs::test_python_lines"],
+    ("network", "$"): ["test_network_page::test_one_machine", "test_network_page::test_several_machines"],
+    ("network", "python"): ["test_guide::test_python_on_the_network"],
+    ("own-array", "$"): ["test_guide::test_own_array"],
+    ("own-array", "python"): ["test_guide::test_own_array"],
+    ("plots", "$"): ["test_plot::test_commands_of_the_page"],
+    ("plots", "python"): ["test_plot::test_python_of_the_page"],
+    ("python", "python"): ["test_guide::test_importing_loads_nothing_but_names"],
+    ("simulation", "$"): ["test_readme::test_page_on_simulation"],
+    ("simulation", "python"): ["test_readme::test_page_on_simulation"],
+    ("view", "$"): ["test_view_command::test_the_page_on_the_view"],
+    ("view", "python"): ["test_view_command::test_the_page_on_the_view"],
+}
+"""Which tests run what a page has to be run: lines that begin with a prompt, or blocks of Python."""
 
 
 @pytest.fixture
@@ -29,6 +61,30 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "data").symlink_to(ROOT / "data")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
+
+
+# ---- all of it is run --------------------------------------------------------------------------------
+
+
+def test_all_that_pages_show_is_run():
+    shown = set()
+    for path in DOCS.glob("*.md"):
+        text = path.read_text("utf-8")
+        shown |= {(path.stem, "$")} if re.search(r"^\w*\$ ", text, re.MULTILINE) else set()
+        shown |= {(path.stem, "python")} if python_in(text) else set()
+    assert shown == set(RUN_BY)
+
+
+@pytest.mark.parametrize("about", RUN_BY, ids="-".join)
+def test_what_is_said_to_run_a_page_does_name_it(about):
+    for named in RUN_BY[about]:
+        file, name = named.split("::")
+        text = (ROOT / "tests" / f"{file}.py").read_text("utf-8")
+        assert name in {node.name for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)}
+        assert f"{about[0]}.md" in text or f'"{about[0]}"' in text
+
+
+# ---- pages without a file of tests of their own ------------------------------------------------------
 
 
 def test_start(place):
@@ -48,19 +104,135 @@ def test_start(place):
 def test_own_array(place):
     text = page("own-array")
     files = re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL)
-    assert [name for name, _ in files] == ["ring.csv", "mine.toml", "scene.toml"]
+    assert [name for name, _ in files] == ["ring.csv", "ring8.toml", "mine.toml", "scene.toml", "pcm.toml", "call.toml"]
     for name, content in files:
         (place / name).write_text(content)
+    numbers = np.random.default_rng(1).integers(-300, 300, (3_192, 8), dtype=np.int16)
+    wavfile.write(place / "echoes.wav", 192_000, numbers)
+    np.zeros(2 * 65_536, "<u4").tofile(place / "ring.bin")
     told = [run_here(place, command) for command in commands_in(text)]
     assert re.search(r"\+14\.\d+ .* 1\.23\d ", told[2])  # 1.2 m ahead and 0.3 m to the left
+    assert re.search(r"\+14\.\d+ .* 1\.23\d ", told[6])
+    assert len(open_recording(place / "words.h5")) == 2
+    assert ertis_numba.load_layout(place / "ring8.toml").word_bits == 8
+    assert (open_recording(place / "echoes.h5")[0].words == numbers[192:]).all()
     (code,) = python_in(text)
     run(place, sys.executable, "-W", "error", "-c", code)
     assert open_recording(place / "mine.h5")[0].words.dtype == "u4"
 
 
+@pytest.mark.parametrize("name", ["accuracy", "beamformers"])
+def test_commands_of_a_page(place, name):
+    (command,) = commands_in(page(name))
+    run_here(place, command)
+    assert (place / "REC.energy.h5").exists()
+
+
+def test_commands_on_cuda():
+    """What `make test` runs, as it is there."""
+    lines = re.findall(r"^\$ (.*?)\s+#", page("cuda"), re.MULTILINE)
+    legs = [line for line in lines if not line.startswith("pip install ")]
+    assert len(legs) == 2
+    recipes = (ROOT / "Makefile").read_text("utf-8")
+    for leg in legs:
+        *variables, _ = leg.split(".venv/bin/python -m pytest ")
+        folder = leg.split()[-1]
+        assert list((ROOT / folder).glob("test_*.py"))
+        assert f"\t{variables[0]}$(PYTEST) {folder}" in recipes
+
+
+def test_python_on_cuda():
+    """On the processor where there is no GPU."""
+    (code,) = python_in(page("cuda"))
+    assert code.count('"cuda"') == 1
+    measurements = noise()
+    given = {"measurements": measurements, "measurement": measurements[0], "settings": measurements[0].settings}
+    exec(compile(code.replace('"cuda"', '"cuda"' if "cuda" in kernels.usable() else '"cpu"'), "cuda.md", "exec"), given)
+    assert len(given["images"]) == len(measurements)
+    assert (given["images"][0].energy == given["image"].energy).all()
+
+
+def test_python_on_formats(place):
+    """In a process of its own: netCDF-C and h5py each bring an HDF5."""
+    (place / "REC.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
+    (code,) = python_in(page("formats"))
+    (*_, last) = code.splitlines()
+    told = run(place, sys.executable, "-c", code.replace(last, f"print(dict({last}.sizes))")).stdout
+    assert "'sample'" in told
+
+
+def test_python_on_the_network(place):
+    (code,) = python_in(page("network"))
+    with Publisher() as publisher, publisher.playing([cloud(number) for number in range(3)]):
+        code = code.replace("tcp://127.0.0.1:5602", publisher.address)
+        words = [sys.executable, "-u", "-W", "error", "-c", code]
+        with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
+            lines = iter(process.stdout.readline, "")
+            assert "2 [1. 0. 0.]\n" in lines  # reads up to it; there are no more
+            process.terminate()
+
+
+def test_importing_loads_nothing_but_names(place):
+    code = page("python").split("```python\n")[1].split("```")[0]
+    modules = run(place, sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)").stdout.split()
+    assert "ertis_numba" in modules
+    assert not {"numpy", "scipy", "numba", "h5py", "zmq", "matplotlib"} & set(modules)
+
+
+# ---- all of it is named ------------------------------------------------------------------------------
+
+
+def public():
+    """The paths that the page on Python has."""
+    return re.findall(r"^\.\. auto\w+:: (ertis_numba[\w.]+)$", page("python"), re.MULTILINE)
+
+
+def taught(text):
+    """The paths into the package that a page names, or that its Python uses."""
+    yield from re.findall(r"`(ertis_numba(?:\.\w+)+)`", text)
+    for code in python_in(text):
+        tree, homes = ast.parse(code), {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                homes |= {each.asname or each.name: f"{node.module}.{each.name}" for each in node.names}
+            elif isinstance(node, ast.Import):
+                homes |= {each.asname or each.name: each.name for each in node.names}
+        homes = {name: path for name, path in homes.items() if path.startswith("ertis_numba")}
+        yield from homes.values()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in homes:
+                yield f"{homes[node.value.id]}.{node.attr}"
+
+
 def test_python_names_all_that_is_public():
-    named = re.findall(r"^\.\. auto\w+:: ertis_numba\.(\w+)$", page("python"), re.MULTILINE)
-    assert sorted(named) == ertis_numba.__all__
+    named = [path.removeprefix("ertis_numba.") for path in public()]
+    assert sorted(name for name in named if "." not in name) == ertis_numba.__all__
+
+
+def test_what_python_names_is_exported():
+    for path in public():
+        home, _, name = path.rpartition(".")
+        assert name in pkgutil.resolve_name(home).__all__, path
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda path: path.stem)
+def test_what_pages_teach_is_public(path):
+    """By any path that leads to it."""
+    objects = {id(pkgutil.resolve_name(each)) for each in public()}
+    homes = {each.rpartition(".")[0] for each in public()}
+    for each in taught(path.read_text("utf-8")):
+        meant = pkgutil.resolve_name(each)
+        assert each in homes if isinstance(meant, ModuleType) else id(meant) in objects, each
+
+
+def test_readers_have_what_the_page_says():
+    section = page("python").partition("## Files\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?`) \|", section, re.MULTILINE)
+    names = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(names) == 6
+    with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
+        assert all(hasattr(recording, name) for name in names)
+        assert isinstance(recording.truth, Truth)
 
 
 def test_every_page_is_in_the_guide():

@@ -24,7 +24,7 @@ from ertis_numba.simulation.render import Simulator
 from ertis_numba.stages import health as stage
 from ertis_numba.stages.health import health, merge
 from ertis_numba.storage import open_recording, write_energyscapes, write_recording
-from tests import cases, files
+from tests import cases, files, rings
 from tests.scenes import SENSOR, line_array, only, scene_of
 
 ROOT = Path(__file__).parents[1]
@@ -165,6 +165,32 @@ def test_all_silent():
     assert (report.noise_dbfs, report.dynamic_range_db) == (None, None)
 
 
+@functools.cache
+def numbers():
+    """What microphones give that speak float32."""
+    recording = rings.PCM.recording.replace(encoding="float32", n_samples=12_000)
+    return rings.heard(rings.PCM.replace(recording=recording), electronics=Electronics(noise_dbfs=-70.0))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
+def test_numbers_have_no_full_scale(scale):
+    """Pascal, for one, goes as high as the sound; what was cut off before is told at any scale."""
+    words = numbers().words * np.float32(scale)
+    assert health(dataclasses.replace(numbers(), words=words)).faults == {}
+    words[:, 5] = np.clip(words[:, 5], -0.4 * np.abs(words).max(), 0.4 * np.abs(words).max())
+    assert health(dataclasses.replace(numbers(), words=words)).faults == {"saturated": (5,)}
+
+
+def test_calibrated_gains_make_no_microphone_dead():
+    gain = (1.0, 2.0, 0.5, 3.0, 0.7, 3.0, 0.2, 3.0)
+    words = numbers().words * np.float32(gain)
+    assert health(dataclasses.replace(numbers(), words=words)).faults == {"dead": (6,)}
+    settings = numbers().settings.replace(array=rings.RING.replace(gain=gain))
+    assert health(Measurement(words, settings)).faults == {}
+    words[:, 3] *= np.float32(0.2)
+    assert health(Measurement(words, settings)).faults == {"dead": (3,)}
+
+
 def test_disabled_channels_are_not_looked_at():
     dead = health(with_bits(with_bits(sound(), 3, np.zeros(65_536)), 6, np.zeros(65_536)))
     assert dead.faults == {"stuck at 0": (3, 6)}
@@ -239,7 +265,7 @@ def test_a_band_too_narrow_for_the_record_is_told(call):
 
 @pytest.mark.parametrize("words", [np.zeros(4000, "u4"), np.zeros((4000, 2), "u1"), np.zeros((4000, 1, 1), "u1")])
 def test_words_of_another_array_are_refused(words):
-    with pytest.raises(ertis.DataError, match=r"its array wants uint8 and 1 per sample: give the array"):
+    with pytest.raises(ertis.DataError, match=r"its settings want uint8 of shape \(4000,\): give the settings"):
         health(dataclasses.replace(sound(), words=words))
 
 

@@ -92,6 +92,12 @@ def test_what_is_left_out_is_what_rtisdev_takes(tmp_path):
 
 
 @pytest.mark.parametrize("planar", [True, False])
+def test_json_may_say_yes_and_no(tmp_path, planar):
+    processing = open_rtis_folder(folder_of(tmp_path, processing=PLANAR | {"2D": planar})).settings.processing
+    assert processing.directions == f"{2 if planar else 3}d:91"
+
+
+@pytest.mark.parametrize("planar", [True, False])
 def test_all_settings_in_one(tmp_path, planar):
     """What ``dict(RTISSettings)`` yields, of which more is there than is needed."""
     azimuth_rad = np.radians(np.linspace(-60, 60, 5)).tolist()
@@ -111,7 +117,7 @@ def test_other_calls_and_clocks(tmp_path):
     folder = folder_of(tmp_path, recording=recording, processing={"microphoneLayout": "uRTIS_v1"})
     settings = open_rtis_folder(folder).settings
     assert (settings.call.duration_s, settings.call.start_frequency_hz) == (0.0031, 30_000)
-    assert settings.recording.pdm_rate_hz == 1_125_000
+    assert settings.recording.sample_rate_hz == 1_125_000
     assert settings.output_rate_hz >= 2 * 5_000  # ranges are fine enough for the bandwidth
     assert math.isclose(settings.processing.range_m[1], 5.0)
 

@@ -14,6 +14,7 @@ from tests.on_device import KERNELS, SIMULATED, sized
 
 CONTRACTS = {
     "unpack_bits": _contract.UnpackBits,
+    "unpack_pcm": _contract.UnpackPcm,
     "decimate": _contract.Decimate,
     "remove_group_delay": _contract.RemoveGroupDelay,
     "demodulate_words": _contract.DemodulateWords,
@@ -132,6 +133,21 @@ def test_unpack_bits(kernel_set, name):
     out = filled(len(channels), len(words))
     kernel_set.unpack_bits(words, channels, out)
     assert (out == reference.unpack_bits(words, channels)).all()
+
+
+@pytest.mark.parametrize("first", [0, 3, -5, 200, -300])
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_unpack_pcm(kernel_set, dtype, first):
+    random = np.random.default_rng(4)
+    words = (20_000 * random.standard_normal((150, 5))).clip(-32_768, 32_767).astype(dtype)
+    words[10], words[11] = 1, -2
+    channels, scale = np.array([0, 2, 4], dtype=np.int32), np.float32(2.0**-15)
+    out = filled(3, 180)
+    kernel_set.unpack_pcm(words, channels, scale, np.float32(1.5), first, out)
+    padded = np.zeros((700, 3))
+    padded[300:450] = words[:, channels] / 2.0**15
+    padded[np.abs(padded) < 1.5 * 2.0**-15] = 0
+    assert (out == padded[300 + first :][:180].T).all()
 
 
 @pytest.mark.parametrize(

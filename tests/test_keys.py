@@ -340,6 +340,16 @@ def test_a_secret_is_never_printed(folder):
     assert KeyPair.load(folder / "robot.secret.toml").secret not in printed
 
 
+def test_no_key_looks_like_an_option(monkeypatch):
+    drawn = zmq.curve_keypair()
+    while drawn[0].startswith(b"-"):
+        drawn = zmq.curve_keypair()
+    dashed = b"-" + drawn[0][1:], drawn[1]
+    given = iter([dashed, dashed, drawn])
+    monkeypatch.setattr(zmq, "curve_keypair", lambda: next(given))
+    assert KeyPair.new("robot").public == drawn[0].decode()
+
+
 def test_a_key_without_a_file_needs_a_name(tmp_path):
     result = CliRunner().invoke(keys_command, ["allow", PAIR.public, "--role", "admin"])
     assert result.exit_code == 2

@@ -79,6 +79,7 @@ def test_saves_energyscapes_of_several_sensors(tmp_path):
     with open_energyscapes(path, sensor="front") as images:
         assert [each.stamp for each in images] == [sent[0].stamp, sent[2].stamp]
         np.testing.assert_array_equal(images[1].energy, sent[2].energy)
+        np.testing.assert_array_equal(images.translation_m, Publisher.translation_m)
 
 
 def test_saves_measurements_as_a_recording_with_their_place(tmp_path):

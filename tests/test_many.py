@@ -1,5 +1,7 @@
 """What becomes of many recordings: made, there already, or failed; and what is made is what one recording becomes."""
 
+import errno
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.campaign import Campaign, Found, Wanted, campaign, find, made, work
+from ertis_numba.campaign import Campaign, Options, Source, campaign, find, made, work
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
@@ -53,7 +55,7 @@ def states(folder):
 
 
 def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
-    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=narrow))
+    found, crew = run_here(monkeypatch, [runs], out, Options(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
     assert [order.about["warm"] for order in crew.given if order.do == "plan"] == [True, False]  # one for each air
     assert found["a.h5"].made["measurements"] == 3
@@ -64,11 +66,42 @@ def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
         assert single.read_bytes() == (out / f"{name}.energy.h5").read_bytes()
 
 
+def test_one_is_told_of_like_many(runs, out, monkeypatch):
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, explain=True, verify=True))
+    arguments = [str(runs / "a.h5"), "--range", "0.5:0.8", "--explain", "--verify", "--json"]
+    single = json.loads(CliRunner().invoke(cli, ["process", *arguments]).stdout)
+    many = found["a.h5"].made
+    assert many.pop("warnings") == []
+    assert single.pop("output") == str(runs / "a.energy.h5")
+    assert list(single) == list(many)
+    for each in (single, many):
+        assert each["verified"] == each["sensors"][0]["verified"]
+        assert each["plan"] == each["sensors"][0]["plan"]
+    for each in (single, single["sensors"][0], many, many["sensors"][0]):
+        assert each.pop("median_ms") > 0
+        for measured in ("plan", "verified"):
+            assert isinstance(each.pop(measured), dict)  # times in it differ
+    assert single == many
+
+
+def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
+    def on_paper(settings):
+        return settings.replace(processing=settings.processing.replace(method="paper"))
+
+    def by_capon(settings):
+        return narrow(settings).replace(processing=settings.processing.replace(beamformer="capon"))
+
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=on_paper, explain=True))
+    assert "a plan is asked for, and method 'paper' has none; give 'fast'" in found["a.h5"].error
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_capon, verify=True))
+    assert "the true error of beamformer 'capon' is asked for, and only the exact image of" in found["a.h5"].error
+
+
 def test_what_is_there_is_left_alone(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs], out, Options(settings=narrow))
     before = states(out)
     (out / "b.energy.h5").unlink()
-    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=narrow, overwrite=True))
+    found, crew = run_here(monkeypatch, [runs], out, Options(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
     assert [order.about["path"] for order in crew.given if order.do == "make"] == [str(runs / "b.h5")]
     after = states(out)
@@ -80,14 +113,14 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [
-        (Wanted(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
-        (Wanted(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
-        (Wanted(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
-        (Wanted(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
+        (Options(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
+        (Options(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
+        (Options(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
+        (Options(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
     ],
 )
 def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, said):
-    run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, Options(settings=narrow))
     before = states(out)
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
     for event in found.values():
@@ -95,7 +128,7 @@ def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wan
         assert f"output {event.output} exists and " in event.error
         assert re.search(said, event.error)
     assert states(out) == before
-    replaced = Wanted(settings=wanted.settings, dtype=wanted.dtype, overwrite=True)
+    replaced = Options(settings=wanted.settings, dtype=wanted.dtype, overwrite=True)
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, replaced)
     assert set(outcomes(found).values()) == {"made"}
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
@@ -103,25 +136,25 @@ def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wan
 
 
 def test_another_recording_of_the_same_name(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     write_recording(runs / "a.h5", noise(count=3, seed=9), overwrite=True)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     assert "exists and was made of another recording" in found["a.h5"].error
 
 
 def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     with h5py.File(runs / "a.h5", "r+") as file:
         file.attrs["remark"] = "written to"
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     assert "exists and was made of another file of the same recording" in found["a.h5"].error
 
 
 def test_another_version(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     newer = {"ertis-numba": "99.0"}
     monkeypatch.setattr(made, "software_versions", lambda: newer)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     assert "exists and was made by ertis-numba 0" in found["a.h5"].error
     assert "this is 99.0" in found["a.h5"].error
 
@@ -132,7 +165,7 @@ def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, cont
     recording = content is None
     content = (runs / "b.h5").read_bytes() if recording else content
     (out / "a.energy.h5").write_bytes(content)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(overwrite=recording))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(overwrite=recording))
     said = "is a recording; give another folder" if recording else "is no energyscape file that can be read"
     assert f"exists and {said}" in found["a.h5"].error
     assert (out / "a.energy.h5").read_bytes() == content
@@ -145,11 +178,11 @@ def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
         return settings.replace(processing=settings.processing.replace(range_m=RANGE_M, directions="grid.csv"))
 
     grid.write_text("-10,0\n10,0\n")
-    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
+    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
     assert outcomes(found) == {"a.h5": "there"}
     grid.write_text("-10,0\n11,0\n")
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=by_file))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
     assert "other settings (grid of sensor eRTIS-7)" in found["a.h5"].error
 
 
@@ -157,7 +190,7 @@ def test_one_that_fails_does_not_stop_the_rest(runs, out, monkeypatch):
     with h5py.File(runs / "b.h5", "r+") as file:
         file["sensors/eRTIS-7/pdm"][1, 777] ^= 1 << 9
     (runs / "c.h5").write_bytes((runs / "c.h5").read_bytes()[:50_000])
-    found, _ = run_here(monkeypatch, [runs, runs / "none.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs, runs / "none.h5"], out, Options(settings=narrow))
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made", "none.h5": "failed"}
     assert "b.h5: measurement 1 has CRC-32" in found["b.h5"].error
     assert "c.h5 is cut short or damaged" in found["c.h5"].error
@@ -169,7 +202,7 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
     def hopeless(settings):
         return narrow(settings).replace(accuracy=settings.accuracy.replace(max_error_db=-199.0))
 
-    found, crew = run_here(monkeypatch, [runs], out, Wanted(settings=hopeless))
+    found, crew = run_here(monkeypatch, [runs], out, Options(settings=hopeless))
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
         assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, and the best")
@@ -178,8 +211,8 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
 
 
 def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], runs, Wanted(settings=narrow))  # beside the recordings
-    found, _ = run_here(monkeypatch, [runs], runs, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], runs, Options(settings=narrow))  # beside the recordings
+    found, _ = run_here(monkeypatch, [runs], runs, Options(settings=narrow))
     assert found["a.energy.h5"].outcome == "passed over"
     assert outcomes(found)["a.h5"] == "there"
     found, _ = run_here(monkeypatch, [runs / "a.energy.h5"], out)
@@ -190,9 +223,9 @@ def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
     left = (replace(each, stamp=replace(each.stamp, sensor="left")) for each in noise(line(8, 8), count=2, seed=5))
     several = [*noise(count=2), *left]
     write_recording(tmp_path / "two.h5", several)
-    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Options(settings=narrow))
     assert [row["sensor"] for row in found["two.h5"].made["sensors"]] == ["eRTIS-7", "left"]
-    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Wanted(settings=narrow, sensor="left"))
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Options(settings=narrow, sensor="left"))
     assert "exists and holds sensor eRTIS-7, left, wanted left" in found["two.h5"].error
 
 
@@ -201,9 +234,9 @@ def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
     for measurement in measurements:
         measurement.words[:] &= np.uint32(0xFFFFFFFE)
     write_recording(tmp_path / "worn.h5", measurements)
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Wanted(settings=narrow, strict=True))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow, strict=True))
     assert "stuck at 0: channel 0" in found["worn.h5"].error
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Wanted(settings=narrow))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow))
     assert "stuck at 0: channel 0" in found["worn.h5"].made["warnings"][0]
 
 
@@ -220,7 +253,7 @@ def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, 
     for number in range(12):  # each has air of its own, and so a pipeline of its own
         settings = SMALL.replace(air=Air(temperature_c=float(number)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
-    found, crew = run_here(monkeypatch, [tmp_path], out, Wanted(settings=narrow))
+    found, crew = run_here(monkeypatch, [tmp_path], out, Options(settings=narrow))
     assert set(outcomes(found).values()) == {"made"}
     assert max(most_kept) == 1
     place = {"look": 0, "make": 0}
@@ -238,7 +271,7 @@ def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
         return chances.pop() if do == "plan" and chances else work.follow(do, *arguments)
 
     monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
-    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "c.h5"], out, Wanted(settings=narrow))  # in the same air
+    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "c.h5"], out, Options(settings=narrow))  # in the same air
     assert outcomes(found) == {"a.h5": "failed", "c.h5": "made"}
     assert found["a.h5"].error == "no memory"
 
@@ -253,34 +286,58 @@ def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
     assert told == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
-@pytest.mark.parametrize(("workers", "size"), [(None, 1), (3, 3)])
-def test_a_gpu_serves_one_at_a_time(runs, out, monkeypatch, workers, size):
+class Watched(Here):
+    """A crew that notes how many orders it has in hand whenever it gets one, and what it had when it was limited."""
+
+    def __init__(self, size):
+        super().__init__(size)
+        self.limited_at, self.in_hand = [], []
+
+    def limit(self, size):
+        super().limit(size)
+        if not self.limited_at:
+            self.in_hand.clear()
+        self.limited_at.append(len(self.orders))
+
+    def give(self, order):
+        super().give(order)
+        self.in_hand.append(len(self.orders))
+
+
+@pytest.mark.parametrize(("workers", "most"), [(None, 1), (3, 3)])
+def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, most):
+    """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
+
     def on_a_gpu(*arguments):
         return {name: "cuda" if name == "device" else value for name, value in work.follow(*arguments).items()}
 
-    crew = Here(3)
+    crew = Watched(3)
+    write_recordings(tmp_path / "many", "abcdefghi", count=1)
     monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
     monkeypatch.setattr(Campaign, "_crew", lambda _: crew)
-    found = ended(Campaign(find([runs]), out, Wanted(settings=narrow), workers=workers).run())
+    found = ended(Campaign(find([tmp_path / "many"]), out, Options(settings=narrow), workers=workers).run())
     assert set(outcomes(found).values()) == {"made"}
-    assert crew.size == size
+    assert max(crew.in_hand) == most
+    assert crew.size == most
+    if workers is None:
+        assert crew.limited_at[0] > 1  # so that there is something to wait for
 
 
 @pytest.mark.parametrize(
     ("wanted", "workers", "count", "found"),
     [
-        (Wanted(), None, 9, 4),
-        (Wanted(), None, 3, 3),
-        (Wanted(), 6, 9, 6),
-        (Wanted(threads=2), None, 9, 2),
-        (Wanted(threads=9), None, 9, 1),
-        (Wanted(device="cuda"), None, 9, 1),
-        (Wanted(device="cuda"), 2, 9, 2),
+        (Options(), None, 9, 4),
+        (Options(), None, 3, 3),
+        (Options(), 6, 9, 6),
+        (Options(threads=2), None, 9, 2),
+        (Options(threads=9), None, 9, 1),
+        (Options(device="cuda"), None, 9, 1),
+        (Options(device="cuda"), 2, 9, 2),
     ],
 )
 def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
     monkeypatch.setattr(campaign, "_n_cores", lambda: 4)
-    recordings = [Found(Path(f"{number}.h5")) for number in range(count)]
+    recordings = [Source(Path(f"{number}.h5")) for number in range(count)]
     assert Campaign(recordings, tmp_path / "out", wanted, workers=workers).workers == found
 
 
@@ -288,10 +345,23 @@ def test_half_files_go_before_and_after(runs, out, monkeypatch):
     out.mkdir()
     (out / "a.energy.h5.0123abcd.part").write_bytes(b"half")
     (out / "z.energy.h5.0123abcd.part").write_bytes(b"of another campaign")
-    run_here(monkeypatch, [runs / "a.h5"], out, Wanted(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     assert names_in(out) == ["a.energy.h5", "z.energy.h5.0123abcd.part"]
     with open_energyscapes(out / "a.energy.h5") as images:
         assert len(images) == 3
+
+
+def test_a_folder_that_cannot_be_written_is_told_with_the_remedy(monkeypatch, tmp_path):
+    def refused(*_):
+        raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
+
+    monkeypatch.setitem(vars(work)["_ORDERS"], "make", refused)
+    told = work.follow("make", {})
+    assert (
+        told["error"]
+        == f"{tmp_path / 'a.energy.h5'}: Read-only file system; see who may use it and its folder, or choose another"
+    )
+    assert told["by_chance"]
 
 
 def test_other_errors_of_settings_end_the_campaign(runs, out, monkeypatch):
@@ -299,5 +369,5 @@ def test_other_errors_of_settings_end_the_campaign(runs, out, monkeypatch):
         raise KeyError("a mistake in the program")
 
     with pytest.raises(KeyError, match="a mistake in the program"):
-        run_here(monkeypatch, [runs], out, Wanted(settings=wrong))
+        run_here(monkeypatch, [runs], out, Options(settings=wrong))
     assert names_in(out) == []

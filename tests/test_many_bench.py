@@ -52,12 +52,18 @@ def test_more_cores_have_more_crews(monkeypatch):
 def test_files_that_differ_are_not_timed(tmp_path, monkeypatch):
     def timed(_, target, *, workers, threads):
         (target / "000.energy.h5").write_text(f"{workers} {threads}")
+        (target / "001.energy.h5").write_text("x" * workers)
+        (target / "002.energy.h5").write_text("the same")
         return 1.0, 1.0
 
     monkeypatch.setattr(many, "_timed", timed)
     monkeypatch.setattr(many, "_require_exact", lambda *_: None)
     crews = {"one": {"workers": 1, "threads": 1}, "two": {"workers": 2, "threads": 1}}
-    with pytest.raises(DataError, match=r"two made other files than 1 worker of 1 thread \(000\.energy\.h5\)"):
+    message = (
+        r"two made other files than 1 worker of 1 thread \(000\.energy\.h5: 1 of 3 bytes, from 0 to 0, "
+        r"001\.energy\.h5: 2 bytes for 1\); do not trust it"
+    )
+    with pytest.raises(DataError, match=message):
         many._measured(  # noqa: SLF001
             tmp_path, tmp_path / "out", crews, 1, lambda _: None
         )

@@ -1,5 +1,6 @@
 """Many recordings on a real dask cluster of this machine: the same files."""
 
+import logging
 import os
 import re
 import shutil
@@ -13,7 +14,8 @@ from distributed import Client, LocalCluster
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
-from ertis_numba.campaign import Advanced, Begun, Campaign, Wanted, find, members
+from ertis_numba.campaign import Advanced, Begun, Campaign, Options, find, members
+from ertis_numba.campaign.orders import Order
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -27,7 +29,7 @@ def narrow(settings):
     return settings.replace(processing=settings.processing.replace(range_m=(0.5, 0.8), directions="2d:300"))
 
 
-WANTED = Wanted(settings=narrow, batch=1)
+WANTED = Options(settings=narrow, batch=1)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -119,6 +121,56 @@ def test_other_versions_are_told(monkeypatch):
     told = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
     assert "worker tcp://far:1 has numpy " in told["error"]
     assert "wanted 0.1; install the same everywhere" in told["error"]
+
+
+class Dwindling:
+    """A client of a cluster that loses a worker whenever somebody counts them, and ends nothing."""
+
+    status = "running"
+
+    def __init__(self):
+        self.workers = 4
+
+    def nthreads(self):
+        self.workers -= 1
+        return dict.fromkeys(range(self.workers), 1)
+
+    def subscribe_topic(self, *_):
+        pass
+
+    def submit(self, *_, **__):
+        return self
+
+    def add_done_callback(self, _):
+        pass
+
+    def cancel(self, *_, **__):
+        pass
+
+    def close(self, **_):
+        pass
+
+
+def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
+    monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
+    monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
+    monkeypatch.setattr(members, "_LOOK_S", 0.0)
+    crew = members.Members("tcp://far:1")
+    for number in range(crew.free):
+        crew.give(Order(number, "look", {}))
+    assert (crew.size, crew.free) == (3, 0)
+    crew.wait(0.0)
+    assert (crew.size, crew.free) == (2, 0)
+
+
+def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
+    monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
+    monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
+    crew = members.Members("tcp://far:1")
+    assert not any(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
+    crew.close()
+    assert all(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
 
 
 def test_no_scheduler(monkeypatch, runs, tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Advanced, Begun, Campaign, Wanted, find, processes
+from ertis_numba.campaign import Advanced, Begun, Campaign, Options, find, processes
 from ertis_numba.campaign.orders import Order
 from ertis_numba.campaign.processes import Processes
 from ertis_numba.errors import DeviceError
@@ -71,7 +71,7 @@ def gone(pid):
 
 
 def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
-    wanted = Wanted(settings=narrow, batch=2)
+    wanted = Options(settings=narrow, batch=2)
     run_here(monkeypatch, [runs], tmp_path / "here", wanted)
     found = ended(Campaign(find([runs]), tmp_path / "out", wanted, workers=2).run())
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
@@ -80,7 +80,7 @@ def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
 
 def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, crews):
     out, killed, found = tmp_path / "out", [], {}
-    campaign = Campaign(find([long_runs]), out, Wanted(settings=narrow, batch=1), workers=2)
+    campaign = Campaign(find([long_runs]), out, Options(settings=narrow, batch=1), workers=2)
     for event in campaign.run():
         if isinstance(event, Advanced) and event.recording.name == "b.h5" and not killed:
             (crew,) = crews
@@ -92,12 +92,12 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
     assert f"{long_runs / 'b.h5'}: the process that worked on it was ended by SIGKILL" in found["b.h5"].error
     assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
-    again = ended(Campaign(find([long_runs]), out, Wanted(settings=narrow), workers=1).run())
+    again = ended(Campaign(find([long_runs]), out, Options(settings=narrow), workers=1).run())
     assert outcomes(again) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
 
 
 def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
-    events = Campaign(find([long_runs]), tmp_path / "out", Wanted(settings=narrow, batch=1), workers=2).run()
+    events = Campaign(find([long_runs]), tmp_path / "out", Options(settings=narrow, batch=1), workers=2).run()
     for event in events:
         if isinstance(event, Begun) and event.measurements == LONG:
             break
@@ -131,6 +131,34 @@ def test_fewer_are_wanted_after_all():
         crew.limit(1)
         assert (crew.size, crew.free, list(crew.doing)) == (1, 1, pids[:1])
         assert all(gone(pid) for pid in pids[1:])
+    finally:
+        crew.close()
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_fewer_are_wanted_while_all_are_busy(size):
+    """Never more orders in hand than there were, and soon no more than are wanted, by as many processes."""
+    crew, numbers, in_hand, seen = Processes(3), iter(range(12)), set(), []
+    try:
+
+        def feed():
+            while crew.free > 0 and (number := next(numbers, None)) is not None:
+                crew.give(Order(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
+                in_hand.add(number)
+            return len(in_hand)
+
+        assert feed() == 3
+        crew.limit(size)
+        assert crew.free == 0
+        while feed():
+            seen.append((len(in_hand), len(crew.doing)))
+            in_hand -= {news.number for news in crew.wait(PATIENCE_S) if news.result is not None}
+        assert next(numbers, None) is None
+        assert seen == sorted(seen, reverse=True)
+        assert seen[0] == (3, 3)
+        assert (size, size) in seen
+        assert max(processes for given, processes in seen if given <= size) == size
+        assert len(crew.doing) == size
     finally:
         crew.close()
 
@@ -169,7 +197,7 @@ def until_a_part_grows(out):
 
 
 def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp_path, monkeypatch):
-    run_here(monkeypatch, [long_runs], tmp_path / "here", Wanted(settings=narrow, batch=1))
+    run_here(monkeypatch, [long_runs], tmp_path / "here", Options(settings=narrow, batch=1))
     wanted, out = contents(tmp_path / "here"), tmp_path / "out"
     for wait_s in (0.0, 0.15):
         with started(long_runs, out) as process:

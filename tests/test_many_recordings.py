@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Campaign, Found, find, outputs
+from ertis_numba.campaign import Campaign, Source, find, outputs
 from ertis_numba.campaign.folder import clear_parts, sole
 from ertis_numba.errors import ArgumentError, DataError
 from tests.campaigns import names_in
@@ -35,6 +35,21 @@ def test_files_folders_and_patterns():
 def test_a_file_that_is_named_twice_is_processed_once():
     Path("link.h5").symlink_to("runs/b.h5")
     assert names("runs/b.h5", "runs", "runs/../runs/*.h5", "link.h5") == ["runs/b.h5", "runs/a.h5"]
+
+
+def test_a_file_counts_rather_than_a_link_to_it():
+    Path("runs/0.h5").symlink_to("b.h5")
+    assert names("runs") == ["runs/b.h5", "runs/a.h5"]
+    assert find(["runs/0.h5", "runs"])[0] == Source(Path("runs/b.h5"), named=True)
+    assert names("runs/0.h5") == ["runs/0.h5"]
+
+
+@pytest.mark.parametrize("given", ["runs", "runs/*.h5"])
+def test_a_link_to_nothing_is_left_to_whoever_opens_it(given):
+    Path("runs/lost.h5").symlink_to("gone.h5")
+    Path("runs/round.h5").symlink_to("round.h5")
+    assert names(given) == ["runs/a.h5", "runs/b.h5", "runs/lost.h5", "runs/round.h5"]
+    assert len(outputs(find([given]), Path("out"))) == 4
 
 
 def test_only_what_is_named_is_meant_for_sure():
@@ -76,7 +91,7 @@ def test_refused_before_anything_is_made(place, given, folder, said):
 def test_no_recording_is_replaced():
     Path("runs/a.energy.h5").touch()
     with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is to be processed itself"):
-        outputs([Found(Path("runs/a.h5")), Found(Path("runs/a.energy.h5"))], Path("runs"))
+        outputs([Source(Path("runs/a.h5")), Source(Path("runs/a.energy.h5"))], Path("runs"))
 
 
 def test_workers_and_a_scheduler():

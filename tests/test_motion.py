@@ -9,6 +9,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Call, Recording
 from ertis_numba.simulation import Box, Emitter, Noise, Point, Scene, Sonar, Sphere, Tone, Wall
+from ertis_numba.waveform import call_at
 from tests.scenes import (
     EAR,
     SENSOR,
@@ -223,6 +224,20 @@ def test_signals_of_many_microphones_are_stretched_calls(spacing_m, speed_m_s):
     [echo] = ways(scene, "doppler", "spreading")
     wanted = written_out(scene.sensors[0].call, echo.delay_s, echo.amplitude[:, :, 0], 40_000, echo.stretch[0][:, None])
     assert error_db(heard(scene, "doppler", "spreading"), wanted) < -80
+
+
+@pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
+@pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (25e3, 50e3)])
+def test_a_stretched_call_seems_to_come_as_much_earlier_as_is_reckoned(modulation, start_hz, stop_hz):
+    """``(s - 1) p₀ / p'``, of which the simulator judges whether motion matters, for both kinds of sweep."""
+    call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation)
+    rate_hz, stretch = 5e6, 1 + 2 * 1.0 / SPEED_M_S
+    time_s = np.arange(40_000) / rate_hz - 2e-3
+    sent, came = (np.fft.fft(call_at(call, time_s / by)) for by in (1.0, stretch))
+    pulse = np.abs(np.fft.ifft(came * np.conj(sent) * (np.fft.fftfreq(len(time_s)) > 0)))
+    later_s = (int(np.argmax(np.roll(pulse, 20_000))) - 20_000) / rate_hz
+    growth = (1 / stop_hz - 1 / start_hz) / call.duration_s
+    assert later_s == pytest.approx(-(stretch - 1) / start_hz / growth, abs=3e-7)
 
 
 def test_without_motion_doppler_changes_no_signal():

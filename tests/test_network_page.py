@@ -1,6 +1,7 @@
 """What the README and docs/network.md say of the network runs, word by word but for ports, hosts and what is heard.
 
-The emulated sensors hear two measurements over and over: to render thirty takes longer than all else together.
+The emulated sensors hear two measurements over and over, from a recording of the scene: to render them takes longer
+than all else together.
 """
 
 import contextlib
@@ -21,6 +22,20 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 PAGE = (ROOT / "docs" / "network.md").read_text("utf-8")
 READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
+
+
+@pytest.fixture(scope="session")
+def platform(tmp_path_factory):
+    """The platform's scene as a recording, rendered once for all processes that test."""
+    folder = tmp_path_factory.getbasetemp().parent
+    path = folder / "platform.h5"
+    if not path.exists():
+        part = tmp_path_factory.mktemp("platform") / "platform.h5"
+        command = [sys.executable, "-m", "ertis_cli", "simulate", ROOT / "examples" / "platform.toml", "-o", part]
+        folders = os.pathsep.join(str(ROOT / name) for name in (".", "cli", "bench"))
+        subprocess.run([*command, "--count", "2", "--quiet"], env=os.environ | {"PYTHONPATH": folders}, check=True)
+        part.replace(path)
+    return path
 
 
 @pytest.fixture
@@ -47,8 +62,8 @@ def ports():
 class Shell:
     """Runs lines of a page; those that end with ``&`` until the test ends."""
 
-    def __init__(self, ports):
-        self.ports = ports
+    def __init__(self, ports, platform):
+        self.ports, self.platform = ports, platform
         self.running, self.readers = [], []
 
     def __enter__(self):
@@ -70,7 +85,7 @@ class Shell:
             arguments += ["--listen", f"tcp://127.0.0.1:{self.ports['5601']}"]
             arguments += ["--publish", f"tcp://127.0.0.1:{self.ports['5602']}"]
         if name == "emulate":
-            arguments += ["--count", "2"]
+            arguments[0] = str(self.platform)
         command = [sys.executable, "-m", "ertis_cli", name, *arguments]
         if not line.endswith("&"):
             done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -95,10 +110,10 @@ def lines_of(page, prompt):
     [next(block for block in page.split("```") if "$ ertis serve" in block) for page in (README, PAGE)],
     ids=["readme", "page"],
 )
-def test_one_machine(place, ports, block):
+def test_one_machine(place, ports, platform, block):
     lines = lines_of(block, "")
     assert [line.split()[0] for line in lines] == ["emulate", "serve", "capture", "listen", "status"]
-    with Shell(ports) as shell:
+    with Shell(ports, platform) as shell:
         *_, heard, status = [shell.run(line) for line in lines]
     assert len([line for line in heard.splitlines() if re.match(r"(front|left) ", line)]) == 10
     assert "front" in status
@@ -107,10 +122,10 @@ def test_one_machine(place, ports, block):
     assert {name for path in recordings for name in sensor_names(path)} == {"front", "left"}
 
 
-def test_several_machines(place, ports):
+def test_several_machines(place, ports, platform):
     lines = lines_of(PAGE, "(?:central|sensor)")
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
-    with Shell(ports) as shell:
+    with Shell(ports, platform) as shell:
         shell.run("emulate examples/platform.toml &")
         for line in lines:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
@@ -118,8 +133,8 @@ def test_several_machines(place, ports):
     assert "0 lost" in told or not told
 
 
-def test_one_machine_stores(place, ports):
-    with Shell(ports) as shell:
+def test_one_machine_stores(place, ports, platform):
+    with Shell(ports, platform) as shell:
         address = f"tcp://127.0.0.1:{ports['5601']}"
         shell.run("emulate examples/platform.toml &")
         READY["record"] = '"listening"'

@@ -39,7 +39,7 @@ def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float
     speed_m_s = sound_speed_m_s(settings.air)
     direction = unit_vectors(np.radians(azimuth_deg), np.float64(0))
     delay_s = -(microphones(settings.array).enabled_positions_m @ direction) / speed_m_s
-    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     arrival_s = 2 * range_m / speed_m_s + delay_s[:, None]
     return words_of(level * call_at(settings.call, time_s - arrival_s))
 

@@ -57,7 +57,7 @@ def test_options_of_cfar(images):
     [
         ("--false-alarm 1e-3", 2, "--false-alarm is for --detector cfar; give both"),
         ("--detector cfar --truth", 2, "--truth compares with --detector peaks; leave out one"),
-        ("--detector cfar --false-alarm 2", 1, "false_alarm is 2; give a number from 1e-09 to 0.5"),
+        ("--detector cfar --false-alarm 2", 1, "--false-alarm is 2; give a number from 1e-09 to 0.5"),
     ],
 )
 def test_what_is_refused(images, options, code, match):

@@ -206,7 +206,7 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
     "words", [np.zeros(10, np.uint32), np.zeros(40_960, np.uint16), np.zeros((40_960, 2), np.uint32)]
 )
 def test_refuses_words_of_other_settings(words):
-    with pytest.raises(DataError, match=r"words of shape .* the settings want uint32 of shape \(40960,\)"):
+    with pytest.raises(DataError, match=r"words of shape .* its settings want uint32 of shape \(40960,\)"):
         Pipeline(SHORT).process(Measurement(words, SHORT))
 
 

@@ -7,14 +7,19 @@ from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import direction_grid, unit_vectors
+from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Recording, Settings
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.stages import planner
+from ertis_numba.stages.cfar import clean
 from ertis_numba.stages.detect import _interpolate, find_peaks, neighbours_of
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.points import PointExtractor
+from tests.cases import noise as words_of_noise
 from tests.scenes import heard
 from tests.test_detect import image_of
+
+OTHERS = [("fast", beamformer) for beamformer in ("coherence_factor", "dmas", "capon")]
 
 
 def noise(directions, range_m=(0.9, 1.2), seed=1):
@@ -207,6 +212,31 @@ def test_uncertainty_goes_with_range_level_and_noise():
     louder = image.replace(energy=np.where(image.energy < 0.1, 2 * image.energy, image.energy))
     assert np.median(image.energy) < 0.1
     assert extractor(louder).uncertainty_m[0] == pytest.approx(2 * first, rel=1e-3)
+
+
+@pytest.mark.parametrize(("method", "beamformer"), [("fast", "delay_and_sum"), ("paper", "delay_and_sum"), *OTHERS])
+def test_only_noise_of_delay_and_sum_is_told_by_its_median(method, beamformer):
+    """√ln 2 of the root mean square, as of a Rayleigh variable."""
+    settings = Settings(
+        recording=Recording(n_samples=65_536),
+        processing=Processing(directions="2d:9", range_m=(0.3, 2.0), method=method, beamformer=beamformer),
+    )
+    with Pipeline(settings, device="numpy") as pipeline:
+        image = pipeline.process(words_of_noise(settings, 1))
+    ratio = np.median(image.energy) / np.sqrt(np.mean(np.square(image.energy, dtype=float)))
+    is_rayleigh = beamformer == "delay_and_sum"
+    assert (ratio == pytest.approx(np.sqrt(np.log(2)), rel=0.02)) == is_rayleigh
+    uncertainty_m = PointExtractor(settings)(image).uncertainty_m
+    assert len(uncertainty_m) > 3
+    assert (np.isnan(uncertainty_m) != is_rayleigh).all()
+
+
+def test_without_noise_nothing_is_known_of_it():
+    """As of an image that was cleaned: 0 would be as if nothing could be known better."""
+    image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
+    cloud = PointExtractor(image.settings)(clean(image))
+    assert len(cloud) > 1
+    assert np.isnan(cloud.uncertainty_m).all()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from ertis_cli import _process_many
 from ertis_cli.main import cli
 
 from ertis_numba import verification
-from ertis_numba.campaign import Advanced, Begun, Campaign, Ended, Wanted
+from ertis_numba.campaign import Advanced, Begun, Campaign, Ended, Options
 from tests.campaigns import Here, names_in, write_recordings
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
@@ -84,6 +84,9 @@ def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
     monkeypatch.setattr(Campaign, "_crew", lambda _: Here())
     done = run("runs", "-o", "more", *FAST, "--explain")
     assert done.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
+    again = run("runs", "-o", "more", *FAST, "--explain")
+    assert again.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
+    assert again.stderr.count(": made before\n") == 2
 
 
 @pytest.mark.usefixtures("here")
@@ -137,7 +140,7 @@ def test_bars_on_a_terminal(runs, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", terminal)
     (runs / "broken.h5").unlink()
     with click.Context(click.Command("process")):
-        _process_many.process_many(["runs"], "out", Wanted(), workers=None, scheduler=None, quiet=False, as_json=True)
+        _process_many.process_many(["runs"], "out", Options(), workers=None, scheduler=None, quiet=False, as_json=True)
     shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # less colours
     assert re.search(r"recordings ━+ \d/2", shown)
     assert "out/a.energy.h5: 3 measurements" in shown

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from ertis_cli.main import COMMANDS
 
-from ertis_numba.storage import open_recording
+from ertis_numba.storage import open_recording, write_recording
+from tests.files import SMALL, noise
 from tests.pages import commands_in, in_background, run, run_here
 
 ROOT = Path(__file__).parents[1]
@@ -18,22 +19,7 @@ README = (ROOT / "README.md").read_text()
 SIMULATION = (ROOT / "docs" / "simulation.md").read_text()
 DEVICES = (ROOT / "docs" / "devices.md").read_text()
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
-PAGES = (
-    "README.md",
-    "docs/accuracy.md",
-    "docs/beamformers.md",
-    "docs/devices.md",
-    "docs/export.md",
-    "docs/formats.md",
-    "docs/gallery.md",
-    "docs/health.md",
-    "docs/many.md",
-    "docs/network.md",
-    "docs/plots.md",
-    "docs/reliability.md",
-    "docs/simulation.md",
-    "docs/view.md",
-)
+PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md")))]
 
 
 @pytest.fixture
@@ -43,6 +29,8 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "data").symlink_to(ROOT / "data")
     real = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     shutil.copy(str(real), tmp_path / "RAW.bin")
+    (tmp_path / "RUNS").mkdir()
+    write_recording(tmp_path / "RUNS" / "first.h5", noise(SMALL, 1))
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.toml", tmp_path / "SCENE.toml")
     return tmp_path
 
@@ -70,6 +58,7 @@ def test_commands(place):
             started.add(name)
     elsewhere = {"completion", "doctor", "keys", "listen", "record", "serve", "status", "view"}  # on pages of their own
     assert started == {*COMMANDS} - elsewhere - {"bench"}
+    assert (place / "IMAGES" / "first.energy.h5").exists()
     assert (place / "picture.png").stat().st_size > 10_000
     assert (place / "shelf.png").stat().st_size > 10_000
 
@@ -112,3 +101,14 @@ def test_files_named_are_there(page):
     path = ROOT / page
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/index.md", "docs/network.md", "docs/applications.md"])
+def test_pages_say_when_an_emulated_sensor_is_there(name):
+    """Commands that follow at once find none, as its scene is rendered first."""
+    before, emulating, _ = (ROOT / name).read_text().partition("$ ertis emulate")
+    assert emulating
+    (said,) = re.findall(
+        r"port\s+is printed|has printed\s+its ports?|has printed\s+their ports", before[-600:].replace("`", "")
+    )
+    assert said

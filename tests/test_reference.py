@@ -22,7 +22,7 @@ def directions_of(azimuth_deg):
 
 def received(settings: Settings, path_m):
     """Words of one echo of amplitude 0.9 that comes by paths of these lengths: (mic,)."""
-    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     arrival_s = np.asarray(path_m) / sound_speed_m_s(settings.air)
     return words_of(0.9 * call_at(settings.call, time_s - arrival_s[:, None]))
 

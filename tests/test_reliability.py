@@ -24,6 +24,7 @@ def test_nothing_is_lost_of_a_sustained_capture(tmp_path):
     assert not found["lost"]
 
 
+@pytest.mark.alone
 def test_groups_of_a_sync_chain_are_complete(tmp_path):
     platform = tmp_path / "platform.toml"
     platform.write_text(captures.platform(4, n_measurements=3).to_toml())

@@ -232,7 +232,7 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         ("[effects]\nmodulation = false", r"effect 'modulation' cannot be left out \(.*\); take it out of effects"),
         ("sensors = []", "scene has no sensors; give at least one"),
         ("[[sensors]]\n[[sensors]]", "scene has 2 sensors named 'sensor'; name each differently"),
-        ("[[sensors]]\nname = ''", r"sensor\.name is ''; give letters, digits and _ \. @ \+ -"),
+        ("[[sensors]]\nname = ''", r"sensor\.name is ''; give letters, digits and _, after the first also \. @ \+ -"),
         ("[[sensors]]\nyaw_deg = 181", r"sensor\.yaw_deg is 181; give a number from -180 to 180"),
         ("[[sensors]]\npitch_deg = 91", r"sensor\.pitch_deg is 91; give a number from -90 to 90"),
         ("[[sensors]]\nroll_deg = 181", r"sensor\.roll_deg is 181; give a number from -180 to 180"),

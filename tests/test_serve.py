@@ -24,7 +24,7 @@ from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import open_recording
-from tests.cases import SHORT, noise
+from tests.cases import CASES, SHORT, noise
 from tests.test_record import REPORTED
 
 TIMEOUT_S = 60.0
@@ -245,3 +245,25 @@ def test_what_is_refused_has_left_nothing(tmp_path):
     assert done.returncode == 1
     assert "is taken by another program; end that or give another --publish" in done.stderr.splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+def test_numbers_of_pcm_go_all_the_way(tmp_path):
+    """Sent, stored and imaged like bits."""
+    given = noise(CASES["PCM, calibrated"])
+    with (
+        serving(*LOOPBACK, "--record", str(tmp_path)) as served,
+        Subscriber(served.publish, products=("energyscape", "status"), credit=64) as subscriber,
+    ):
+        received(subscriber, Status)
+        with SensorNode(served.listen) as node:
+            node.add_sensor("ring", given.settings)
+            stamp = Stamp(sensor="ring", epoch=11, timestamp_ns=time.time_ns())
+            node.append([Entry(Measurement(given.words, given.settings, stamp), time.monotonic_ns())])
+            assert node.flush(timeout_s=TIMEOUT_S)
+            image = received(subscriber, Energyscape)
+        served.end()
+    with Pipeline(image.settings, max_error_db=image.settings.accuracy.max_error_db) as pipeline:
+        assert np.array_equal(image.energy, pipeline.process(given).energy)
+    (path,) = tmp_path.rglob("*.h5")
+    with open_recording(path) as recording:
+        assert np.array_equal(recording[0].words, given.words)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.geometry import direction_grid, microphones
 from ertis_numba.settings import (
     ERROR_PRESETS_DB,
     INTERPOLATIONS,
@@ -61,7 +63,7 @@ any_settings = st.builds(
     Settings,
     array=arrays(),
     call=calls,
-    recording=st.builds(Recording, pdm_rate_hz=st.floats(3e6, 5e6), n_samples=st.integers(1, 2**28)),
+    recording=st.builds(Recording, sample_rate_hz=st.floats(3e6, 5e6), n_samples=st.integers(1, 2**28)),
     air=st.builds(
         Air,
         temperature_c=st.floats(-40, 60),
@@ -153,7 +155,7 @@ def test_nothing_can_be_changed_in_place():
         ("[call]\nduration_s = 0", r"call\.duration_s is 0; give a number from 3\.55556e-05 to 1"),
         ("[call]\nsample_rate_hz = -1", r"call\.sample_rate_hz is -1; give a number above 0"),
         ("[call]\nramp_fraction = 0.6", r"call\.ramp_fraction is 0\.6; give a number from 0 to 0\.5"),
-        ("[recording]\npdm_rate_hz = 0", r"recording\.pdm_rate_hz is 0; give a number from 1000 to 1e\+09"),
+        ("[recording]\nsample_rate_hz = 0", r"recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
         ("[recording]\nn_samples = 0", r"recording\.n_samples is 0; give a whole number from 1 to 268435456"),
         ("[processing]\nmethod = 'slow'", r"s, line 2, processing\.method: Invalid enum value 'slow'"),
         ("[processing]\ndecimation = 0", r"processing\.decimation is 0; give a whole number from 1 to 1000"),
@@ -290,3 +292,27 @@ def test_range_decimation_without_a_useful_divisor_is_refused():
 def test_microphones_far_away_are_refused():
     with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 40; give a number from -10 to 10"):
         Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))
+
+
+def test_settings_of_older_recordings_are_read():
+    text = Settings().to_toml()
+    assert "pdm_rate_hz" not in text
+    former = text.replace("sample_rate_hz = 4500000.0", "pdm_rate_hz = 1125000.0")
+    assert Settings.from_toml(former).recording.sample_rate_hz == 1_125_000
+
+
+def test_files_that_settings_name_are_beside_them(tmp_path, monkeypatch):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "line.csv").write_text("0, 0\n10, 0\n")
+    (folder / "two.csv").write_text("-10, 0\n10, 0\n")
+    (folder / "s.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "two.csv"\n')
+    monkeypatch.chdir(tmp_path)
+    found = Settings.load("mine/s.toml")
+    assert found.array.layout == str(Path("mine/line.csv"))
+    assert len(microphones(found.array).enabled) == len(direction_grid(found.processing)) == 2
+    (folder / "s.toml").write_text(f'[array]\nlayout = "{folder / "line.csv"}"\n')
+    assert Settings.load("mine/s.toml").array.layout == str(folder / "line.csv")
+    (folder / "s.toml").write_text('[array]\nlayout = "uRTIS_v1"\n[processing]\ndirections = "90"\n')
+    named = Settings(array=Array(layout="uRTIS_v1"), processing=Processing(directions="90"))
+    assert Settings.load("mine/s.toml") == named

@@ -248,7 +248,7 @@ def test_half_a_command_that_a_crashed_program_left(device):
 
 
 def test_everything_is_told(device, caplog):
-    setup = Setup.of(SETTINGS.replace(recording=Recording(n_samples=65_536, pdm_rate_hz=1_125_000.0)), emissions=3)
+    setup = Setup.of(SETTINGS.replace(recording=Recording(n_samples=65_536, sample_rate_hz=1_125_000.0)), emissions=3)
     with Sonar.open("left") as sonar:
         assert device.registers.armed == 0
         caplog.set_level("INFO", "ertis_numba")

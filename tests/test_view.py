@@ -1,44 +1,27 @@
-"""What the live view draws, without a browser: pictures, points, what is fused, and what comes of a file or a node."""
+"""What the live view draws, without a browser: pictures, points, and what is fused."""
 
 import io
-import json
+import itertools
 import math
-import re
-import socket
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import plyfile
 import pytest
-import viser
-from click.testing import CliRunner
-from ertis_cli.main import cli
 from PIL import Image
-from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
 
-from ertis_numba.errors import ArgumentError, NetworkError
-from ertis_numba.frames import Stamp
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Air, Processing
-from ertis_numba.storage import open_recording, write_energyscapes, write_recording
-from ertis_numba.viewer import COLOURS, Choices, Dome, Film, Live, Polar, Pose, Scene, Sector, Taken, View
+from ertis_numba.settings import Processing
+from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, Scene, Sector, Taken, _axes
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._choices import colour_table
-from ertis_numba.viewer._page import Order
 from ertis_numba.viewer._polar import cropped
 from ertis_numba.viewer._saving import picture_png, points_ply
-from tests.files import SMALL, image, noise
-from tests.pages import ROOT, commands_in, run, run_here
-from tests.publishing import Publisher
-from tests.publishing import image as published
+from tests.files import image
+from tests.views import TABLE, brightest, spot, taken
 
-TABLE = colour_table("inferno")
 TURNED = Pose((1.0, 2.0, 0.5), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # to the left
-PATIENCE_S = 20.0
 
 
 def solid():
@@ -58,34 +41,6 @@ IMAGES = {
     "many ranges": image(range_m=np.linspace(0.2, 40.0, 4001)),
     "one range": image(range_m=[1.0]),
 }
-
-
-def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp):
-    """An image with one reflector, soft enough to lie between directions and ranges."""
-    made = image(np.linspace(-90, 90, 91))
-    across = (np.degrees(made.azimuth_rad) - azimuth_deg) / 4
-    along = (made.range_m - range_m) / 0.03
-    energy = made.energy * 0.01 + (level * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
-    return made.replace(energy=energy.astype(np.float32), stamp=Stamp(sensor=sensor, sequence=sequence, **stamp))
-
-
-def taken(made, pose=None, time_s=0.0):
-    return Taken(made, pose or Pose(), time_s)
-
-
-def brightest(picture):
-    """The middle of the pixels of the highest level, but for those of the scale below: x, y."""
-    away = np.abs(picture.astype(int) - TABLE[255].astype(int)).sum(axis=2)
-    rows, columns = np.nonzero(away <= away.min() + 6)
-    return columns.mean() + 0.5, rows.mean() + 0.5
-
-
-def wait_for(reached):
-    end_s = time.monotonic() + PATIENCE_S
-    while not (found := reached()):
-        assert time.monotonic() < end_s, "it did not come"
-        time.sleep(0)
-    return found
 
 
 @pytest.mark.parametrize("name", IMAGES)
@@ -122,6 +77,22 @@ def test_rings_and_rays_are_where_they_say():
         assert [is_lit(azimuth_deg, range_m) for range_m in (1, 1.5, 2, 2.5, 3, 3.5, 4)] == [True, False] * 3 + [True]
     for range_m in (1.3, 2.6, 3.4):
         assert [is_lit(ray, range_m) for ray in (-60, -45, -30, -15, 0, 15, 30, 45, 60)] == [True, False] * 4 + [True]
+
+
+@pytest.mark.parametrize("half_deg", [5, 45, 60, 90, 135, 180])
+@pytest.mark.parametrize("range_m", [(0.0, 0.3), (0.5, 5.0), (2.0, 2.5), (3.0, 3.004), (4.9995, 5.0), (12.0, 12.0006)])
+def test_no_names_overlap(half_deg, range_m, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(_axes, "_ink", drawn.append)
+    fan_rad = np.radians([-half_deg, 0, half_deg])
+    place = _axes.Place.of(fan_rad, range_m, 640)
+    _axes.draw_axes(place, fan_rad, range_m, 40.0)
+    names = [text for text in drawn[0].axes[0].texts if text.get_text()]
+    assert sum(text.get_text().endswith(" m") for text in names) >= 1
+    boxes = [text.get_window_extent() for text in names]
+    for one, other in itertools.combinations(range(len(boxes)), 2):
+        assert not boxes[one].overlaps(boxes[other]), (names[one].get_text(), names[other].get_text())
+    assert all(box.x0 >= 0 and box.x1 <= place.width_px for box in boxes)
 
 
 def test_levels_are_those_below_the_strongest():
@@ -168,8 +139,8 @@ def test_points_stay_and_fade():
     assert (len(latest.position_m), latest.n_points) == (1, 1)
     fading = scene.draw(Choices(decay_s=0.25)).sensors["front"]
     assert (len(fading.position_m), fading.n_points) == (3, 1)
-    brightness = fading.colours.astype(int).sum(axis=1)
-    np.testing.assert_allclose(brightness / brightness[-1], [0.2, 0.6, 1.0], atol=0.02)
+    np.testing.assert_allclose(fading.share_left, [0.2, 0.6, 1.0], atol=0.02)
+    assert len(np.unique(fading.colours, axis=0)) == 1  # a point that was dark would hide what it lies on
     scene.take(taken(spot(50, 2.0), time_s=0.1))  # the film begins anew
     assert len(scene.draw(Choices(decay_s=10)).sensors["front"].position_m) == 2
 
@@ -226,83 +197,44 @@ def test_files_hold_what_is_drawn():
     last = frame.sensors["other"].picture
     np.testing.assert_array_equal(picture[-last.shape[0] :, : last.shape[1]], last)
     assert len(picture) > sum(each.picture.shape[0] for each in frame.sensors.values())
-    vertex = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(choices), choices)))["vertex"]
+    vertex = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(choices))))["vertex"]
     stored = np.stack([vertex[axis] for axis in "xyz"], axis=1)
     drawn = np.concatenate([each.position_m for each in frame.sensors.values()])
     np.testing.assert_allclose(stored, drawn, atol=1e-5)
 
 
-def stamped(count, *, sensors=("front",), step_s=0.05):
-    return [
-        spot(0, 1.0 + number, sensor=name, sequence=number, timestamp_ns=round(1e18 + number * step_s * 1e9) + index)
-        for number in range(count)
-        for index, name in enumerate(sensors)
-    ]
+def test_the_points_that_are_saved_are_those_that_are_drawn():
+    """Also where the strongest of the image lies beyond the window, and between directions."""
+    rng = np.random.default_rng(5)
+    noisy = image(np.linspace(-90, 90, 91))
+    energy = rng.rayleigh(0.05, noisy.energy.shape).astype(np.float32) + spot(11.3, 1.507).energy
+    scene = Scene()
+    scene.take(taken(noisy.replace(energy=energy), TURNED))
+    for choices in (Choices(threshold_db=-12), Choices(threshold_db=-18, range_m=(1.5, 4.0))):
+        drawn = scene.draw(choices).sensors["sensor"]
+        vertex = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(choices))))["vertex"]
+        stored = np.stack([vertex[axis] for axis in "xyz"], axis=1)
+        assert len(stored) == drawn.n_points > 3
+        np.testing.assert_allclose(stored, drawn.position_m, atol=1e-5)
+        assert np.isfinite(vertex["uncertainty_range"]).all()
 
 
-def test_a_film_shows_all_sensors_of_a_moment_together(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(3, sensors=("front", "left")))
-    with Film(path) as film:
-        assert [moment.time_s for moment in film.moments] == pytest.approx([0, 0.05, 0.1])
-        assert film.moments[1].measurements == (("front", 1), ("left", 1))
-        assert [each.image.stamp.sensor for each in film.at(2)] == ["front", "left"]
-    with Film(path, sensors=["left"]) as film:
-        assert film.moments[2].measurements == (("left", 2),)
-
-
-def test_a_film_plays_pauses_and_steps(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(4))
-    with Film(path) as film:
-        film.play(playing=False)
-        film.seek(2)
-        (shown,) = wait_for(film.take)
-        assert (shown.image.stamp.sequence, film.shown, film.playing) == (2, 2, False)
-        film.play(playing=True)
-        seen = [shown]
-        begun_s = time.monotonic()
-        while film.playing or seen[-1].image.stamp.sequence != 3:
-            seen += film.take()
-            assert time.monotonic() - begun_s < PATIENCE_S
-        assert time.monotonic() - begun_s > 0.045
-        film.play(playing=True)
-        assert wait_for(film.take)[0].image.stamp.sequence == 0
-        film.seek(99)
-        assert wait_for(lambda: film.take() and film.shown == 3)
-
-
-def test_a_film_without_times_has_its_own(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", [each.replace(stamp=Stamp()) for each in stamped(3)])
-    with Film(path) as film:
-        assert [moment.time_s for moment in film.moments] == pytest.approx([0, 0.1, 0.2])
-
-
-def test_recordings_are_processed_with_their_own_settings_and_air(tmp_path):
-    first, second, _ = noise(SMALL)
-    second = replace(second, settings=SMALL.replace(air=Air(temperature_c=5.0)))
-    mounting = {"eRTIS-7": (TURNED.translation_m, TURNED.rotation_xyzw)}
-    path = write_recording(tmp_path / "rec.h5", [first, second], mounting=mounting)
-    with open_recording(path) as recording:
-        wanted = [Pipeline(each.settings, device="cpu").process(each) for each in recording]
-    with Film(path, device="cpu") as film:
-        for place, each in enumerate(wanted):
-            (shown,) = film.at(place)
-            np.testing.assert_array_equal(shown.image.energy, each.energy)
-            np.testing.assert_array_equal(shown.image.range_m, each.range_m)
-            assert shown.pose.translation_m == TURNED.translation_m
-
-
-def test_the_latest_of_each_sensor_is_shown_and_others_are_counted():
-    sent = [published(number, sensor=name) for number in range(5) for name in ("front", "left")]
-    with Publisher() as publisher, publisher.playing(sent), Live(publisher.address) as live:
-        wait_for(lambda: live.received == len(sent))
-        shown = wait_for(live.take)
-        assert sorted((each.image.stamp.sensor, each.image.stamp.sequence) for each in shown) == [
-            ("front", 4),
-            ("left", 4),
-        ]
-        assert (live.skipped, live.dropped, live.take()) == (8, 0, [])
-        assert shown[0].pose.translation_m == Publisher.translation_m
-        assert live.latency_s(shown) == pytest.approx(time.time() - 1_700_000_000.4, abs=5)
+def test_nothing_is_drawn_beyond_the_image():
+    scene = Scene()
+    poses = {"a": Pose((0.0, 0.3, 0.0)), "b": Pose((0.0, -0.3, 0.0))}
+    for name, pose in poses.items():
+        scene.take(taken(spot(0, 2.0, sensor=name), pose))
+    whole, beyond = scene.draw(Choices()), scene.draw(Choices(range_m=(100.0, 200.0)))
+    assert beyond.fused is None
+    assert beyond.range_m == whole.range_m == 5.0
+    for name, drawn in beyond.sensors.items():
+        assert (drawn.shape, drawn.n_points, len(drawn.position_m)) == (None, 0, 0)
+        assert drawn.picture.shape == whole.sensors[name].picture.shape
+        assert (drawn.picture == PAGE).all(axis=2).mean() > 0.95
+        assert (drawn.picture != PAGE).any()  # it says why
+    other = scene.draw(Choices(range_m=(300.0, 400.0))).sensors["a"].picture
+    assert not np.array_equal(other, beyond.sensors["a"].picture)
+    np.testing.assert_array_equal(scene.draw(Choices()).sensors["a"].picture, whole.sensors["a"].picture)
 
 
 @pytest.mark.parametrize(
@@ -327,119 +259,86 @@ def test_pictures_that_cannot_be():
         Polar(image(range_m=[0.0]))
 
 
-def test_a_port_that_is_taken_is_refused(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with socket.socket() as other, Film(path) as film:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        with pytest.raises(NetworkError, match=r"nothing can be served at 127.0.0.1:\d+ .*; give another host or port"):
-            View(film, port=other.getsockname()[1])
-    with Film(path) as film, pytest.raises(NetworkError, match=r"nothing can be served at 203\.0\.113\.1"):
-        View(film, host="203.0.113.1", port=0)
+def seen(frame, name):
+    drawn = frame.sensors[name]
+    return len(drawn.position_m), drawn.overdue
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("missing.h5",), "missing.h5"),
-        (("IMG", "--sensor", "back"), "back"),
-        (("IMG", "--key", "viewer"), "--key is for an address, and a file is given"),
-        (("IMG", "--threshold", "5"), "threshold_db is 5"),
-        (("IMG", "--save-html", "IMG"), "exists"),
-        (("IMG", "--duration", "0"), "--duration is 0; give a number above 0"),
-        (("tcp://0.0.0.0:5602",), "keys"),
-    ],
-)
-def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, told):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    done = CliRunner().invoke(cli, ["view", *(str(path) if word == "IMG" else word for word in arguments)])
-    assert done.exit_code != 0
-    assert told in f"{done.stderr} {done.exception}"
+def test_points_fade_with_time_and_not_with_images():
+    scene = Scene()
+    scene.take(taken(spot(0, 2.0), time_s=10.0))
+    bright = scene.draw(Choices(decay_s=0.5), 10.0)
+    dim = scene.draw(Choices(decay_s=0.5), 10.25)
+    assert (bright.sensors["front"].share_left.tolist(), dim.sensors["front"].share_left.tolist()) == ([1.0], [0.5])
+    assert dim.until_s <= 10.25  # it is not right for any longer
+    gone = scene.draw(Choices(decay_s=0.5), 10.5)
+    assert (len(gone.sensors["front"].position_m), gone.sensors["front"].n_points) == (0, 0)
+    assert gone.until_s == 20.0  # when the sensor is overdue
+    assert len(scene.draw(Choices(), 10.5).sensors["front"].position_m) == 1
 
 
-def test_pages_of_other_sites_are_refused(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with Film(path) as film, View(film, port=0) as view:
-        address = view.url.replace("http", "ws", 1)
-
-        def ask(origin):
-            return connect(address, origin=origin, subprotocols=[f"viser-v{viser.__version__}"])
-
-        for origin in ("http://example.org", "http://127.0.0.1.example.org:8080", "null"):
-            with pytest.raises(InvalidStatus, match="403"):
-                ask(origin)
-        for origin in (view.url.rstrip("/"), "http://localhost:9", None):
-            with ask(origin) as connection:
-                assert connection.recv(timeout=PATIENCE_S)
-
-
-class Client:
-    """A browser that asks for a file."""
-
-    def __init__(self):
-        self.files, self.notices = [], []
-
-    def send_file_download(self, name, content, *, save_immediately):
-        assert save_immediately
-        self.files.append((name, content))
-
-    def add_notification(self, title, body, **_):
-        self.notices.append((title, body))
+@pytest.mark.parametrize(("interval_s", "due_s"), [(None, 10.0), (0.05, 1.0), (2.0, 6.0)])
+def test_who_is_silent_is_overdue_by_what_is_usual_of_it(interval_s, due_s):
+    scene = Scene()
+    scene.take(taken(spot(0, 2.0), time_s=10.0, interval_s=interval_s))
+    timely = scene.draw(Choices(), 10.0 + due_s - 0.01)
+    assert (timely.sensors["front"].overdue, timely.until_s) == (False, 10.0 + due_s)
+    late = scene.draw(Choices(), 10.0 + due_s)
+    assert (late.sensors["front"].overdue, late.until_s) == (True, math.inf)
+    before, after = timely.sensors["front"], late.sensors["front"]
+    assert (before.picture == TABLE[255]).all(axis=2).any()
+    assert not (after.picture == TABLE[255]).all(axis=2).any()
+    assert after.picture.sum(dtype=int) < before.picture.sum(dtype=int)
+    assert 2 * after.colours.astype(int).max() < before.colours.max()
 
 
-def test_what_cannot_be_saved_or_chosen_is_told_and_the_view_goes_on(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", [spot(0, 2.0, timestamp_ns=3 * 10**18)])
-    client = Client()
-    with Film(path) as film, View(film, port=0) as view:
-        orders = [Order("threshold_db", 7.0), Order("points", client=client), Order("picture", client=client)]
-        wait_for(lambda: view.run(duration_s=0.05) or view.shown)
-        for order in orders:
-            view._orders.put(order)  # noqa: SLF001  as a browser does
-        view.run(duration_s=0.2)
-        assert view.choices == Choices()
-    ((title, body),) = client.notices
-    assert title == "Nothing is saved"
-    assert "wanted one from 1970 to 2038" in body
-    ((name, content),) = client.files
-    assert (name, content[:4]) == ("img.png", b"\x89PNG")
+def test_who_is_overdue_is_no_part_of_what_is_fused():
+    scene = Scene()
+    places = {"front": Pose((0.3, 0.0, 0.0)), "left": Pose((0.0, 0.3, 0.0)), "right": Pose((0.0, -0.3, 0.0))}
+    for name, pose in places.items():
+        scene.take(taken(spot(0, 2.0, sensor=name), pose))
+    whole = scene.draw(Choices())
+    for name in ("front", "right"):
+        scene.take(taken(spot(0, 2.0, sensor=name, level=1e-9), places[name], time_s=3600.0))
+    frame = scene.draw(Choices())
+    assert [seen(frame, name)[1] for name in sorted(places)] == [False, True, False]
+    assert frame.fused is not None
+    assert whole.fused.extent_m != frame.fused.extent_m  # only of the two that are there
+    assert [drawn.shape is None for _, drawn in sorted(frame.sensors.items())] == [True, False, True]
+    assert frame.sensors["left"].shape.colours[..., :3].max() < 100
+    scene.take(taken(spot(0, 2.0, sensor="right"), places["right"], time_s=7200.0))
+    assert scene.draw(Choices()).fused is None  # of one alone
+    scene.take(taken(spot(0, 2.0, sensor="left"), places["left"], time_s=7200.0))
+    assert scene.draw(Choices()).fused is not None
 
 
-def test_without_viser_there_is_a_line_that_says_what_to_install(tmp_path, monkeypatch):
-    for name in ("_view", "_page", "_space"):
-        monkeypatch.delitem(sys.modules, f"ertis_numba.viewer.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    done = CliRunner().invoke(cli, ["view", str(path)])
-    assert done.exit_code == 1
-    assert done.stderr.splitlines() == ["ertis: error: viser is not installed; pip install 'ertis-numba[view]'"]
+def test_what_stays_the_same_is_not_drawn_again():
+    scene = Scene()
+    for name in ("front", "left"):
+        scene.take(taken(spot(0, 2.0, sensor=name)))
+    choices = Choices(decay_s=1.0)
+    first, second = scene.draw(choices, 0.1), scene.draw(choices, 0.2)
+    assert first.fused is second.fused
+    assert first.sensors["left"].picture is second.sensors["left"].picture
+    assert first.sensors["left"].share_left.sum() > second.sensors["left"].share_left.sum()
+    other = scene.draw(Choices(decay_s=1.0, colours="viridis"), 0.2)
+    assert other.fused is not first.fused
+    assert not np.array_equal(other.sensors["left"].picture, first.sensors["left"].picture)
 
 
-def test_a_recording_as_a_page_of_its_own(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(3))
-    page = tmp_path / "page.html"
-    done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page)])
-    assert done.exit_code == 0, (done.stderr, done.exception)
-    assert done.stderr.splitlines() == [f"{page}: 3 frames of {path}"]
-    text = page.read_text()
-    assert "__VISER_EMBED_DATA__" in text
-    assert len(text) > 500_000
-
-
-def test_the_page_on_the_view(tmp_path):
-    (tmp_path / "data").symlink_to(ROOT / "data")
-    write_energyscapes(tmp_path / "IMG.h5", stamped(3))
-    text = (ROOT / "docs" / "view.md").read_text()
-    commands = [command for command in commands_in(text) if command.startswith("view ")]
-    assert len(commands) == 4
-    with Publisher() as publisher, publisher.playing([]):
-        for command in commands:
-            words = command.replace("tcp://127.0.0.1:5602", publisher.address)
-            if "--save-html" in words:
-                run_here(tmp_path, words)
-            else:
-                told = json.loads(run_here(tmp_path, f"{words} --port 0 --no-open --json --duration 0.2"))
-                assert told["source"] == words.split()[1]
-    assert (tmp_path / "PAGE.html").stat().st_size > 500_000
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    done = run(tmp_path, sys.executable, "-W", "error", "-c", code)
-    assert done.stdout.startswith("http://127.0.0.1:")
+def test_sensors_whose_places_nobody_knows_have_no_platform():
+    scene = Scene()
+    scene.take(Taken(spot(-40, 1.5), None, 0.0))
+    alone = scene.draw(Choices()).sensors["front"]
+    assert (alone.pose, len(alone.position_m)) == (Pose(), 1)
+    assert isinstance(alone.shape, Sector)
+    comments = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(Choices())))).comments
+    assert "frame front" in comments
+    scene.take(Taken(spot(20, 3.5, sensor="left"), None, 0.0))
+    frame = scene.draw(Choices())
+    assert frame.fused is None
+    for drawn in frame.sensors.values():
+        assert (drawn.pose, drawn.shape, len(drawn.position_m), drawn.n_points) == (None, None, 0, 1)
+        assert (drawn.picture == TABLE[255]).all(axis=2).any()
+    with pytest.raises(ArgumentError, match="where sensors front, left are on their platform is not known"):
+        points_ply(scene.latest(Choices()))

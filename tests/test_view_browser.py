@@ -203,8 +203,9 @@ def test_a_higher_threshold_leaves_fewer_points(film):
 
 
 def test_the_window_of_ranges_moves_the_axes(film):
-    thumb = film.control("Range (m)").locator(".multi-slider-thumb").last
-    box, track = thumb.bounding_box(), film.control("Range (m)").locator(".multi-slider-track").bounding_box()
+    slider = film.control(re.compile("^Range"))
+    thumb = slider.locator(".multi-slider-thumb").last
+    box, track = thumb.bounding_box(), slider.locator(".multi-slider-track").bounding_box()
     y = box["y"] + box["height"] / 2
     film.page.mouse.move(box["x"] + box["width"] / 2, y)
     film.page.mouse.down()
@@ -351,3 +352,22 @@ def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
         assert process.wait(TIMEOUT_S) == 0, process.stderr.read()
         assert time.monotonic() - begun_s < 1
         live.close()
+
+
+def test_each_browser_has_a_recording_of_its_own(film, browser):
+    other = Page(browser, film.page.url)
+    begin, end = (
+        other.page.get_by_role("button", name=f"{word} HTML recording", exact=True) for word in ("Begin", "End")
+    )
+    other.page.get_by_text("at most 256 MB", exact=True).wait_for()
+    film.press("Begin HTML recording")
+    film.page.get_by_text(re.compile(r"^\d+\.\d MB, at most 256 MB$")).wait_for()
+    begin.wait_for()
+    assert end.count() == 0
+    begin.click()
+    end.wait_for()
+    recording, _ = film.saved("End HTML recording")
+    assert b"__VISER_EMBED_DATA__" in recording
+    film.page.get_by_role("button", name="Begin HTML recording", exact=True).wait_for()
+    assert end.count() == 1
+    other.close()

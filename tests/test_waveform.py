@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -150,33 +151,35 @@ def test_matched_filter_scales_with_the_echo_and_nothing_else():
 
 
 @settings(max_examples=60, deadline=None)
-@given(decimation=st.integers(1, 40), share=st.floats(0.05, 0.97), pdm_rate_hz=st.floats(1e5, 1e7))
-def test_decimation_filter_keeps_its_promises(decimation, share, pdm_rate_hz):
-    rate_hz = pdm_rate_hz / decimation
+@given(decimation=st.integers(1, 40), share=st.floats(0.05, 0.97), sample_rate_hz=st.floats(1e5, 1e7))
+def test_decimation_filter_keeps_its_promises(decimation, share, sample_rate_hz):
+    rate_hz = sample_rate_hz / decimation
     pass_hz = share * rate_hz / 2
-    taps = decimation_taps(pdm_rate_hz=pdm_rate_hz, decimation=decimation, pass_hz=pass_hz)
+    taps = decimation_taps(sample_rate_hz=sample_rate_hz, decimation=decimation, pass_hz=pass_hz)
     assume(len(taps) < 6000)
     assert taps.sum() == pytest.approx(1)
     assert_allclose(taps, taps[::-1], atol=1e-15)
     assert (len(taps) - 1) % (2 * decimation) == 0  # the group delay is whole in samples of either rate
-    passed = filter_response(taps, np.linspace(0, pass_hz, 200) / pdm_rate_hz)
+    passed = filter_response(taps, np.linspace(0, pass_hz, 200) / sample_rate_hz)
     assert_allclose(passed, 1, atol=2e-3)
     for image in range(1, decimation // 2 + 1):  # whatever folds onto 0 … pass_hz
-        folding_hz = np.linspace(image * rate_hz - pass_hz, min(image * rate_hz + pass_hz, pdm_rate_hz / 2), 100)
-        gain_db = 20 * np.log10(np.abs(filter_response(taps, folding_hz / pdm_rate_hz)).max() + 1e-12)
+        folding_hz = np.linspace(image * rate_hz - pass_hz, min(image * rate_hz + pass_hz, sample_rate_hz / 2), 100)
+        gain_db = 20 * np.log10(np.abs(filter_response(taps, folding_hz / sample_rate_hz)).max() + 1e-12)
         assert gain_db < -59.4
 
 
 def test_decimation_filter_of_the_default_measurement():
     made = Settings()
-    taps = decimation_taps(pdm_rate_hz=made.recording.pdm_rate_hz, decimation=10, pass_hz=matched_band_hz(made.call)[1])
+    taps = decimation_taps(
+        sample_rate_hz=made.recording.sample_rate_hz, decimation=10, pass_hz=matched_band_hz(made.call)[1]
+    )
     assert len(taps) == 61
     folding = filter_response(taps, np.linspace(395e3, 505e3, 500) / 4.5e6)
     assert 20 * np.log10(np.abs(folding).max()) < -60
 
 
 def test_filter_response_is_that_of_the_taps():
-    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=10, pass_hz=85e3)
+    taps = decimation_taps(sample_rate_hz=4.5e6, decimation=10, pass_hz=85e3)
     frequency = np.linspace(0, 0.5, 64)
     half = (len(taps) - 1) / 2
     spectrum = np.exp(-2j * np.pi * np.outer(frequency, np.arange(len(taps)))) @ taps
@@ -187,13 +190,13 @@ def test_filter_response_is_that_of_the_taps():
 def test_decimation_that_leaves_too_little_is_refused(decimation):
     rate_hz = 4.5e6 / decimation
     with pytest.raises(ArgumentError, match=f"decimation {decimation} leaves {rate_hz:g} Hz, too little.*lower it"):
-        decimation_taps(pdm_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
+        decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
 
 
 @settings(max_examples=60, deadline=None)
 @given(decimation=st.integers(1, 100), share=st.floats(0.05, 0.5))
 def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
-    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=decimation, pass_hz=share * 4.5e6 / decimation / 2)
+    taps = decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=share * 4.5e6 / decimation / 2)
     whole = whole_taps(taps)
     assert whole.dtype == np.int16
     assert np.abs(whole.astype(int)).sum() <= 32_767
@@ -202,8 +205,27 @@ def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
 
 
 def test_taps_too_many_for_16_bits_are_refused():
-    taps = decimation_taps(pdm_rate_hz=4.5e6, decimation=500, pass_hz=0.8 * 4500)
+    taps = decimation_taps(sample_rate_hz=4.5e6, decimation=500, pass_hz=0.8 * 4500)
     with pytest.raises(ArgumentError, match=r"decimation filter of \d+ taps is too long for 16 bits .* smaller"):
         whole_taps(taps)
     with pytest.raises(ArgumentError, match="too long for 16 bits"):
         whole_taps(np.full(70_001, 1 / 70_001))
+
+
+@pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
+@pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (20e3, 80e3)])
+def test_frequency_goes_as_the_modulation_says(modulation, start_hz, stop_hz):
+    """The instantaneous frequency of the samples, by a quarter of them, against the definition."""
+    call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation, ramp_fraction=0.0)
+    rate_hz = 10e6
+    analytic = scipy.signal.hilbert(call_samples(call, rate_hz=rate_hz))
+    found_hz = np.diff(np.unwrap(np.angle(analytic))) * rate_hz / 2 / np.pi
+    share = (np.arange(len(found_hz)) + 0.5) / len(found_hz)
+    wanted_hz = (
+        start_hz + share * (stop_hz - start_hz)
+        if modulation == "linear"
+        else 1 / (1 / start_hz + share * (1 / stop_hz - 1 / start_hz))
+    )
+    middle = slice(len(share) // 8, -len(share) // 8)
+    assert np.median(np.abs(found_hz[middle] / wanted_hz[middle] - 1)) < 0.005
+    assert np.abs(np.mean(found_hz[middle] - wanted_hz[middle])) < 100

@@ -80,7 +80,7 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     """Pull the plug at random moments, also within a measurement, and tell how long it took to be back."""
     random_ = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     target = folder / "unplugs.h5"
-    moments, at_s = [], 2.0
+    moments, at_s = [], 5.0  # seconds that a busy machine takes to begin the capture
     for _ in range(count):
         at_s += random_.uniform(1.0, 2.0)
         away_s = random_.uniform(0.2, 1.0)

@@ -47,7 +47,7 @@ def _exact(image: Energyscape, measurement: Measurement, chosen: NDArray[np.intp
     """Return the exact envelopes of some directions: (direction, range) float64."""
     settings = measurement.settings
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
-    rate_hz = settings.recording.pdm_rate_hz
+    rate_hz = settings.recording.sample_rate_hz
     n_fft = scipy.fft.next_fast_len(
         settings.recording.n_samples + math.ceil(2 * settings.call.duration_s * rate_hz), real=True
     )

@@ -17,7 +17,7 @@ from ertis_bench import checks, machine, subject
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_numba import cluster
-from ertis_numba.campaign import Begun, Campaign, Ended, Wanted, find
+from ertis_numba.campaign import Begun, Campaign, Ended, Options, find
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
@@ -117,16 +117,26 @@ def _measured(
                 _require_exact(folder, Path(target))
                 wanted = files
         if files != wanted:
-            others = sorted(each for each in files | wanted if files.get(each) != wanted.get(each))
-            raise DataError(f"{name} made other files than 1 worker of 1 thread ({', '.join(others)}); do not trust it")
+            others = ", ".join(_differences(files, wanted))
+            raise DataError(f"{name} made other files than 1 worker of 1 thread ({others}); do not trust it")
         if turn:  # files and kernels come from memory from now on
             times_s[name].append(took_s)
     return times_s
 
 
+def _differences(files: dict[str, bytes], wanted: dict[str, bytes]) -> Iterator[str]:
+    """Yield how each file that differs does, by which whoever looks for the reason can begin."""
+    for name in sorted(files | wanted):
+        one, other = (np.frombuffer(each.get(name, b""), np.uint8) for each in (files, wanted))
+        if len(one) != len(other):
+            yield f"{name}: {len(one)} bytes for {len(other)}"
+        elif (places := np.flatnonzero(one != other)).size:
+            yield f"{name}: {places.size} of {len(one)} bytes, from {places[0]} to {places[-1]}"
+
+
 def _timed(folder: Path, target: Path, *, threads: int | None = None, **crew: Any) -> tuple[float, float]:
     begin_s = first_s = time.perf_counter()
-    for event in Campaign(find([folder]), target, Wanted(threads=threads), **crew).run():
+    for event in Campaign(find([folder]), target, Options(threads=threads), **crew).run():
         if isinstance(event, Begun) and first_s == begin_s:
             first_s = time.perf_counter()
         if isinstance(event, Ended) and event.outcome != "made":

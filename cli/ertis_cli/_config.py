@@ -3,18 +3,33 @@
 import difflib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import click
 
-__all__ = ["add_variables", "config", "origin", "variable"]
+__all__ = [
+    "add_variables",
+    "config",
+    "instead",
+    "long_name",
+    "origin",
+    "require_config",
+    "typed",
+    "unknown_variables",
+    "variable",
+]
 
 _GENERAL = frozenset({"device", "quiet", "threads"})
 """Options that mean the same in every command: ``ERTIS_THREADS`` is of all."""
 
-_FILE = "ertis_cli.config_file"  # key of click's `Context.meta`
+_NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
+"""What others of this package read, and what its benchmark knows its processes by."""
+
+_FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`
+_WITHOUT = frozenset({"completion", "doctor"})
+"""What runs where the configuration is at fault: every new shell asks for the one, whoever is at a loss the other."""
 
 
 def variable(path: Iterable[str], option: str) -> str:
@@ -40,23 +55,70 @@ def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
             add_variables(each, (*path, name))
 
 
+def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
+    """Yield a line for each variable that begins like those of commands and is of none, with the one that may be meant.
+
+    Others' may begin so, too: those of a service in a cluster are named after it.
+    """
+    # Commands are imported only where a variable begins like one of theirs.
+    commands = {variable((name,), ""): name for name in group.list_commands(ctx)}
+    general = {variable((), option) for option in _GENERAL}
+    for name in sorted(os.environ):
+        if not name.startswith("ERTIS_") or name in general | _NO_OPTIONS:
+            continue
+        prefix = "_".join(name.split("_")[:2]) + "_"
+        near = difflib.get_close_matches(prefix, commands, n=1)
+        command = group.get_command(ctx, commands[near[0]]) if near else None
+        known = general | _NO_OPTIONS | set(_variables(command) if command else ())
+        if name not in known:
+            close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.8)
+            meant = f"did you mean {close[0]!r}?" if close else "unset it if nobody needs it"
+            yield f"the variable {name} is known to no command; {meant}"
+
+
+def _variables(command: click.Command) -> Iterator[str]:
+    """Yield the variables of a command, and of those in it."""
+    for option in _options(command).values():
+        yield from [option.envvar] if isinstance(option.envvar, str) else option.envvar or ()
+    if isinstance(command, click.Group):
+        for each in command.commands.values():
+            yield from _variables(each)
+
+
 def _options(command: click.Command) -> dict[str, click.Option]:
     """Return options by their long names without dashes."""
     return {
-        _long_name(parameter): parameter
+        long_name(parameter): parameter
         for parameter in command.params
         if isinstance(parameter, click.Option) and parameter.expose_value
     }
 
 
-def _long_name(option: click.Option) -> str:
+def long_name(option: click.Option) -> str:
+    """Return the name of an option that says most, without dashes."""
     return max(option.opts, key=len).lstrip("-")
 
 
 def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
-    """Take the defaults of all commands from a file."""
-    if path is None:
-        return
+    """Take the defaults of all commands from a file; whoever needs them is told what is wrong with it."""
+    if path is not None:
+        try:
+            _take(ctx, path)
+        except click.ClickException as error:
+            ctx.meta[_BROKEN] = error
+
+
+def require_config(ctx: click.Context) -> str:
+    """Refuse to go on without the file of `config`; return what is wrong with it for commands that need none."""
+    error: click.ClickException | None = ctx.meta.get(_BROKEN)
+    if error is None:
+        return ""
+    if ctx.invoked_subcommand not in _WITHOUT:
+        raise error
+    return error.format_message()
+
+
+def _take(ctx: click.Context, path: Path) -> None:
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
@@ -73,7 +135,7 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
     for name, table in tables.items():
         command = group.get_command(ctx, name)
         if command is None:
-            raise click.ClickException(f"{where}{name!r} is no command; {_instead(name, names)}")
+            raise click.ClickException(f"{where}{name!r} is no command; {instead(name, names)}")
         if not isinstance(table, dict):
             raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, as in [{name}]")
         if isinstance(command, click.Group):
@@ -82,7 +144,7 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
         options = _options(command)
         for key in table:
             if key not in options:
-                raise click.ClickException(f"{where}{name} has no option {key!r}; {_instead(key, options)}")
+                raise click.ClickException(f"{where}{name} has no option {key!r}; {instead(key, options)}")
         found[name] = {str(options[key].name): _value(value) for key, value in table.items()}
     return found
 
@@ -94,10 +156,20 @@ def _value(value: Any) -> Any:
     return value if isinstance(value, bool) else str(value)
 
 
-def _instead(name: str, known: Iterable[str]) -> str:
+def instead(name: str, known: Iterable[str]) -> str:
+    """Return what a name that is not known may mean."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+
+
+def typed(name: str) -> bool:
+    """Return whether an option of the running command was typed, by its Python name.
+
+    A default of the user's own holds where it fits: whoever always wants two workers can still process one recording.
+    """
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
 
 
 def origin(error: click.UsageError) -> str:

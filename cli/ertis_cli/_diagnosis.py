@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,7 +22,16 @@ __all__ = ["CHECKS", "Finding", "State"]
 State = Literal["good", "note", "bad"]
 
 _LIBRARIES: Final = ("numpy", "scipy", "numba", "h5py", "pyserial", "pyzmq", "msgspec", "matplotlib")
-_EXTRAS: Final = {"cluster": "distributed", "metrics": "prometheus_client"}
+_EXTRAS: Final = {
+    "browser": ("playwright",),
+    "cluster": ("distributed",),
+    "metrics": ("prometheus_client",),
+    "ros": ("mcap", "mcap_ros2"),
+    "view": ("viser", "websockets"),
+}
+"""Modules that they bring; a GPU's are looked at with it."""
+
+_RULE: Final = 'KERNEL=="ttyACM*", GROUP="dialout", MODE="0660"'
 _SENSOR_MB_S: Final = 13.1
 """Of a sensor with 20 measurements of 655,360 bytes per second."""
 
@@ -67,8 +77,8 @@ def _versions(_folder: Path) -> Iterator[Finding]:
     yield Finding("libraries", "good", ", ".join(found))
     if missing:
         yield Finding("libraries", "bad", f"{', '.join(missing)} missing", f"pip install {' '.join(missing)}")
-    for extra, module in _EXTRAS.items():
-        there = importlib.util.find_spec(module) is not None
+    for extra, modules in _EXTRAS.items():
+        there = all(importlib.util.find_spec(module) is not None for module in modules)
         yield Finding(
             f"extra {extra}",
             "good" if there else "note",
@@ -164,8 +174,16 @@ def _permission(path: Path) -> str:
         return "end the program that uses it"
     import grp
 
-    group = grp.getgrgid(path.stat().st_gid).gr_name
-    return f"run 'sudo usermod -aG {group} $USER' and log in again"
+    status = path.stat()
+    # The group of root may do much more than that, and one whose members may not read and write is of no use.
+    if status.st_gid and status.st_mode & 0o060 == 0o060 and status.st_gid not in os.getgroups():
+        with suppress(KeyError):
+            return f"run 'sudo usermod -aG {grp.getgrgid(status.st_gid).gr_name} $USER' and log in again"
+    if sys.platform != "linux":
+        return "have its owner let your group read and write it"
+    return (
+        f"as root, write '{_RULE}' into /etc/udev/rules.d/60-ertis.rules, plug it in again and join the group 'dialout'"
+    )
 
 
 def _disk(folder: Path) -> Iterator[Finding]:

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _progress, _tables, options, plans
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
-    from rich.table import Table
 
-    from ertis_numba.campaign import Ended, Event, Wanted
+    from ertis_numba.campaign import Ended, Event, Options
 
 __all__ = ["are_meant", "process_many", "summary"]
 
@@ -39,7 +38,7 @@ def are_meant(paths: Sequence[str], target: str | None) -> bool:
 def process_many(
     paths: Sequence[str],
     target: str | None,
-    wanted: "Wanted",
+    wanted: "Options",
     *,
     workers: int | None,
     scheduler: str | None,
@@ -88,25 +87,16 @@ class _Bars(_Hidden):
     """A bar over all files, and one over the measurements of each that is under way."""
 
     def __init__(self, count: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        # stdout is for whoever reads it, even while there are bars on stderr.
-        self.progress = Progress(
-            *columns, console=Console(file=sys.stderr), redirect_stdout=False, redirect_stderr=False, transient=True
-        )
+        self.progress = _progress.bars()
         self._files = self.progress.add_task("recordings", total=count)
         self._tasks: dict[Path, TaskID] = {}
 
     def follow(self, event: "Event") -> None:
-        from rich.markup import escape
-
         from ertis_numba.campaign import Advanced, Begun
 
         match event:
             case Begun(recording, measurements):
-                self._tasks[recording] = self.progress.add_task(escape(recording.name), total=measurements)
+                self._tasks[recording] = self.progress.add_task(recording.name, total=measurements)
             case Advanced(recording, done):
                 if recording in self._tasks:
                     self.progress.update(self._tasks[recording], completed=done)
@@ -115,17 +105,14 @@ class _Bars(_Hidden):
                     self.progress.remove_task(task)
                 self.progress.advance(self._files)
 
-    def say(self, text: str) -> None:
-        self.progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
 
 @contextmanager
 def _shown(count: int, *, quiet: bool) -> Iterator[_Hidden]:
-    if quiet or not sys.stderr.isatty():
+    if quiet or not _progress.is_drawn_on(sys.stderr):
         yield _Hidden()
         return
     bars = _Bars(count)
-    with bars.progress:
+    with _progress.drawn(bars.progress):
         yield bars
 
 
@@ -149,7 +136,7 @@ class _Report:
         error = _named(event)
         self._totals[event.outcome] += 1
         self._measurements += event.made.get("measurements", 0)
-        for line in _lines(event):
+        for line in _lines(event, told=not self._as_json):
             if not self._quiet:
                 shown.say(line)
         for warning in event.made.get("warnings", ()):
@@ -184,19 +171,15 @@ class _Report:
             )
 
     def _print_table(self, took_s: float) -> None:
-        from rich.console import Console
-
-        console = Console(file=sys.stderr, width=None if sys.stderr.isatty() else 160)
         if self._count <= _MOST_ROWS:
-            console.print(_table([*self._rows.values()]))
+            _table([row for row in self._rows.values() if row]).print(err=True)
         elif self._failed:
             rows = [(path, "failed", "", "") for path in self._failed[:_MOST_FAILED]]
             more = len(self._failed) - len(rows)
-            console.print(_table(rows + ([(f"… and {more} more", "failed", "", "")] if more else [])))
+            _table(rows + ([(f"… and {more} more", "failed", "", "")] if more else [])).print(err=True)
         counts = ", ".join(f"{count} {name}" for name, count in self._totals.items() if count)
         done = options.counted(self._measurements, "measurement")
-        text = f"{options.counted(self._count, 'recording')}: {counts}; {done} in {took_s:.1f} s"
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        click.echo(f"{options.counted(self._count, 'recording')}: {counts}; {done} in {took_s:.1f} s", err=True)
 
 
 def _named(event: "Ended") -> str:
@@ -206,16 +189,23 @@ def _named(event: "Ended") -> str:
     return f"{event.recording}: {event.error}"
 
 
-def _lines(event: "Ended") -> Iterator[str]:
+def _lines(event: "Ended", *, told: bool) -> Iterator[str]:
+    """Yield what there is to say; of plans only where they are not in an object."""
     match event.outcome:
         case "made":
-            rows = event.made["sensors"]
-            yield from (line for row in rows for line in row.pop("lines", ()))
-            yield from summary(event.output, rows, event.made["device"])
+            yield from _plans(event, told=told)
+            yield from summary(event.output, event.made["sensors"], event.made["device"])
         case "there":
+            yield from _plans(event, told=told)
             yield f"{event.output}: made before"
         case "passed over":
             yield f"{event.recording}: is no recording but an energyscape file, passed over"
+
+
+def _plans(event: "Ended", *, told: bool) -> Iterator[str]:
+    for row in event.made.get("sensors", ()):
+        if told:
+            yield from plans.said_of(row["sensor"], row)
 
 
 def _object(event: "Ended") -> dict[str, Any]:
@@ -226,18 +216,10 @@ def _object(event: "Ended") -> dict[str, Any]:
 
 def _row(event: "Ended") -> tuple[str, ...]:
     made = event.made
-    figures = (f"{made['measurements']}", f"{made['median_ms']:.1f}") if made else ("", "")
+    figures = (f"{made['measurements']}", f"{made['median_ms']:.1f}") if "median_ms" in made else ("", "")
     return (str(event.recording), event.outcome, *figures)
 
 
-def _table(rows: Sequence[tuple[str, ...]]) -> "Table":
-    from rich.box import SIMPLE
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=SIMPLE, pad_edge=False)
-    for heading, justify in (("recording", "left"), ("outcome", "left"), ("measurements", "right"), ("ms", "right")):
-        table.add_column(heading, justify="right" if justify == "right" else "left")
-    for row in rows:
-        table.add_row(*map(escape, row), style="red" if row[1] == "failed" else None)
-    return table
+def _table(rows: Sequence[tuple[str, ...]]) -> _tables.Table:
+    columns: dict[str, _tables.Side] = {"recording": "left", "outcome": "left", "measurements": "right", "ms": "right"}
+    return _tables.Table(columns, rows, {"failed": "red"})

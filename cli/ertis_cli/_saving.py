@@ -58,7 +58,16 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
         from ertis_numba.storage import EnergyscapeWriter
 
         with EnergyscapeWriter(target, overwrite=overwrite) as writer:
-            yield lambda arrival: writer.write(cast("Energyscape", arrival.item))  # as was asked
+            mounted: set[str] = set()
+
+            def write(arrival: "Arrival") -> None:
+                image = cast("Energyscape", arrival.item)  # as was asked
+                if image.stamp.sensor not in mounted:
+                    mounted.add(image.stamp.sensor)
+                    writer.note_mounting(image.stamp.sensor, arrival.translation_m, arrival.rotation_xyzw)
+                writer.write(image)
+
+            yield write
         return
     yield from _recording(target, overwrite=overwrite)
 

@@ -82,9 +82,17 @@ __all__ = ["capture"]
 @click.option("--listen-only", is_flag=True, help="Send nothing: another program has set up the sensor.")
 @click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Calls per measurement.")
 @click.option(
-    "--preset", metavar="NAME", help="short_, default_ or long_ with 20_80 or 25_50; default_25_50 by default."
+    "--preset",
+    metavar="NAME",
+    shell_complete=options.complete_presets,
+    help="short_, default_ or long_ with 20_80 or 25_50; default_25_50 by default.",
 )
-@click.option("--layout", metavar="NAME", help="Array: eRTIS_v3D1, the default, and others, or a .toml or .csv file.")
+@click.option(
+    "--layout",
+    metavar="NAME",
+    shell_complete=options.complete_layouts,
+    help="Array: eRTIS_v3D1, the default, and others, or a .toml or .csv file.",
+)
 @click.option("--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings as TOML.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--name", "names", multiple=True, metavar="NAME", help="Of the sensors, in the order of the ports.")
@@ -101,7 +109,7 @@ __all__ = ["capture"]
 @click.option("--dry-run", is_flag=True, help="Print the commands that the sensor would get, and end.")
 @options.force
 @options.quiet
-@options.as_json
+@options.as_json_of("one object a line for each measurement and each event, the last of all of them")
 def capture(
     *,
     ports: tuple[str, ...],
@@ -290,7 +298,7 @@ def _configured(
         enabled = np.zeros(32, dtype=bool)
         enabled[: len(given)] = given
         checks = {
-            name: BitCheck(recording.n_samples, recording.pdm_rate_hz, enabled, splices=splices) for name in sonars
+            name: BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=splices) for name in sonars
         }
     for name, sonar in sonars.items():
         sonar.configure(setup, bits=checks[name].check if check_bits else None)

@@ -6,23 +6,23 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.stages.compare import Errors
 
 __all__ = ["compare"]
 
-_WIDTHS = {
-    "measurements": 12,
-    "matched": 7,
-    "missed": 6,
-    "false": 5,
-    "angle_rms_deg": 13,
-    "range_bias_m": 12,
-    "range_rms_m": 11,
-    "level_rms_db": 12,
-}
+_NUMBERS = (
+    "measurements",
+    "matched",
+    "missed",
+    "false",
+    "angle_rms_deg",
+    "range_bias_m",
+    "range_rms_m",
+    "level_rms_db",
+)
 
 
 @click.command()
@@ -40,22 +40,18 @@ def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) 
     """
     from ertis_numba.stages.compare import errors_of
 
-    compared = {
-        name: [comparison for _, comparison in options.comparisons(path, name, min_level)]
-        for name in options.sensors_of(path, sensor)
-    }
+    names = options.sensors_of(path, sensor)
+    options.note_untold_directions(path, names)
+    compared = {name: [comparison for _, comparison in options.comparisons(path, name, min_level)] for name in names}
     sensors = {name: errors_of(given) for name, given in compared.items()}
     whole = errors_of(comparison for given in compared.values() for comparison in given)
     if as_json:
         rows = [{"sensor": name, **_rounded(errors)} for name, errors in sensors.items()]
         options.print_json({**_rounded(whole), "sensors": rows})
         return
-    width = max(map(len, (*sensors, "sensor")))
-    click.echo("  ".join(["sensor".ljust(width), *(name.rjust(size) for name, size in _WIDTHS.items())]))
-    for name, errors in (*sensors.items(), ("all", whole)):
-        cells = _rounded(errors)
-        shown = (_cell(cells[column]).rjust(size) for column, size in _WIDTHS.items())
-        click.echo("  ".join([name.ljust(width), *shown]))
+    columns: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(_NUMBERS, "right")}
+    cells = [(name, _rounded(errors)) for name, errors in (*sensors.items(), ("all", whole))]
+    _tables.Table(columns, [(name, *(_cell(of[number]) for number in _NUMBERS)) for name, of in cells]).print()
 
 
 def _rounded(errors: "Errors") -> dict[str, Any]:

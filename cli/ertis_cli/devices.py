@@ -4,14 +4,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.devices.survey import Answer
 
 __all__ = ["devices"]
 
-_HEADINGS = ("port", "serial number", "state", "firmware", "call", "what")
+_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
+    ("port", "serial number", "state", "firmware", "call", "what"), "left"
+)
 
 
 @click.command()
@@ -34,8 +36,8 @@ def devices(*, names: tuple[str, ...], as_json: bool) -> None:
     listed = [answer for answer in answers if names or answer.state != "no answer"]
     if as_json:
         options.print_json({"devices": [_report(answer) for answer in listed]})
-    else:
-        _print_table(listed)
+    elif listed:
+        _tables.Table(_COLUMNS, [_row(answer) for answer in listed]).print()
     for answer in answers:
         if not names and answer.error is not None and answer.state != "in use":
             click.echo(str(answer.error), err=True)
@@ -58,15 +60,6 @@ def _report(answer: "Answer") -> dict[str, Any]:
         "firmware": answer.firmware,
         "call_hash": answer.call_hash,
     }
-
-
-def _print_table(answers: list["Answer"]) -> None:
-    if not answers:
-        return
-    rows = [_HEADINGS, *(_row(answer) for answer in answers)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _row(answer: "Answer") -> tuple[str, ...]:

@@ -5,9 +5,13 @@ from pathlib import Path
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _tables, options
 
 __all__ = ["doctor"]
+
+_MARKS = {"good": "ok", "note": "note", "bad": "BAD"}
+_STYLES = {"ok": "green", "note": "yellow", "BAD": "red"}
+_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "what", "found", "what to do"), "left")
 
 
 @click.command()
@@ -26,10 +30,6 @@ def doctor(ctx: click.Context, *, folder: Path, as_json: bool) -> None:
     Versions, cores and threads, GPU, serial ports and who may open them, speed and room of the disk, keys. The exit
     code is 1 if something does not work; what is only missing is a note.
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from ertis_cli._diagnosis import CHECKS, Finding
     from ertis_numba.errors import ArgumentError
 
@@ -47,12 +47,7 @@ def doctor(ctx: click.Context, *, folder: Path, as_json: bool) -> None:
     if as_json:
         options.print_json({"problems": n_bad, "findings": [asdict(each) for each in found]})
     else:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("", "what", "found", "what to do"):
-            table.add_column(heading, overflow="fold")
-        marks = {"good": Text("ok", "green"), "note": Text("note", "yellow"), "bad": Text("BAD", "red")}
-        for each in found:
-            table.add_row(marks[each.state], *map(Text, (each.what, each.text, each.remedy)))
-        Console(highlight=False).print(table)
+        rows = [(_MARKS[each.state], each.what, each.text, each.remedy) for each in found]
+        _tables.Table(_COLUMNS, rows, _STYLES).print()
     if n_bad:
         ctx.exit(1)

@@ -175,7 +175,7 @@ def _rendered(path: Path, names: "Sequence[str]", *, count: int | None, seed: in
     silent = scene.replace(
         sensors=tuple(each.replace(emitter=each.emitter.replace(silent=True)) for each in scene.sensors)
     )
-    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet), options.interrupt_later():
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 

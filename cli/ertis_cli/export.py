@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -61,16 +62,13 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     multiple=True,
     help="What of a sensor goes into MCAP, may be given several times; all by default.",
 )
-@click.option(
-    "--top", type=int, default=256, show_default=True, metavar="N", help="At most so many points of an image."
-)
+@click.option("--top", type=int, metavar="N", help="At most so many points of an image; 256 by default.")
 @click.option(
     "--min-level",
+    "min_level_db",
     type=float,
-    default=-20.0,
-    show_default=True,
     metavar="DB",
-    help="Leave out points that are weaker, below the strongest.",
+    help="Leave out points that are weaker, below the strongest; -20 by default.",
 )
 @click.option("--ascii", "text", is_flag=True, help="PLY and PCD as text.")
 @options.force
@@ -84,8 +82,8 @@ def export(
     sensor: str | None,
     places: tuple[int, int] | None,
     topics: tuple[str, ...],
-    top: int,
-    min_level: float,
+    top: int | None,
+    min_level_db: float | None,
     text: bool,
     force: bool,
     quiet: bool,
@@ -97,28 +95,27 @@ def export(
     files for Acoular the microphone signals of one measurement. A recording is processed with its own
     settings first, but for Acoular.
     """
-    from ertis_numba.interop import export as write
-    from ertis_numba.interop import files_of, format_of
+    from ertis_numba import interop
     from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
 
-    name = format_of(target, file_format)
-    for file in files_of(target, name):
+    name = interop.format_of(target, file_format)
+    for file in interop.files_of(target, name):
         check_target(file, overwrite=force, sources=[path])
     with ExitStack() as stack:
         recorded = name == "acoular" or file_kind(path) == "recording"
         open_file: Callable[..., Any] = open_recording if recorded else open_energyscapes
         readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
+        fitting = interop.FORMATS[name].options
+        given = {"topics": topics or None, "top": top, "min_level_db": min_level_db, "text": text}
+        chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting or typed(key)}
         items = _Items(readers, places, process=recorded and name != "acoular", quiet=quiet)
-        written = write(
+        written = interop.export(
             target,
             items,
             file_format=name,
-            mounting={each.sensor: (each.translation_m, each.rotation_xyzw) for each in readers} if recorded else None,
-            topics=topics or TOPICS,
-            top=top,
-            min_level_db=min_level,
-            text=text,
+            mounting=_mounting(readers) if "mounting" in fitting else None,
             overwrite=force,
+            **chosen,
         )
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
     options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
@@ -132,6 +129,11 @@ def export(
                 "measurements": len(items),
             }
         )
+
+
+def _mounting(readers: "Sequence[RecordingReader | EnergyscapeReader]") -> dict[str, tuple[Any, Any]]:
+    """Return where sensors are, of those of which their file says it, as energyscape files need not."""
+    return {each.sensor: (each.translation_m, each.rotation_xyzw) for each in readers if each.translation_m is not None}
 
 
 class _Items:

@@ -1,31 +1,60 @@
-"""``ertis import``: raw words to a recording."""
+"""``ertis import``: raw words, or PCM, to a recording."""
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
-    from ertis_numba.interop import RawReader
-    from ertis_numba.settings import Air
+    from ertis_numba.interop import PcmReader, RawReader
+    from ertis_numba.settings import Settings
 
 __all__ = ["import_raw"]
 
+_PCM = {".wav", ".h5", ".hdf5", ".hdf"}
+
 
 @click.command("import")
-@click.argument("raw", metavar="RAW.bin...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@options.output("Recording to write; RAW.h5 beside the first file or the folder by default.")
+@click.argument("raw", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.output("Recording to write; FILE.h5 beside the first file or the folder by default.")
 @click.option(
     "--layout",
     metavar="NAME",
+    shell_complete=options.complete_layouts,
     help="Array: eRTIS_v3D1 and others, or a .toml or .csv file; not needed where a folder names it.",
 )
 @click.option(
     "--preset",
     metavar="NAME",
+    shell_complete=options.complete_presets,
     help="short_, default_ or long_ with 20_80 or 25_50; not needed where a folder holds the settings.",
+)
+@click.option(
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="TOML with array, call and whatever else is not that of an eRTIS; --layout and the air go before it.",
+)
+@click.option(
+    "--skip", "skip_s", type=click.FloatRange(min=0), metavar="S", help="PCM: when the first emission begins."
+)
+@click.option(
+    "--length",
+    "length_s",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="PCM: from one emission to the next, where a file holds several; all of a file is one by default.",
+)
+@click.option(
+    "--start",
+    metavar="TIME",
+    type=click.DateTime(["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%dT%H:%M:%S.%f%z"]),
+    help="PCM: when the first emission was, as 2026-05-04T12:30:00, in UTC unless it says otherwise.",
 )
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
@@ -39,6 +68,10 @@ def import_raw(
     target: Path | None,
     layout: str | None,
     preset: str | None,
+    settings_file: Path | None,
+    skip_s: float | None,
+    length_s: float | None,
+    start: datetime | None,
     sensor: str,
     temperature: float | None,
     humidity: float | None,
@@ -46,43 +79,141 @@ def import_raw(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Turn raw eRTIS words into a recording.
+    """Turn raw eRTIS words, or PCM of other arrays, into a recording.
 
-    RAW.bin holds little-endian words without a header, one measurement after the other. Array and
+    Raw words are little-endian and have no header, one measurement after the other. Array and
     preset say what the file does not; a preset is the length of a measurement and the band of the
-    call in kHz. The recording then holds all of it.
+    call in kHz. Or a settings file says all of it. The recording then holds it.
 
     In place of files, a folder may be given that a program on RTIS Dev has saved to: NAME<number>.bin
     for each measurement, and the settings of recording and processing as JSON.
+
+    Files that end in .wav are multichannel PCM, and so are .h5 files with the time_data of Acoular. Their
+    channels are the rows of the layout, and their rate is that of the recording.
     """
-    from ertis_numba.settings import Air
     from ertis_numba.storage import check_target, write_recording
 
-    given = {"temperature_c": temperature, "humidity_percent": humidity}
-    air = Air(**{name: value for name, value in given.items() if value is not None})
+    is_pcm = all(path.suffix.lower() in _PCM for path in raw)
+    for name, parameter in (("--skip", "skip_s"), ("--length", "length_s"), ("--start", "start")):
+        if typed(parameter) and not is_pcm:
+            raise click.UsageError(f"{name} is for PCM (.wav, .h5); leave it out", click.get_current_context())
+    if not is_pcm and any(path.suffix.lower() in _PCM for path in raw):
+        raise click.UsageError(
+            "some files are PCM (.wav, .h5) and others raw words; import them one kind after the other",
+            click.get_current_context(),
+        )
     folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
-    measurements = _opened(raw, folder, layout, preset, air, sensor)
     if target is None:
-        target = raw[0].with_suffix(".h5") if folder is None else Path(f"{folder.resolve()}.h5")
+        target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
     check_target(target, overwrite=force, sources=raw)
+    given = {"temperature_c": temperature, "humidity_percent": humidity}
+    air = {name: value for name, value in given.items() if value is not None}
+    measurements: PcmReader | RawReader
+    if is_pcm:
+        times = {"skip_s": skip_s or 0.0, "length_s": length_s, "start_ns": _since_1970_ns(start)}
+        measurements = _opened_pcm(raw, layout, preset, settings_file, air, sensor, times)
+    else:
+        measurements = _opened_raw(raw, folder, layout, preset, settings_file, air, sensor)
     source = ", ".join(path.name for path in raw)
     with options.progress(measurements, length=len(measurements), label="importing", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=source)
     options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)
+    rest_s = getattr(measurements, "rest_s", 0.0)
+    if rest_s:
+        options.say(f"note: {rest_s:.4g} s at the ends of files are left out", quiet=quiet)
+    _say_what_hinders(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements)})
 
 
-def _opened(
-    raw: tuple[Path, ...], folder: Path | None, layout: str | None, preset: str | None, air: "Air", sensor: str
+def _beside(first: Path) -> Path:
+    """Return the recording's name where none is given."""
+    if first.suffix.lower() == ".h5":
+        raise click.MissingParameter(
+            "the recording cannot have the name of the file that it is made of",
+            ctx=click.get_current_context(),
+            param_hint="'--output'",
+            param_type="option",
+        )
+    return first.with_suffix(".h5")
+
+
+def _opened_raw(
+    raw: tuple[Path, ...],
+    folder: Path | None,
+    layout: str | None,
+    preset: str | None,
+    settings_file: Path | None,
+    air: dict[str, float],
+    sensor: str,
 ) -> "RawReader":
     from ertis_numba.interop import open_raw, open_rtis_folder
-    from ertis_numba.settings import Array, Settings
+    from ertis_numba.settings import Air
 
     if folder is not None:
-        return open_rtis_folder(folder, layout=layout, preset=preset, air=air, sensor=sensor)
-    if layout is None or preset is None:
-        option = "--layout" if layout is None else "--preset"
-        context = click.get_current_context()
-        raise click.MissingParameter(ctx=context, param_hint=f"'{option}'", param_type="option")
-    return open_raw(raw, Settings.from_preset(preset, array=Array(layout=layout), air=air), sensor=sensor)
+        if typed("settings_file"):
+            raise click.UsageError(
+                "--settings is for files, and a folder holds settings; leave it out", click.get_current_context()
+            )
+        return open_rtis_folder(folder, layout=layout, preset=preset, air=Air(**air), sensor=sensor)
+    if settings_file is None and (layout is None or preset is None):
+        _require("--layout" if layout is None else "--preset")
+    return open_raw(raw, _settings(layout, preset, settings_file, air), sensor=sensor)
+
+
+def _opened_pcm(
+    raw: tuple[Path, ...],
+    layout: str | None,
+    preset: str | None,
+    settings_file: Path | None,
+    air: dict[str, float],
+    sensor: str,
+    times: dict[str, Any],
+) -> "PcmReader":
+    from ertis_numba.interop import open_pcm
+
+    settings = None
+    if any(part is not None for part in (layout, preset, settings_file)):
+        if settings_file is None and (layout is None or preset is None):
+            _require("--layout" if layout is None else "--preset")
+        settings = _settings(layout, preset, settings_file, air)
+    elif raw[0].suffix.lower() == ".wav":
+        _require("--settings")
+    return open_pcm(raw, settings, sensor=sensor, **times)
+
+
+def _since_1970_ns(start: datetime | None) -> int:
+    if start is None:
+        return 0
+    given = start if start.tzinfo else start.replace(tzinfo=UTC)
+    if given.year < 1970:
+        raise click.BadParameter("is before 1970; give a later time", param_hint="'--start'")
+    return (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
+
+
+def _say_what_hinders(settings: "Settings", *, quiet: bool) -> None:
+    """Tell now why the recording could not be processed by the settings that it holds."""
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.geometry import direction_grid
+    from ertis_numba.stages.window import time_window
+
+    try:
+        direction_grid(settings.processing)
+        time_window(settings, largest_delay_s=0.0, n_taps=1)
+    except ArgumentError as error:
+        options.say(f"note: it cannot be processed as it is: {error}", quiet=quiet)
+
+
+def _require(option: str) -> None:
+    raise click.MissingParameter(ctx=click.get_current_context(), param_hint=f"'{option}'", param_type="option")
+
+
+def _settings(layout: str | None, preset: str | None, settings_file: Path | None, air: dict[str, float]) -> "Settings":
+    """Return what the files do not say, of preset, settings file and options."""
+    from ertis_numba.settings import Array, Settings
+
+    settings = Settings() if preset is None else Settings.from_preset(preset)
+    settings = options.settings_with(settings, settings_file=settings_file)
+    if layout is not None:
+        settings = settings.replace(array=Array(layout=layout))
+    return settings.replace(air=settings.air.replace(**air))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.stages.health import Health
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["info"]
 
 _LOOKED_AT = 8
+_CLOCK_SET_NS = 946_684_800 * 10**9  # 2000: nobody has recorded before
 _WIDTH = 7  # at least
 _COLUMNS = {  # name: digits, of the report and of the table
     "offset": (6, 4),
@@ -106,8 +107,9 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
     stamps = reader.stamps()
     recording = reader.settings.recording
     return {
+        "encoding": recording.encoding,
         "samples": recording.n_samples,
-        "pdm_rate_hz": recording.pdm_rate_hz,
+        "sample_rate_hz": recording.sample_rate_hz,
         "duration_ms": round(1000 * recording.duration_s, 3),
         "first": _iso(stamps[0].timestamp_ns),
         "last": _iso(stamps[-1].timestamp_ns),
@@ -128,8 +130,8 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
 
 
 def _iso(time_ns: int) -> str | None:
-    """Return a time as ISO 8601; none is known where the record says 0."""
-    if not time_ns:
+    """Return a time as ISO 8601; none is known where the clock was not set, and simulations have none."""
+    if time_ns < _CLOCK_SET_NS:
         return None
     second = datetime.fromtimestamp(time_ns // 10**9, UTC)
     return f"{second:%Y-%m-%dT%H:%M:%S}.{time_ns % 10**9:09d}Z"
@@ -155,6 +157,7 @@ def _tell_health(path: Path, *, as_json: bool) -> None:
             click.echo()
         for line in _health_lines(section):
             click.echo(line)
+        _microphones(section).print()
 
 
 def _health(report: "Health") -> dict[str, Any]:
@@ -174,7 +177,7 @@ def _health(report: "Health") -> dict[str, Any]:
 
 
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
-    """Yield what is known of an array, then a row for each of its microphones."""
+    """Yield what is known of an array."""
     yield f"sensor         {section['sensor']}"
     yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
@@ -183,11 +186,17 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
         yield f"cannot tell    {text}"
-    width = max(len("state"), *(len(row["state"]) for row in section["channels"]))
-    yield "  ".join(["channel", "state".ljust(width), *(name.rjust(_WIDTH) for name in _COLUMNS)])
-    for row in section["channels"]:
-        cells = (_cell(row[name], digits).rjust(max(_WIDTH, len(name))) for name, (_, digits) in _COLUMNS.items())
-        yield "  ".join([f"{row['channel']:7d}", row["state"].ljust(width), *cells])
+
+
+def _microphones(section: dict[str, Any]) -> _tables.Table:
+    """Return a row for each microphone of an array."""
+    columns: dict[str, _tables.Side] = {"channel": "right", "state": "left"}
+    columns |= dict.fromkeys([name.rjust(_WIDTH) for name in _COLUMNS], "right")
+    rows = [
+        (str(row["channel"]), row["state"], *(_cell(row[name], digits) for name, (_, digits) in _COLUMNS.items()))
+        for row in section["channels"]
+    ]
+    return _tables.Table(columns, rows, {state: "green" if state == "ok" else "red" for _, state, *_ in rows})
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

@@ -45,7 +45,7 @@ _LOOK_S = 0.1
 @_network.server_key
 @options.force
 @options.quiet
-@options.as_json
+@options.as_json_of("one object a line for each event, the last when it ends")
 def listen(
     *,
     address: str,

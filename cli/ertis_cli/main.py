@@ -1,15 +1,18 @@
 """The ``ertis`` command: finds its commands by name, and turns errors into one line and an exit code."""
 
+import errno
 import gc
 import importlib
+import os
 import signal
 import sys
+import threading
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import click
 
-from ertis_cli import _config
+from ertis_cli import _config, _naming
 
 __all__ = ["COMMANDS", "cli", "main"]
 
@@ -25,7 +28,7 @@ COMMANDS = {
         "Be the sensors of a scene or of a recording, until interrupted.",
     ),
     "export": ("ertis_cli.export:export", "Write a file for other programs."),
-    "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words into a recording."),
+    "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words, or PCM of other arrays, into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
     "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes at ADDRESS."),
@@ -43,6 +46,8 @@ COMMANDS = {
 """Where each command is, and what its help says first: commands are imported when they are run."""
 
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
+_ENDED = 128  # and the number of the signal
+_CALLBACK_S = 0.01  # until a callback is over
 
 
 class _Commands(click.Group):
@@ -55,7 +60,16 @@ class _Commands(click.Group):
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
         command: click.Command = getattr(importlib.import_module(module), attribute)
         _config.add_variables(command, (cmd_name,))
+        _naming.name_options(command)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if not name.startswith("-") and name not in COMMANDS and not ctx.resilient_parsing:
+            ctx.fail(f"No such command {name!r} ({_config.instead(name, COMMANDS)})")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         with formatter.section("Commands"):
@@ -92,8 +106,21 @@ def _told(error: Exception) -> tuple[int, str]:
     if isinstance(error, click.Abort):
         return _INTERRUPTED, "interrupted"
     if _is_expected(error):
-        return _FAILED, str(error) or type(error).__name__
+        return _FAILED, _of_system(error) or str(error) or type(error).__name__
     raise error
+
+
+def _of_system(error: Exception) -> str:
+    """Return an error of the system as ours are told: what it is about, what came, the remedy; empty if it is ours."""
+    from ertis_numba.atomic import remedy
+    from ertis_numba.errors import ErtisError
+
+    if isinstance(error, ErtisError) or not isinstance(error, OSError) or not error.strerror:
+        return ""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}; {remedy(error)}"
+    # What has no name but could be full is what stdout goes to.
+    return f"the output is full ({error.strerror}); {remedy(error)}" if error.errno == errno.ENOSPC else ""
 
 
 def _is_expected(error: Exception) -> bool:
@@ -121,28 +148,54 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the version."
 )
 @_config.config
-def cli() -> None:
+@click.pass_context
+def cli(ctx: click.Context) -> None:
     """Imaging sonar in air: from one-bit microphones to energyscapes.
 
     Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage,
     130 interrupted. Options come from the command line, then from variables such as ERTIS_PROCESS_MAX_ERROR,
     then from the file of --config.
     """
+    fault = _config.require_config(ctx)
+    if fault:
+        click.echo(f"ertis: warning: {fault}", err=True)
+    for line in _config.unknown_variables(cast("click.Group", ctx.command), ctx):
+        click.echo(f"ertis: warning: {line}", err=True)
 
 
 def main() -> None:
     """Run the command line."""
-    # A polite end unwinds like Ctrl-C does, so that no half-written file is left behind.
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), _end)
+    obey_signals()
     # Libraries make a hundred thousand objects that stay: to look through them is a twentieth of a command's time.
     gc.set_threshold(100_000)
     cli.main()
 
 
+def obey_signals() -> None:
+    """Let a polite end unwind like Ctrl-C does, so that no half-written file is left behind."""
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), _end)
+    sys.unraisablehook = _end_again
+
+
 def _end(number: int, _: object) -> NoReturn:
-    sys.exit(128 + number)
+    sys.exit(_ENDED + number)
+
+
+def _end_again(swallowed: "sys.UnraisableHookArgs") -> None:
+    """Send a signal again that came in a callback, such as those of h5py: Python drops what is raised there."""
+    code = getattr(swallowed.exc_value, "code", None)
+    if isinstance(swallowed.exc_value, KeyboardInterrupt):
+        number = signal.SIGINT
+    elif isinstance(swallowed.exc_value, SystemExit) and isinstance(code, int) and code > _ENDED:
+        number = signal.Signals(code - _ENDED)
+    else:
+        sys.__unraisablehook__(swallowed)
+        return
+    again = threading.Timer(_CALLBACK_S, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
 
 
 if __name__ == "__main__":

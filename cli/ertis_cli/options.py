@@ -6,11 +6,14 @@ import sys
 import threading
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
+
+from ertis_cli import _progress
 
 if TYPE_CHECKING:
     from ertis_numba.pipeline import Pipeline
@@ -18,10 +21,15 @@ if TYPE_CHECKING:
     from ertis_numba.stages.compare import Comparison
 
 __all__ = [
+    "DIRECTION",
     "ERROR_BUDGET",
     "INTERVAL",
+    "PREPARING",
     "as_json",
+    "as_json_of",
     "comparisons",
+    "complete_layouts",
+    "complete_presets",
     "counted",
     "device",
     "force",
@@ -29,6 +37,7 @@ __all__ = [
     "interrupt_later",
     "measurement",
     "min_level",
+    "note_untold_directions",
     "note_when_slow",
     "output",
     "pipeline",
@@ -44,6 +53,7 @@ __all__ = [
     "threads",
 ]
 
+_MOST_DEG = 90.0  # of azimuth and elevation, before an array
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -59,6 +69,20 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         return self.fail(f"{value!r} is no interval, give two numbers as in 0.5:5", param, ctx)
 
 
+class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
+    name = "AZ:EL"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        azimuth, colon, elevation = str(value).partition(":")
+        if colon:
+            with suppress(ValueError):
+                angles_deg = float(azimuth), float(elevation)
+                if all(-_MOST_DEG <= angle_deg <= _MOST_DEG for angle_deg in angles_deg):
+                    return angles_deg
+        wanted = f"azimuth and elevation, each from -{_MOST_DEG:g} to {_MOST_DEG:g}, as in 30:0"
+        return self.fail(f"{value!r} is no direction, give {wanted}", param, ctx)
+
+
 class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
     name = "DB"
 
@@ -72,11 +96,20 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
         return self.fail(f"{value!r} is no error, give dB as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx)
 
 
+DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
+PREPARING = "preparing (a first run compiles kernels, which takes longer) ..."
+"""What is said of a start that is slow, for whichever reason: a machine may be busy, too."""
 _FILE = click.Path(path_type=Path)
 
-as_json: Decorator = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+
+def as_json_of(what: str) -> Decorator:
+    """Return the option that prints JSON instead of text, and says what there is an object of."""
+    return click.option("--json", "as_json", is_flag=True, help=f"Print JSON on stdout: {what}.")
+
+
+as_json: Decorator = as_json_of("one object, or one a line where there are several")
 device: Decorator = click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda", "numpy"]),
@@ -85,7 +118,9 @@ device: Decorator = click.option(
     help="What computes; auto is cuda, an NVIDIA GPU, where there is one; numpy runs without compiled kernels.",
 )
 force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
-quiet: Decorator = click.option("--quiet", "-q", is_flag=True, help="No progress, no summary; errors only.")
+quiet: Decorator = click.option(
+    "--quiet", "-q", is_flag=True, help="No progress, no summary; warnings and errors only."
+)
 threads: Decorator = click.option("--threads", type=int, metavar="N", help="Threads; all cores by default.")
 
 
@@ -192,10 +227,36 @@ def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
     """Return a pipeline, and tell who waits for it why."""
-    with note_when_slow("compiling kernels (first run only) ...", quiet=quiet), interrupt_later():
+    with note_when_slow(PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.pipeline import Pipeline
 
         return Pipeline(settings, device=device, threads=threads)
+
+
+def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001
+    """Return the presets that a shell may complete."""
+    from ertis_numba.settings import PRESETS
+
+    return [name for name in PRESETS if name.startswith(incomplete)]
+
+
+def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG001
+    """Return the layouts that a shell may complete, and where none is, files."""
+    from ertis_numba.geometry import layout_names
+
+    names = [CompletionItem(name) for name in layout_names() if name.startswith(incomplete)]
+    return names or [CompletionItem(incomplete, type="file")]
+
+
+def note_untold_directions(path: Path, sensors: Sequence[str]) -> None:
+    """Say which sensors of an energyscape file have one microphone, and so tell ranges only."""
+    from ertis_numba.geometry import microphones
+    from ertis_numba.storage import open_energyscapes
+
+    for name in sensors:
+        with open_energyscapes(path, sensor=name) as images:
+            if microphones(images.settings.array).enabled.sum() == 1:
+                click.echo(f"note: sensor {name} has one microphone, which tells ranges but no directions", err=True)
 
 
 def say(text: str, *, quiet: bool) -> None:
@@ -216,8 +277,9 @@ def print_json(report: dict[str, Any]) -> None:
 
 def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> AbstractContextManager[Iterable[Item]]:
     """Return ``items`` under a progress bar on stderr, which is hidden where nobody looks."""
-    hidden = quiet or not sys.stderr.isatty()
-    return click.progressbar(items, length=length, label=label, file=sys.stderr, hidden=hidden)
+    if quiet or not _progress.is_drawn_on(sys.stderr):
+        return nullcontext(items)
+    return _progress.bar(items, length=length, label=label)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Peak
@@ -19,11 +19,15 @@ __all__ = ["peaks"]
 _TOP = 10
 _MIN_LEVEL_DB = -30.0
 _FALSE_ALARM = 1e-4
-_HEAD = "  measurement  azimuth_deg  elevation_deg  range_m  level_db"
-_ROW = "  {measurement:11d}  {azimuth_deg:+11.2f}  {elevation_deg:+13.2f}  {range_m:7.3f}  {level_db:8.1f}"
-_ERROR_HEAD = "  angle_error_deg  range_error_m  level_error_db  reflector"
-_ERROR = "  {angle_deg:15.3f}  {range_m:+13.4f}  {level_db:+14.2f}  {name}"
-_NO_ERROR = "  {:>15}  {:>13}  {:>14}  {}"
+_PLACE = {"azimuth_deg": "+.2f", "elevation_deg": "+.2f", "range_m": ".3f", "level_db": ".1f"}
+_ERROR = {"angle_deg": ".3f", "range_m": "+.4f", "level_db": "+.2f"}
+_COLUMNS: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(("measurement", *_PLACE), "right")}
+_ERROR_COLUMNS: dict[str, _tables.Side] = {
+    "angle_error_deg": "right",
+    "range_error_m": "right",
+    "level_error_db": "right",
+    "reflector": "left",
+}
 _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4}
 
 
@@ -45,7 +49,7 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     type=click.Choice(["peaks", "cfar"]),
     default="peaks",
     show_default=True,
-    help="What tells reflectors: their level, or that they stand out of the noise.",
+    help="How reflectors are found: by their level, or by standing out of the noise around them (CFAR).",
 )
 @click.option(
     "--false-alarm",
@@ -71,8 +75,9 @@ def peaks(
 
     One entry per reflector, the strongest of each measurement first; levels are in dB below it.
 
-    With --detector cfar, reflectors are what stands out of the noise around them in range, however weak
-    they are, and is at most 10 dB below the strongest of its range (see 'docs/plots.md').
+    With --detector cfar, a reflector is what stands out of the noise around it in range, however weak it
+    is, and is at most 10 dB below the strongest of its range. The noise is estimated from 32 bins of the
+    same direction (OS-CFAR), so that noise alone stands out as rarely as --false-alarm says.
 
     With --truth, each true reflector comes first, with the errors of the peak that shows it or as
     missed; then come the peaks that no reflector explains, as false, and those of reflectors that do
@@ -86,7 +91,7 @@ def peaks(
     if detector != "cfar" and false_alarm is not None:
         raise click.UsageError("--false-alarm is for --detector cfar; give both", click.get_current_context())
     sensors = options.sensors_of(path, sensor)
-    width = max(map(len, (*sensors, "sensor")))
+    options.note_untold_directions(path, sensors)
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
             ({"sensor": name, "measurement": index}, comparison)
@@ -99,22 +104,17 @@ def peaks(
             "peaks": [row for place, comparison in compared for row in _compared(place, comparison)],
             "missed": [place | _rounded(item) for place, comparison in compared for item in comparison.missed],
         }
-        lines = (
-            place["sensor"].ljust(width) + line for place, comparison in compared for line in _lines(place, comparison)
-        )
-        head = _HEAD + _ERROR_HEAD
+        cells = [row for place, comparison in compared for row in _beside_the_truth(place, comparison)]
+        table = _tables.Table(_COLUMNS | _ERROR_COLUMNS, cells)
     else:
         find = _finder(detector, _TOP if top is None else top, min_level, false_alarm)
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
-        lines = (row["sensor"].ljust(width) + _ROW.format(**row) for row in rows)
-        head = _HEAD
+        table = _tables.Table(_COLUMNS, [_cells(row, row) for row in rows])
     if as_json:
         options.print_json(report)
         return
-    click.echo("sensor".ljust(width) + head)
-    for line in lines:
-        click.echo(line)
+    table.print()
 
 
 def _finder(
@@ -160,16 +160,22 @@ def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[
         }
 
 
-def _lines(place: dict[str, Any], comparison: "Comparison") -> Iterator[str]:
-    """Yield a line for each true reflector of a measurement, then for the other peaks."""
+def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterator[tuple[str, ...]]:
+    """Yield the cells of each true reflector of a measurement, then of the other peaks."""
     for match in comparison.matched:
-        told = _ERROR.format(**_error(match), name=match.reflector.name)
-        yield _ROW.format(**place, **_rounded(match.reflector)) + told
+        error = _error(match)
+        told = (f"{error[name]:{form}}" for name, form in _ERROR.items())
+        yield (*_cells(place, _rounded(match.reflector)), *told, match.reflector.name)
     for reflector in comparison.missed:
-        yield _ROW.format(**place, **_rounded(reflector)) + _NO_ERROR.format("missed", "-", "-", reflector.name)
+        yield (*_cells(place, _rounded(reflector)), "missed", "-", "-", reflector.name)
     for verdict, given in (("false", comparison.false), ("explained", comparison.explained)):
         for peak in given:
-            yield _ROW.format(**place, **_rounded(peak)) + _NO_ERROR.format(verdict, "-", "-", "-")
+            yield (*_cells(place, _rounded(peak)), verdict, "-", "-", "-")
+
+
+def _cells(place: dict[str, Any], found: dict[str, Any]) -> tuple[str, ...]:
+    """Return where a reflector or a peak is."""
+    return (place["sensor"], str(place["measurement"]), *(f"{found[name]:{form}}" for name, form in _PLACE.items()))
 
 
 def _error(match: "Match") -> dict[str, float]:

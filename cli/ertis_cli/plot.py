@@ -72,7 +72,7 @@ _ONLY = {
 @click.option(
     "--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Of beam patterns; up to five times."
 )
-@click.option("--steer", type=options.INTERVAL, metavar="AZ:EL", help="Where beam patterns look to, in degrees.")
+@click.option("--steer", type=options.DIRECTION, metavar="AZ:EL", help="Where beam patterns look to, in degrees.")
 @options.force
 @options.quiet
 @options.as_json
@@ -118,6 +118,8 @@ def plot(
                 f"--{name} is for --kind {', '.join(_ONLY[name])}; leave it out with {kind}",
                 click.get_current_context(),
             )
+    if kind != "array":
+        _require_no_array(path)
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)
@@ -188,6 +190,17 @@ def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":
         return recording[options.place(index, len(recording))]
 
 
+def _require_no_array(path: Path) -> None:
+    """Refuse what only ``--kind array`` draws."""
+    from ertis_numba.geometry import layout_names
+
+    if path.suffix.lower() in {".csv", ".toml"} or (str(path) in layout_names() and not path.exists()):
+        raise click.UsageError(
+            f"{path} has no measurement to draw; give --kind array, or a recording or an energyscape file",
+            click.get_current_context(),
+        )
+
+
 def _settings(path: Path, sensor: str | None) -> "Settings":
     """Return the settings of a file, or those of an array that a file or a name is the layout of."""
     from ertis_numba.geometry import layout_names
@@ -195,7 +208,8 @@ def _settings(path: Path, sensor: str | None) -> "Settings":
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     suffix = path.suffix.lower()
-    is_layout = str(path) in layout_names() or suffix == ".csv" or (suffix == ".toml" and _is_layout(path))
+    is_name = str(path) in layout_names() or not (suffix or path.exists())  # of a layout, though it may be misspelt
+    is_layout = is_name or suffix == ".csv" or (suffix == ".toml" and _is_layout(path))
     if sensor is not None and (is_layout or suffix == ".toml"):
         raise click.UsageError(
             "--sensor is for files that hold several; leave it out with settings or a layout",

@@ -1,16 +1,20 @@
 """``ertis process``: recordings to energyscapes."""
 
-import statistics
-from contextlib import ExitStack
+import functools
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _process_examine, _process_many, options, plans
+from ertis_cli import _process_many, options, plans
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
-    from ertis_numba.campaign import Wanted
+    from collections.abc import Iterator, Sequence
+
+    from ertis_numba.campaign import Options
+    from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
 
 __all__ = ["process"]
@@ -152,9 +156,9 @@ def process(
         plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
 
-    from ertis_numba.campaign import Wanted
+    from ertis_numba.campaign import Options
 
-    wanted = Wanted(
+    wanted = Options(
         settings=changed,
         sensor=sensor,
         dtype=dtype,
@@ -163,77 +167,56 @@ def process(
         batch=batch,
         strict=strict,
         overwrite=force,
-        examine=_process_examine.NAME if explain or verify else "",
-        examine_with={"explain": explain, "verify": verify, "silent": as_json},
+        explain=explain,
+        verify=verify,
     )
     if _process_many.are_meant(paths, target):
         _process_many.process_many(
             paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
         )
         return
-    for name, given in (("--workers", workers), ("--scheduler", scheduler)):
-        if given is not None:
+    for name in ("workers", "scheduler"):
+        if typed(name):
             raise click.UsageError(
-                f"{name} is for several recordings; give more, a folder or a pattern, or an -o that ends in /",
+                f"--{name} is for several recordings; give more, a folder or a pattern, or an -o that ends in /",
                 click.get_current_context(),
             )
     path = Path(paths[0])
-    report = _process_one(
-        path,
-        Path(target) if target else path.with_suffix(".energy.h5"),
-        wanted,
-        explain=explain,
-        verify=verify,
-        quiet=quiet,
-        as_json=as_json,
-    )
+    target_file = Path(target) if target else path.with_suffix(".energy.h5")
+    report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     for line in _process_many.summary(Path(report["output"]), report["sensors"], report["device"]):
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json(report)
 
 
-def _process_one(
-    path: Path, target: Path, wanted: "Wanted", *, explain: bool, verify: bool, quiet: bool, as_json: bool
-) -> dict[str, Any]:
+def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as_json: bool) -> dict[str, Any]:
     """Process one recording in this process, and return the report."""
-    from ertis_numba.campaign import SensorRun, faults_of
-    from ertis_numba.errors import DataError
-    from ertis_numba.storage import EnergyscapeWriter, open_recording
+    from ertis_numba.campaign import making
 
-    with ExitStack() as stack:
-        names = options.sensors_of(path, wanted.sensor)
-        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]
-        # Every sensor is looked at before the first one is processed, so that what cannot be done is told at once.
-        settings = [wanted.settings(recording.settings) for recording in recordings]
-        writer = EnergyscapeWriter(target, recording=recordings, dtype=wanted.dtype, overwrite=wanted.overwrite)
-        pipelines = [
-            stack.enter_context(options.pipeline(given, device=wanted.device, threads=wanted.threads, quiet=quiet))
-            for given in settings
-        ]
-        runs = [SensorRun(pipeline, batch=wanted.batch) for pipeline in pipelines]
-        for run, recording in zip(runs, recordings, strict=True):
-            first = run.known(recording[0])
-            faults = faults_of(f"{path}: sensor {recording.sensor}", first)
-            if faults and wanted.strict:
-                raise DataError(faults)
-            if faults:
-                click.echo(f"ertis: warning: {faults}", err=True)
-            run.told = plans.tell(
-                run.pipeline, first, threads=wanted.threads, explain=explain, verify=verify, silent=as_json
-            )
-        written = (None for run, recording in zip(runs, recordings, strict=True) for _ in run.write(recording, writer))
-        length = sum(map(len, recordings))
-        with writer, options.progress(written, length=length, label="processing", quiet=quiet) as shown:
+    @contextmanager
+    def pipelines(several: "Sequence[Settings]") -> "Iterator[list[Pipeline]]":
+        with ExitStack() as stack:
+            wait = functools.partial(options.pipeline, device=wanted.device, threads=wanted.threads, quiet=quiet)
+            yield [stack.enter_context(wait(settings)) for settings in several]
+
+    def show(sensor: str, told: dict[str, Any]) -> None:
+        for line in () if as_json else plans.said_of(sensor, told):
+            click.echo(line, err=True)
+
+    with making(
+        path,
+        target,
+        wanted,
+        sensors=options.sensors_of(path, wanted.sensor),
+        pipelines=pipelines,
+        warn=lambda faults: click.echo(f"ertis: warning: {faults}", err=True),
+        show=show,
+    ) as work:
+        with (
+            closing(work.run()) as steps,
+            options.progress(steps, length=work.measurements, label="processing", quiet=quiet) as shown,
+        ):
             for _ in shown:
                 pass
-    rows = [{"sensor": name, **run.report()} for name, run in zip(names, runs, strict=True)]
-    times_ms = [time_ms for run in runs for time_ms in run.times_ms]
-    return {
-        "output": str(target),
-        "measurements": len(times_ms),
-        **({name: rows[0][name] for name in ("directions", "ranges", *runs[0].told)} if len(rows) == 1 else {}),
-        "device": runs[0].pipeline.device,
-        "median_ms": round(statistics.median(times_ms), 3),
-        "sensors": rows,
-    }
+        return {"output": str(target), **work.report()}

@@ -68,7 +68,7 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
-    with options.note_when_slow("compiling kernels (first run only) ...", quiet=quiet), options.interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet), options.interrupt_later():
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 
@@ -96,10 +96,11 @@ def simulate(
         )
     options.say(_summary(target, scene, truth), quiet=quiet)
     for simulator in simulators:
-        if simulator.loudest > _FOLLOWED:
+        followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
+        if simulator.loudest > followed:
             options.say(
-                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, and modulators "
-                f"follow up to {_FOLLOWED:g}; lower emitter.level_db or move things away",
+                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, and {by} "
+                f"follow up to {followed:g}; lower emitter.level_db or move things away",
                 quiet=quiet,
             )
     effects = _effects(plan, simulators)

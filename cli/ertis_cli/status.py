@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _network, options
+from ertis_cli import _network, _progress, _tables, options
 from ertis_cli._central_watch import size
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["status"]
 
 _REFRESH_S = 1.0
+_ALARMING = ("away: ", "fault: ")
 
 
 @click.command()
@@ -29,7 +30,7 @@ _REFRESH_S = 1.0
 @click.option("--once", is_flag=True, help="Show it once, on a terminal too.")
 @click.option("--watch", is_flag=True, help="Show it again and again, not only on a terminal; with --json as lines.")
 @click.option("--patience", type=float, default=3.0, show_default=True, metavar="S", help="Wait so long for an answer.")
-@options.as_json
+@options.as_json_of("one object, with --watch one a line for each time")
 def status(
     *,
     address: str,
@@ -52,7 +53,7 @@ def status(
         raise click.UsageError("--once and --watch exclude each other; give one of them")
     checks.positive("--patience", patience)
     with Asking(address, keys=_network.client_keys(key, server_key)) as node:
-        if as_json or once or not sys.stdout.isatty():
+        if as_json or once or not _progress.is_drawn_on(sys.stdout):
             for now, away in _looks(node, patience, again=watch):
                 _print(now, away, as_json=as_json)
             return
@@ -77,16 +78,20 @@ def _looks(node: "Asking", patience_s: float, *, again: bool) -> "Iterator[tuple
 
 
 def _print(now: "Status", away: str, *, as_json: bool) -> None:
-    from rich.console import Console
-
     if as_json:
         import msgspec
 
         event = {"address": now.address, "text": away} if away else msgspec.to_builtins(now)
         options.print_json({"event": "away" if away else "status"} | event)
         return
-    # A pipe is as wide as a table needs.
-    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(_drawn(now, away))
+    if _progress.is_drawn_on(sys.stdout):
+        from rich.console import Console
+
+        Console(file=sys.stdout).print(_drawn(now, away))
+        return
+    above, table, below = _told(now, away)
+    for line in (*above, *table.lines(), *below):
+        click.echo(line)
 
 
 @contextmanager
@@ -98,46 +103,46 @@ def _live() -> "Iterator[Any]":
 
 
 def _drawn(now: "Status", away: str = "") -> "Group":
-    """Return the tables; where it does not answer, those of before."""
+    """Return what `_told` does, drawn."""
     from rich.console import Group
     from rich.text import Text
 
+    above, table, below = _told(now, away)
+    lines = [Text(line, "bold red" if line.startswith(_ALARMING) else "") for line in above]
+    return Group(*lines, table, *map(Text, below))
+
+
+def _told(now: "Status", away: str) -> tuple[list[str], _tables.Table, list[str]]:
+    """Return the sensors, with lines above and below; where it does not answer, those of before."""
     keys = "with keys" if now.keys else "without keys"
     head = (
         f"{now.address} on {now.host}, {now.state}, up {_seconds(now.uptime_s)}, "
         f"{options.counted(now.peers, 'sensor node')}, {keys}, {now.memory_bytes / 1e6:.0f} MB"
     )
-    lines = [Text(f"away: {away}; it said before:", style="bold red")] if away else []
-    lines.append(Text(head))
+    above = [f"away: {away}; it said before:"] if away else []
+    above.append(head)
     if now.fault:
-        lines.append(Text(f"fault: {now.fault}", style="bold red"))
+        above.append(f"fault: {now.fault}")
     if now.refused:
-        lines.append(Text(f"refused: {_by_reason(now.refused)}"))
-    return Group(*lines, _sensors(now), *(Text(line) for line in _below(now)))
+        above.append(f"refused: {_by_reason(now.refused)}")
+    return above, _sensors(now), [*_below(now)]
 
 
-def _sensors(now: "Status") -> Any:
-    from rich.box import SIMPLE
-    from rich.table import Table
-
-    table = Table(box=SIMPLE, pad_edge=False)
-    table.add_column("sensor")
+def _sensors(now: "Status") -> _tables.Table:
     processing, archive = now.processing is not None, now.archive is not None
     headings = ["Hz", "received", *(["stored"] if archive else []), *(["published"] if processing else []), "queue"]
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    table.add_column("missing")
+    columns: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(headings, "right"), "missing": "left"}
     if processing:
-        table.add_column("dropped")
-        table.add_column("image ms p50/p99", justify="right")
+        columns |= {"dropped": "left", "image ms p50/p99": "right"}
+    rows = []
     for name, each in now.sensors.items():
         row = [f"{each.rate_hz:.1f}", str(each.received)]
         row += [str(each.stored)] if archive else []
         row += [str(each.published)] if processing else []
         row += [str(each.queue), _by_reason(each.missing)]
         row += [_by_reason(each.dropped), _times(each.image_latency)] if processing else []
-        table.add_row(name if each.connected else f"{name} (away)", *row)
-    return table
+        rows.append((name if each.connected else f"{name} (away)", *row))
+    return _tables.Table(columns, rows)
 
 
 def _below(now: "Status") -> Iterator[str]:

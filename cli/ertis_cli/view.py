@@ -1,30 +1,57 @@
 """``ertis view``: what sensors see, live or of a file, on a page in the browser."""
 
 import gc
-import ipaddress
 import math
+import os
+import re
+import signal
 import sys
+import time
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from ertis_cli import _network, options
-from ertis_cli._watch import stopped_by_signals
+from ertis_cli._watch import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
-    from ertis_numba.viewer import Film, Live
+    from ertis_numba.viewer import Film, Live, View
 
 __all__ = ["view"]
 
 _COLOURS = ("inferno", "viridis", "cividis", "magma")
+_LIVE, _FILM, _PAGE = "an address", "a file that is shown", "a file that --save-html writes as a page"
+_HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
+_PAGES = (".html", ".htm")
+_TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
+_ENDING = "ending when the image at hand is made (a first run compiles kernels); Ctrl-C ends at once ..."
+_ONLY = {
+    "host": (_LIVE, _FILM),
+    "port": (_LIVE, _FILM),
+    "opened": (_LIVE, _FILM),
+    "loop": (_FILM,),
+    "duration": (_LIVE, _FILM),
+    "key": (_LIVE,),
+    "server_key": (_LIVE,),
+    "device": (_FILM, _PAGE),
+}
+"""Options that not all have use for, and who has."""
 
 
 @click.command()
 @click.argument("what", metavar="ADDRESS|REC.h5|IMG.h5")
 @click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Of these only; of all by default.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Where to serve the page.")
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Where to serve the page. Where others reach it, they see and steer the view: there is no password.",
+)
 @click.option("--port", type=click.IntRange(0, 65_535), default=8080, show_default=True, help="0 for any that is free.")
 @click.option("--open/--no-open", "opened", default=None, help="Open a browser; done by default on a terminal.")
 @click.option("--threshold", type=float, default=-20.0, show_default=True, metavar="DB", help="Weakest points to show.")
@@ -41,7 +68,8 @@ _COLOURS = ("inferno", "viridis", "cividis", "magma")
     "html",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write what is shown as a page that needs no server: all of a file at once, or a live view at its end.",
+    help="Write what is shown as a page that needs no server: all of a file at once, or a live view at its end; "
+    "at most 256 MB.",
 )
 @_network.key
 @_network.server_key
@@ -77,11 +105,15 @@ def view(
     are shown, at the speed at which they were recorded. The page shows range and azimuth of each sensor, and all of
     them on their platform in three dimensions. It needs the extra view, and no other host.
     """
+    live = _is_address(what)
+    _require_use(_LIVE if live else _FILM if html is None else _PAGE)
     _network.require_duration(duration)
     if html is not None:
+        from ertis_numba import checks
         from ertis_numba.storage import check_target
 
-        check_target(html, overwrite=force)
+        check_target(html, overwrite=force, sources=[] if live else [Path(what)])
+        checks.choice("page format", html.suffix.lower(), _PAGES)
     try:
         from ertis_numba.viewer import Choices, View
     except ModuleNotFoundError as error:
@@ -91,29 +123,56 @@ def view(
     choices = Choices(
         threshold_db=threshold, dynamic_range_db=dynamic_range, range_m=range_m, decay_s=decay, colours=colours
     )
-    live = "://" in what
+    at_once = html is not None and not live
     with (
         stopped_by_signals() as signals,
         _source(what, sensors, live=live, keys=(key, server_key), device=device, loop=loop) as source,
+        nullcontext() if live else _ended(source, signals, quiet=quiet),
         View(
             source,
-            host=host,
-            port=0 if html is not None and not live else port,
+            host="127.0.0.1" if at_once else host,  # nobody is to look while a file becomes a page
+            port=0 if at_once else port,
             choices=choices,
             on_note=lambda text: options.say(text, quiet=quiet),
         ) as shown,
     ):
         signals.obey(shown.stop)
-        if html is not None and not live:
+        if html is not None and at_once:
+            with _compiling(options.PREPARING, signals, quiet=quiet):
+                shown.prepare()
             shown.record(html, overwrite=force)
+            if shown.recorded is None:
+                signals.end()
         else:
-            _tell(what, shown.url, host, quiet=quiet, as_json=as_json)
+            _tell(what, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
                 webbrowser.open(shown.url)
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
     gc.freeze()  # to look through all that libraries have made would take a fifth of a second that nobody waits for
     if html is not None:
-        options.say(f"{html}: {options.counted(shown.shown, 'frame')} of {what}", quiet=quiet)
+        _tell_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
+
+
+def _is_address(what: str) -> bool:
+    """Whether this is an address rather than a file."""
+    live = "://" in what
+    host_port = None if live or Path(what).exists() else _HOST_PORT.fullmatch(what)
+    if host_port:
+        raise click.UsageError(
+            f"{what!r} is no file; give tcp://{host_port[2]}, if that is where a central node publishes"
+        )
+    return live
+
+
+def _require_use(kind: str) -> None:
+    """Refuse options that would change nothing; a file of settings may hold them for other uses."""
+    context = click.get_current_context()
+    names = {each.name: each.opts[0] for each in context.command.params}
+    for name, kinds in _ONLY.items():
+        if kind not in kinds and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; leave it out with {kind}", context)
+    if context.params["html"] is None and context.get_parameter_source("force") is ParameterSource.COMMANDLINE:
+        raise click.UsageError("--force is for --save-html; leave it out", context)
 
 
 def _source(
@@ -123,21 +182,64 @@ def _source(
         from ertis_numba.viewer import Live
 
         return Live(what, sensors=sensors or None, keys=_network.client_keys(*keys))
-    if any(keys):
-        raise click.UsageError("--key is for an address, and a file is given")
     from ertis_numba.viewer import Film
 
     return Film(what, sensors=sensors or None, device=device, loop=loop)
 
 
-def _tell(what: str, url: str, host: str, *, quiet: bool, as_json: bool) -> None:
+@contextmanager
+def _ended(source: "Live | Film", signals: Signals, *, quiet: bool) -> Iterator[None]:
+    """Close a source after the block; who waits for that is told why."""
+    try:
+        yield
+    finally:
+        with _compiling(_ENDING, signals, quiet=quiet, ending=True):
+            source.__exit__()
+
+
+@contextmanager
+def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False) -> Iterator[None]:
+    """Tell of a block that takes long, and keep signals until it is done; a second one ends the process at once.
+
+    An exception would break in the compiler or be swallowed there, and an interpreter that ends meanwhile crashes.
+    Where all is ``ending`` anyway, the first signal counts as the second.
+    """
+    first_s = math.inf if not ending else time.monotonic() if signals.came else -math.inf
+
+    def come(number: int, frame: object) -> None:
+        nonlocal first_s
+        now_s = time.monotonic()
+        if now_s - first_s > _TWICE_S:
+            os._exit(128 + number)
+        if math.isinf(first_s):
+            first_s = now_s
+            signals(number, frame)
+            options.say("ending when that is done; Ctrl-C again ends at once", quiet=quiet)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in before:
+            signal.signal(number, come)
+        with options.note_when_slow(note, quiet=quiet):
+            yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _tell(what: str, shown: "View", *, quiet: bool, as_json: bool) -> None:
     """Tell where the page is, and who else may reach it."""
     if as_json:
-        options.print_json({"event": "viewing", "source": what, "url": url})
-    options.say(f"{what} at {url}; Ctrl-C ends", quiet=quiet)
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = False
-    if not loopback:
+        options.print_json({"event": "viewing", "source": what, "url": shown.url})
+    options.say(f"{what} at {shown.url}; Ctrl-C ends", quiet=quiet)
+    if not shown.is_local:
         options.say("whoever reaches that host sees and steers this view; it asks for no password", quiet=False)
+
+
+def _tell_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
+    """Tell what was written; it is an error if that is nothing."""
+    if n_frames is None:
+        raise click.ClickException(f"no image of {what} was shown, and {html} is not written; see that sensors send")
+    options.say(f"{html}: {options.counted(n_frames, 'frame')} of {what}", quiet=quiet)
+    if as_json:
+        options.print_json({"event": "recorded", "source": what, "output": str(html), "frames": n_frames})

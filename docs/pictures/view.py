@@ -52,7 +52,8 @@ def _save(page: Page) -> None:
         box.fill(str(moment))
         box.press("Enter")
         page.wait_for_function(
-            f"() => document.querySelector('[data-name=sequence]').innerText.startsWith('{moment}, ')"
+            "() => document.querySelector('[data-name=sequence]').innerText.split(', ')"
+            f".every(each => each.endsWith(' {moment}'))"
         )
     for notice in page.locator(".mantine-Notification-closeButton").all():  # of drawing without a graphics card
         notice.click()

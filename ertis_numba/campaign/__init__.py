@@ -7,9 +7,9 @@ and no other one.
 
 from ertis_numba.campaign.campaign import Campaign
 from ertis_numba.campaign.events import Advanced, Begun, Ended, Event
-from ertis_numba.campaign.orders import Wanted
-from ertis_numba.campaign.recordings import Found, find, outputs
-from ertis_numba.campaign.sensor_run import SensorRun, faults_of
+from ertis_numba.campaign.making import Making, making
+from ertis_numba.campaign.orders import Options
+from ertis_numba.campaign.recordings import Source, find, outputs
 
 __all__ = [
     "Advanced",
@@ -17,10 +17,10 @@ __all__ = [
     "Campaign",
     "Ended",
     "Event",
-    "Found",
-    "SensorRun",
-    "Wanted",
-    "faults_of",
+    "Making",
+    "Options",
+    "Source",
     "find",
+    "making",
     "outputs",
 ]

@@ -6,15 +6,15 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from ertis_numba import checks
 from ertis_numba.campaign.events import Advanced, Begun, Ended, Event, Outcome
 from ertis_numba.campaign.folder import clear_parts, sole
 from ertis_numba.campaign.made import difference
-from ertis_numba.campaign.orders import MOST_BYTES, Crew, News, Order, Wanted
+from ertis_numba.campaign.orders import HOW, MOST_BYTES, Crew, Do, News, Options, Order
 from ertis_numba.campaign.plans import Plans
-from ertis_numba.campaign.recordings import Found, outputs
+from ertis_numba.campaign.recordings import Source, outputs
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained
 from ertis_numba.settings import Accuracy, Settings
@@ -29,10 +29,11 @@ _AHEAD: Final = 2  # recordings that are looked at while others are made, so tha
 class _Case:
     """A recording in hand."""
 
-    found: Found
+    found: Source
     target: Path
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
+    is_there: bool = False
 
     def ended(self, outcome: Outcome, **more: Any) -> Ended:
         return Ended(self.found.path, self.target, outcome, **more)
@@ -47,10 +48,10 @@ class Campaign:
 
     Parameters
     ----------
-    recordings : sequence of Found
+    recordings : sequence of Source
     folder : Path
         It is made if there is none.
-    wanted : Wanted, optional
+    options : Options, optional
     workers : int, optional
         Processes on this machine; one for each core by default, of which each has one thread, and one for a GPU.
     scheduler : str, optional
@@ -64,9 +65,9 @@ class Campaign:
 
     def __init__(
         self,
-        recordings: Sequence[Found],
+        recordings: Sequence[Source],
         folder: str | Path,
-        wanted: Wanted | None = None,
+        options: Options | None = None,
         *,
         workers: int | None = None,
         scheduler: str | None = None,
@@ -75,7 +76,7 @@ class Campaign:
             checks.whole("workers", workers, 1)
             if scheduler is not None:
                 raise ArgumentError("workers are given and a scheduler, which has its own; give one of both")
-        self.folder, self._wanted = Path(folder), wanted or Wanted()
+        self.folder, self._options = Path(folder), options or Options()
         targets = outputs(recordings, self.folder)
         self._names = {target.name for target in targets}
         self._waiting = deque(_Case(*pair) for pair in zip(recordings, targets, strict=True))
@@ -90,7 +91,7 @@ class Campaign:
     def workers(self) -> int:
         """How many processes of this machine share it: no more than there are recordings."""
         cores = _n_cores()
-        chosen = self._workers or (1 if self._wanted.device == "cuda" else cores // (self._wanted.threads or 1))
+        chosen = self._workers or (1 if self._options.device == "cuda" else cores // (self._options.threads or 1))
         return max(1, min(chosen, len(self._names)))
 
     def run(self) -> Generator[Event]:
@@ -126,7 +127,7 @@ class Campaign:
 
     def _feed(self, crew: Crew) -> bool:
         """Give orders to whoever is free; return whether there is anything to wait for."""
-        while crew.free and (pair := self._next(crew)) is not None:
+        while crew.free > 0 and (pair := self._next(crew)) is not None:
             self._given[pair[0].number] = pair
             crew.give(pair[0])
         return bool(self._given)
@@ -135,13 +136,13 @@ class Campaign:
         """Return what is to be done next: what is nearest to its end comes first."""
         if self._ready:
             case = self._ready.popleft()
-            return self._order("make", self._to_make(case, crew.size)), case
+            return self._order("check" if case.is_there else "make", self._to_make(case, crew.size)), case
         if (planned := self._to_plan(crew.size)) is not None:
             return planned
         in_hand = len(self._given) + len(self._unplanned)
         if self._waiting and in_hand < crew.size + _AHEAD:
             case = self._waiting.popleft()
-            return self._order("look", self._paths(case) | {"sensor": self._wanted.sensor}), case
+            return self._order("look", self._paths(case) | {"sensor": self._options.sensor}), case
         return None
 
     def _to_plan(self, n_workers: int) -> tuple[Order, _Case] | None:
@@ -154,21 +155,21 @@ class Campaign:
                 return self._order("plan", about), case
         return None
 
-    def _order(self, do: Literal["look", "plan", "make"], about: dict[str, Any]) -> Order:
+    def _order(self, do: Do, about: dict[str, Any]) -> Order:
         self._n_orders += 1
         return Order(self._n_orders, do, about)
 
     def _paths(self, case: _Case) -> dict[str, Any]:
         far = self._scheduler is not None  # where the current folder is another one
         path, target = (each.absolute() if far else each for each in (case.found.path, case.target))
-        return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._wanted.dtype}
+        return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._options.dtype}
 
     def _shares(self, n_workers: int) -> dict[str, Any]:
         share = 1 if self._scheduler is not None else n_workers
-        return {"device": self._wanted.device, "threads": self._wanted.threads, "share": share}
+        return {"device": self._options.device, "threads": self._options.threads, "share": share}
 
     def _to_make(self, case: _Case, n_workers: int) -> dict[str, Any]:
-        wanted = self._wanted
+        options = self._options
         planned = {}
         for name, settings in case.wanted.items():
             plan = self._plans.of(settings)
@@ -177,14 +178,11 @@ class Campaign:
         return {
             **self._paths(case),
             **self._shares(n_workers),
+            **{name: getattr(options, name) for name in HOW},
             "sensors": planned,
-            "batch": wanted.batch,
             "most_bytes": MOST_BYTES / n_workers,
-            "strict": wanted.strict,
             # Dask starts again what a worker had that was lost, even if all but the news of it had been done.
-            "overwrite": wanted.overwrite or self._scheduler is not None,
-            "examine": wanted.examine,
-            "examine_with": dict(wanted.examine_with),
+            "overwrite": options.overwrite or self._scheduler is not None,
         }
 
     def _heard(self, crew: Crew, news: News) -> Iterator[Event]:
@@ -207,7 +205,7 @@ class Campaign:
         elif order.do == "look":
             yield from self._looked(case, news.result)
         else:
-            yield case.ended("made", made=news.result)
+            yield case.ended("there" if case.is_there else "made", made=news.result)
 
     def _clear(self, case: _Case) -> None:
         """Remove what a worker that was killed has left."""
@@ -220,7 +218,7 @@ class Campaign:
         try:
             for name, text in told["sensors"].items():
                 recorded = Settings.from_toml(text, f"{case.found.path}: settings")
-                case.wanted[name] = self_contained(_absolute(self._wanted.settings(recorded)))
+                case.wanted[name] = self_contained(_absolute(self._options.settings(recorded)))
             case.measurements = told["measurements"]
             made = told["made"]
             differs = "" if made is None else difference(made, case.wanted)
@@ -228,12 +226,21 @@ class Campaign:
             yield case.ended("failed", error=" ".join(str(error).split()))
             return
         if made is not None and not differs:
-            yield case.ended("there")
-        elif made is not None and (made.get("recording") or not self._wanted.overwrite):
+            yield from self._found_there(case, made["sensors"])
+        elif made is not None and (made.get("recording") or not self._options.overwrite):
             remedy = "give another folder" + ("" if made.get("recording") else ", or ask to replace it (--force)")
             yield case.ended("failed", error=f"output {case.target} exists and {differs}; {remedy}")
         else:
             yield from self._forward(case)
+
+    def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
+        """Let go of what is made, unless there is something to find out of how it was made."""
+        if not self._options.looks_closely:
+            yield case.ended("there")
+            return
+        case.is_there = True
+        case.wanted = {name: Settings.from_toml(held["settings"], "settings") for name, held in sensors.items()}
+        yield from self._forward(case)
 
     def _planned(self, crew: Crew, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
         if told.get("device") == "cuda" and self._workers is None and self._scheduler is None:
@@ -253,7 +260,8 @@ class Campaign:
             self._unplanned.append(case)
         else:
             self._ready.append(case)
-            yield Begun(case.found.path, case.measurements)
+            if not case.is_there:
+                yield Begun(case.found.path, case.measurements)
 
 
 def _absolute(settings: Settings) -> Settings:

@@ -37,7 +37,7 @@ class Ended:
     error : str
         Why it failed, in a line.
     made : dict
-        Measurements, times and more of what was made.
+        Measurements, times and more of what was made; of what was there what it was checked for.
     """
 
     recording: Path

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["clear_parts", "sole"]
+__all__ = ["clear_parts", "final_name", "sole"]
 
 _PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # as `atomic.replacing` names them
 
@@ -44,6 +44,12 @@ def sole(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def final_name(name: str) -> str:
+    """Return the name that a file has in the end, whether it is half-written or not."""
+    part = _PART.fullmatch(name)
+    return part[1] if part else name
 
 
 def clear_parts(folder: Path, targets: Collection[str]) -> None:

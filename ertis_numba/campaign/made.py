@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.errors import DamagedError, ErtisError
 from ertis_numba.geometry import direction_grid, self_contained
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
@@ -13,6 +13,7 @@ from ertis_numba.storage.schema import software_versions
 __all__ = ["difference", "look_at"]
 
 _OPEN = (None, "auto")  # what settings leave to the planner
+_ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
 
 
 class _Made(EnergyscapeReader):
@@ -27,6 +28,12 @@ class _Made(EnergyscapeReader):
     def axes(self) -> str:
         return _digest(self.azimuth_rad.tobytes(), self.elevation_rad.tobytes())
 
+    def require_whole(self) -> None:
+        """Refuse images that are not what was written."""
+        with self._reading():
+            for index in range(len(self)):
+                self._rows.row(index)
+
 
 def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
@@ -35,24 +42,37 @@ def _digest(*parts: bytes) -> str:
 def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
     """Return what there is of an energyscape file that was made of a recording: its sensors' settings and axes.
 
-    ``differs`` in it says why it is something else; it is empty where only settings can be different. None is returned
-    where there is no file. A ``recording`` is never to be replaced.
+    ``differs`` in it says why it is something else, or that it is damaged; it is empty where only settings can be
+    different. None is returned where there is no file. A ``recording`` is never to be replaced.
     """
     if not target.exists():
         return None
     try:
-        if file_kind(target) == "recording":
-            return {"differs": "is a recording", "recording": True}
-        sensors = {}
-        for name in sensor_names(target):
-            with _Made(target, sensor=name) as made:
-                differs = _differs(made, recording, dtype)
-                if differs:
-                    return {"differs": differs}
-                sensors[name] = {"settings": made.settings.to_toml(), "axes": made.axes, "measurements": len(made)}
-    except ErtisError:
+        found, made_of = _read(target, recording, dtype)
+    except DamagedError:
+        return {"differs": "is damaged"}
+    except (ErtisError, *_ODD):
         return {"differs": "is no energyscape file that can be read"}
-    return {"differs": "", "sensors": sensors}
+    if not found["differs"] and made_of != recording.sha256():  # last, as it reads all of it
+        return {"differs": "was made of another file of the same recording"}
+    return found
+
+
+def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[str, Any], object]:
+    """Return what a file is, and the SHA-256 of the file that it was made of."""
+    if file_kind(target) == "recording":
+        return {"differs": "is a recording", "recording": True}, None
+    sensors: dict[str, Any] = {}
+    made_of: object = None
+    for name in sensor_names(target):
+        with _Made(target, sensor=name) as made:
+            differs = _differs(made, recording, dtype)
+            if differs:
+                return {"differs": differs}, None
+            made.require_whole()
+            made_of = made.attributes.get("recording_sha256")
+            sensors[name] = {"settings": made.settings.to_toml(), "axes": made.axes, "measurements": len(made)}
+    return {"differs": "", "sensors": sensors}, made_of
 
 
 def _differs(made: _Made, recording: RecordingReader, dtype: str) -> str:
@@ -64,8 +84,6 @@ def _differs(made: _Made, recording: RecordingReader, dtype: str) -> str:
             return f"was made by {name} {came}, this is {wanted}"
     if made.dtype != dtype:
         return f"holds {made.dtype}, wanted {dtype}"
-    if made.attributes.get("recording_sha256") != recording.sha256():  # last, as it reads all of it
-        return "was made of another file of the same recording"
     return ""
 
 

@@ -4,6 +4,7 @@ import queue
 import secrets
 import time
 from concurrent.futures import CancelledError
+from contextlib import ExitStack
 from typing import Any, Final
 
 from ertis_numba import cluster
@@ -43,14 +44,14 @@ class Members:
         self._topic = f"ertis-{secrets.token_hex(4)}"
         self._told: queue.SimpleQueue[News] = queue.SimpleQueue()
         self._futures: dict[int, cluster.Future] = {}
-        self._client = cluster.connect(address, timeout_s=_CONNECT_S)
-        try:
+        with ExitStack() as stack:
+            self._client = cluster.connect(address, timeout_s=_CONNECT_S)
+            stack.enter_context(cluster.silence())  # what it would print of a scheduler that is lost is told in a line
+            stack.callback(self._client.close, timeout=2)
             cluster.require_workers(self._client, address, timeout_s=_CONNECT_S)
             self._size = len(self._client.nthreads())
             self._client.subscribe_topic(self._topic, self._advance)
-        except BaseException:
-            self._client.close(timeout=2)
-            raise
+            self._stack = stack.pop_all()
         self._looked_s = time.monotonic()
 
     @property
@@ -61,7 +62,7 @@ class Members:
     @property
     def free(self) -> int:
         """See `Crew`."""
-        return self._size - len(self._futures)
+        return max(0, self._size - len(self._futures))  # workers may have been lost
 
     def limit(self, size: int) -> None:
         """See `Crew`; each worker of a cluster has its own device."""
@@ -100,9 +101,9 @@ class Members:
 
     def close(self) -> None:
         """See `Crew`: dask cannot end a thread, but the work notices that nobody wants it any more."""
-        if self._client.status == "running":
-            self._client.cancel(list(self._futures.values()), force=True)
-        self._client.close(timeout=2)
+        with self._stack:
+            if self._client.status == "running":
+                self._client.cancel(list(self._futures.values()), force=True)
 
     def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
         """Take what a task tells; in a thread of the client."""

@@ -1,20 +1,20 @@
-"""What is wanted of a campaign, and what a worker is told to do, as JSON can hold it."""
+"""The options of a campaign, and what a worker is told to do, as JSON can hold it."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 from ertis_numba import checks
 from ertis_numba.settings import Settings
 
-__all__ = ["MOST_BYTES", "Crew", "News", "Order", "Wanted"]
+__all__ = ["HOW", "MOST_BYTES", "Crew", "Do", "News", "Options", "Order"]
 
 MOST_BYTES: Final = 256e6
 """Of images that wait to be written, of all workers together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wanted:
+class Options:
     """How each recording is to be processed.
 
     Attributes
@@ -32,12 +32,13 @@ class Wanted:
     strict : bool
         Refuse recordings with faulty microphones instead of warning.
     overwrite : bool
-        Replace energyscape files that were made otherwise. What was made of the same recording by the same settings and
-        versions stays as it is in any case.
-    examine : str
-        ``package.module:function`` that is called in the worker with the pipeline and the first measurement of each
-        sensor, ``threads`` and ``examine_with``, before anything is written. It returns what JSON can hold.
-    examine_with : mapping
+        Replace energyscape files that were made otherwise or are damaged. What is whole, and was made of the same
+        recording by the same settings and versions, stays as it is in any case.
+    explain : bool
+        Tell the plan of each sensor, its predicted error and time, as ``plan`` of what was made.
+    verify : bool
+        Measure the error of each sensor's first measurement, ``verified`` of what was made; a recording fails if it
+        is beyond the budget.
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
@@ -48,13 +49,25 @@ class Wanted:
     batch: int = 8
     strict: bool = False
     overwrite: bool = False
-    examine: str = ""
-    examine_with: Mapping[str, Any] = field(default_factory=dict)
+    explain: bool = False
+    verify: bool = False
 
     def __post_init__(self) -> None:
         checks.choice("dtype", self.dtype, ("float32", "float16"))
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.whole("batch", self.batch, 1)
+
+    @property
+    def looks_closely(self) -> bool:
+        """Whether there is more to find out of a recording than what its image is, even of one that is made already."""
+        return self.strict or self.explain or self.verify
+
+
+HOW: Final = ("dtype", "batch", "strict", "overwrite", "explain", "verify")
+"""What an order has of `Options` as it is."""
+
+
+Do = Literal["look", "plan", "make", "check"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +77,13 @@ class Order:
     Attributes
     ----------
     number : int
-    do : {"look", "plan", "make"}
+    do : {"look", "plan", "make", "check"}
     about : dict
         As `work` has it.
     """
 
     number: int
-    do: Literal["look", "plan", "make"]
+    do: Do
     about: dict[str, Any]
 
 
@@ -102,10 +115,10 @@ class Crew(Protocol):
 
     @property
     def free(self) -> int:
-        """How many more may be given now."""
+        """How many more may be given now; none where more are followed than there are to be."""
 
     def limit(self, size: int) -> None:
-        """Follow fewer orders at a time from now on."""
+        """Follow fewer orders at a time from now on; those that were given are followed to their end."""
 
     def give(self, order: Order) -> None:
         """Have something done; returns at once."""

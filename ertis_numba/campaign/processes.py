@@ -68,7 +68,7 @@ class Processes:
     @property
     def free(self) -> int:
         """See `Crew`."""
-        return self._size - sum(worker.order is not None for worker in self._workers)
+        return max(0, self._size - sum(worker.order is not None for worker in self._workers))
 
     @property
     def doing(self) -> dict[int, str]:
@@ -76,7 +76,7 @@ class Processes:
         return {worker.process.pid: _path(worker.order) for worker in self._workers}
 
     def limit(self, size: int) -> None:
-        """See `Crew`."""
+        """See `Crew`; whoever is busy ends when it is done, as far as there are too many."""
         self._size = min(self._size, size)
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
@@ -152,6 +152,8 @@ class Processes:
         news = News(told["number"], told.get("done", 0), told.get("result"))
         if news.result is not None:
             worker.order = None
+            if len(self._workers) > self._size:
+                self._end(worker)
         return news
 
     def _died(self, worker: _Worker) -> News | None:

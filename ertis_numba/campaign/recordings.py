@@ -8,14 +8,14 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["SUFFIX", "Found", "find", "outputs"]
+__all__ = ["SUFFIX", "Source", "find", "outputs"]
 
 SUFFIX = ".energy.h5"
 """Of the energyscape file of a recording."""
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Source:
     """A file that is to be processed.
 
     Attributes
@@ -30,8 +30,11 @@ class Found:
     named: bool = True
 
 
-def find(given: Iterable[str | Path]) -> list[Found]:
+def find(given: Iterable[str | Path]) -> list[Source]:
     """Return the files that are meant, each once, in the order given.
+
+    A file counts rather than links to it, which may come to mean another one. What a pattern or a folder has that is
+    no file, as a link to what is gone, is left to whoever opens it to tell.
 
     Parameters
     ----------
@@ -43,29 +46,40 @@ def find(given: Iterable[str | Path]) -> list[Found]:
     DataError
         A folder or a pattern stands for nothing.
     """
-    found: dict[Path, Found] = {}
+    found: dict[str, Source] = {}
     for each in given:
         for one in _meant(str(each)):
-            found.setdefault(one.path.resolve(), one)
+            real = os.path.realpath(one.path)  # resolve() refuses links that go in circles
+            known = found.setdefault(real, one)
+            found[real] = Source(
+                one.path if known.path.is_symlink() and not one.path.is_symlink() else known.path,
+                named=known.named or one.named,
+            )
     return list(found.values())
 
 
-def _meant(text: str) -> Sequence[Found]:
+def _meant(text: str) -> Sequence[Source]:
     path = Path(text)
     if path.is_dir():
-        paths = sorted(each for each in path.glob("*.h5") if each.is_file())
+        paths = sorted(each for each in path.glob("*.h5") if _may_be_meant(each))
         if not paths:
             raise DataError(f"folder {path} has no *.h5 in it; give a folder with recordings, or a pattern")
     elif path.exists() or not glob.has_magic(text):
-        return [Found(path)]
+        return [Source(path)]
     else:
-        paths = sorted(each for each in map(Path, glob.glob(text, recursive=True)) if each.is_file())  # noqa: PTH207
+        every = map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
+        paths = sorted(each for each in every if _may_be_meant(each))
         if not paths:
             raise DataError(f"no file is named like {text}; give another pattern")
-    return [Found(each, named=False) for each in paths]
+    return [Source(each, named=False) for each in paths]
 
 
-def outputs(recordings: Sequence[Found], folder: Path) -> list[Path]:
+def _may_be_meant(path: Path) -> bool:
+    """Whether a path is a file, or a link to one that is gone."""
+    return path.is_file() or not path.exists()
+
+
+def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
     """Return the file in ``folder`` that each recording is to become.
 
     Raises
@@ -77,7 +91,7 @@ def outputs(recordings: Sequence[Found], folder: Path) -> list[Path]:
         raise ArgumentError(f"output {folder} is a file, and several recordings need a folder; give another name")
     if not folder.parent.is_dir():
         raise ArgumentError(f"output {folder}: there is no folder {folder.parent}; make it or give another")
-    named = {found.path.resolve() for found in recordings if found.named}  # others may be energyscape files
+    named = {os.path.realpath(found.path) for found in recordings if found.named}  # others may be energyscape files
     taken: dict[str, Path] = {}
     targets = []
     for found in recordings:
@@ -87,7 +101,7 @@ def outputs(recordings: Sequence[Found], folder: Path) -> list[Path]:
             raise ArgumentError(
                 f"{taken[name]} and {found.path} would both become {target}; process them into folders of their own"
             )
-        if target.resolve() in named:
+        if os.path.realpath(target) in named:
             raise ArgumentError(
                 f"{found.path} would become {target}, which is to be processed itself; give another folder"
             )

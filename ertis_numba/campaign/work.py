@@ -1,24 +1,27 @@
-"""What workers do: look at a recording, plan how to process it, and make its energyscapes.
+"""What workers do: look at a recording, plan how to process it, make its energyscapes, or check those that are there.
 
 Each takes and returns what JSON can hold, so that it runs in any process of any machine that sees the files.
 """
 
-import importlib
-import statistics
+import functools
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import kernels
+from ertis_numba.atomic import remedy
+from ertis_numba.campaign.folder import final_name
 from ertis_numba.campaign.made import look_at
-from ertis_numba.campaign.sensor_run import SensorRun, faults_of
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.campaign.making import checked, making
+from ertis_numba.campaign.orders import HOW, Options
+from ertis_numba.errors import ErtisError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages import planner
-from ertis_numba.storage import EnergyscapeWriter, file_kind, open_recording, sensor_names
+from ertis_numba.storage import file_kind, open_recording, sensor_names
 
 __all__ = ["follow"]
 
@@ -34,7 +37,7 @@ def follow(do: str, about: Mapping[str, Any], tell: Tell = lambda _: None) -> di
 
     Parameters
     ----------
-    do : {"look", "plan", "make"}
+    do : {"look", "plan", "make", "check"}
     about : mapping
     tell : callable
         Called with the number of measurements that are done; what it raises ends the work.
@@ -44,7 +47,14 @@ def follow(do: str, about: Mapping[str, Any], tell: Tell = lambda _: None) -> di
     except ErtisError as error:
         return {"error": " ".join(str(error).split())}
     except (OSError, MemoryError) as error:  # they need not come another time
-        return {"error": " ".join(str(error).split()) or type(error).__name__, "by_chance": True}
+        return {"error": _in_a_line(error), "by_chance": True}
+
+
+def _in_a_line(error: OSError | MemoryError) -> str:
+    """Return an error of the system with the remedy, and with the name that a file was to have in the end."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{final_name(os.fsdecode(error.filename))}: {error.strerror}; {remedy(error)}"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _look(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
@@ -80,37 +90,37 @@ def _plan(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
 
 def _make(about: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
     """Make the energyscape file of a recording."""
-    path, target = Path(about["path"]), Path(about["target"])
-    settings = [Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()]
-    threads = _threads(about, settings[0])
+    options, how = _how(about)
     warnings: list[str] = []
-    with ExitStack() as stack:
-        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in about["sensors"]]
-        writer = EnergyscapeWriter(target, recording=recordings, dtype=about["dtype"], overwrite=about["overwrite"])
-        pipelines = stack.enter_context(_pipelines(settings, about["device"], threads))
-        runs = [SensorRun(each, batch=about["batch"], most_bytes=about["most_bytes"]) for each in pipelines]
-        for run, recording in zip(runs, recordings, strict=True):
-            first = run.known(recording[0])
-            faults = faults_of(f"{path}: sensor {recording.sensor}", first)
-            if faults and about["strict"]:
-                raise DataError(faults)
-            warnings += [faults] if faults else []
-            if about["examine"]:
-                run.told = _named(about["examine"])(run.pipeline, first, threads=threads, **about["examine_with"])
-        done = 0
-        with writer:
-            for run, recording in zip(runs, recordings, strict=True):
-                for _ in run.write(recording, writer):
-                    done += 1
-                    tell(done)
-    times_ms = [time_ms for run in runs for time_ms in run.times_ms]
-    return {
-        "measurements": len(times_ms),
-        "device": runs[0].pipeline.device,
-        "median_ms": round(statistics.median(times_ms), 3),
-        "sensors": [{"sensor": name, **run.report()} for name, run in zip(about["sensors"], runs, strict=True)],
-        "warnings": warnings,
-    }
+    with making(
+        Path(about["path"]),
+        Path(about["target"]),
+        options,
+        sensors=list(how["settings"]),
+        most_bytes=about["most_bytes"],
+        warn=warnings.append,
+        **how,
+    ) as work:
+        with closing(work.run()) as steps:
+            for done in steps:
+                tell(done)
+        return {**work.report(), "warnings": warnings}
+
+
+def _check(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
+    """Say of a recording whose energyscapes are there what would have been said before they were made."""
+    options, how = _how(about)
+    warnings: list[str] = []
+    return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
+
+
+def _how(about: Mapping[str, Any]) -> tuple[Options, dict[str, Any]]:
+    """Return the options, the settings of each sensor and where pipelines come from."""
+    settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
+    threads = _threads(about, next(iter(settings.values())))
+    options = Options(**{name: about[name] for name in HOW}, threads=threads)
+    pipelines = functools.partial(_pipelines, device=about["device"], threads=threads)
+    return options, {"settings": settings, "pipelines": pipelines}
 
 
 def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
@@ -145,14 +155,9 @@ def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -
             _kept.update(found)
 
 
-def _named(name: str) -> Callable[..., dict[str, Any]]:
-    module, _, function = name.partition(":")
-    found: Callable[..., dict[str, Any]] = getattr(importlib.import_module(module), function)
-    return found
-
-
 _ORDERS: Final[dict[str, Callable[[Mapping[str, Any], Tell], dict[str, Any]]]] = {
     "look": _look,
     "plan": _plan,
     "make": _make,
+    "check": _check,
 }

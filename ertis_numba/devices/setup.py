@@ -79,7 +79,7 @@ class Setup:
         _check_length(self.n_samples)
         if self.pdm_rate_hz not in PDM_RATES_HZ:
             raise ArgumentError(
-                f"recording.pdm_rate_hz is {self.pdm_rate_hz:.10g}; a sensor's clocks are "
+                f"recording.sample_rate_hz is {self.pdm_rate_hz:.10g}; a sensor's clocks are "
                 f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}: give one of them"
             )
         object.__setattr__(self, "dac_rate_hz", _dac_rate_hz(self.dac_rate_hz))
@@ -105,9 +105,11 @@ class Setup:
         """
         recording, call = settings.recording, settings.call
         _check_array(settings.array)
+        if not recording.is_pdm:
+            raise ArgumentError(f"recording.encoding is {recording.encoding!r}; a sensor gives bits: give 'pdm'")
         return cls(
             n_samples=recording.n_samples,
-            pdm_rate_hz=recording.pdm_rate_hz,
+            pdm_rate_hz=recording.sample_rate_hz,
             codes=call_codes(call),
             dac_rate_hz=_dac_rate_hz(call.sample_rate_hz),
             emissions=emissions,

@@ -1,8 +1,9 @@
-"""Pictures of energyscapes and of what they are made from, and of what exactness costs. The only door to Matplotlib.
+"""Pictures of energyscapes and of what they are made from, and of what exactness costs.
 
 They are drawn without pyplot, so that no global state and no window system is needed. As x is forward, y left and z up
 in the sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array out of
-the sensor's eyes. Each function returns a figure; `save` writes it to a file.
+the sensor's eyes. Each function returns a figure; `save` writes it to a file. Besides this package only the live view
+uses Matplotlib.
 """
 
 from collections.abc import Sequence
@@ -13,12 +14,13 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _array, _curve, _echoes, _front, _sector, _signals, _slices, _sphere
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
 from ertis_numba.figures._style import Look, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Array, Settings
 
 __all__ = [
     "Look",
@@ -33,6 +35,8 @@ __all__ = [
     "signals",
     "slices",
 ]
+
+_FORMATS = ("pdf", "png", "svg")
 
 
 def plot(
@@ -66,9 +70,9 @@ def plot(
     Raises
     ------
     ArgumentError
-        The dynamic range is not positive, or the theme is unknown.
+        What came is no image, the dynamic range is not positive, or the theme is unknown.
     """
-    canvas = _canvas(dynamic_range_db, look, peaks)
+    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
     if len(image.azimuth_rad) == 1:
         return _curve.draw(canvas, image)
     if image.is_planar:
@@ -84,7 +88,7 @@ def polar(
     **look: Unpack[Look],
 ) -> Figure:
     """Draw an energyscape as a sector in metres, of several elevations the strongest; arguments are those of `plot`."""
-    return _sector.draw(_canvas(dynamic_range_db, look, peaks), image)
+    return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image)
 
 
 def projection(
@@ -95,14 +99,14 @@ def projection(
     **look: Unpack[Look],
 ) -> Figure:
     """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
-    return _sphere.draw_map(_canvas(dynamic_range_db, look, peaks), image)
+    return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image)
 
 
 def slices(
     image: Energyscape,
     *,
     height_m: float = 0.0,
-    left_m: float = 0.0,
+    left_m: float | None = None,
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
     **look: Unpack[Look],
@@ -116,19 +120,20 @@ def slices(
     image : Energyscape
     height_m : float
         Of the level plane: its z.
-    left_m : float
-        Where the upright plane is: its y.
+    left_m : float, optional
+        Where the upright plane is: its y; 0 by default.
     dynamic_range_db, peaks, **look
         As for `plot`.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used, or a plane lies outside of the image.
+        An argument cannot be used, or a plane lies outside of the image; a planar one has no upright plane.
     """
     checks.finite("height_m", height_m)
-    checks.finite("left_m", left_m)
-    return _slices.draw(_canvas(dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m)
+    if left_m is not None:
+        checks.finite("left_m", left_m)
+    return _slices.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m)
 
 
 def signals(
@@ -156,6 +161,7 @@ def signals(
     ArgumentError
         An argument cannot be used, or there is no such microphone.
     """
+    _require("measurement", measurement, Measurement, "a recording holds")
     return _signals.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
@@ -170,11 +176,12 @@ def matched_filter(
 
     Arguments are those of `signals`.
     """
+    _require("measurement", measurement, Measurement, "a recording holds")
     return _echoes.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
 def array(
-    settings: Settings,
+    settings: Settings | str,
     *,
     frequencies_hz: Sequence[float] | None = None,
     azimuth_deg: float = 0.0,
@@ -186,8 +193,8 @@ def array(
 
     Parameters
     ----------
-    settings : Settings
-        Their array, call and air.
+    settings : Settings or str
+        Their array, call and air; or a layout's name, with the default call and air.
     frequencies_hz : sequence of float, optional
         1 to 5; the ends of the call's band and the mean power over it by default.
     azimuth_deg, elevation_deg : float
@@ -201,6 +208,9 @@ def array(
         An argument cannot be used.
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
+    if isinstance(settings, str):
+        settings = Settings(array=Array(layout=settings))
+    _require("settings", settings, Settings, "Settings.load reads, or the name of a layout")
     return _array.draw(
         style_of(**look),
         settings,
@@ -243,13 +253,36 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
     target : str, Path or binary file
     format : {"png", "svg", "pdf"}, optional
         By default what the name ends in.
+
+    Raises
+    ------
+    ArgumentError
+        The format is unknown, or the name has none.
     """
     kind = format or Path(str(target)).suffix.lower().lstrip(".")
+    if format:
+        checks.choice("format", format, _FORMATS)
+    elif kind not in _FORMATS:
+        raise ArgumentError(
+            "an open file names no format; give format"
+            if hasattr(target, "write")
+            else f"{target} ends in none of .pdf, .png and .svg; give such a name, or format"
+        )
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     with mpl.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
         figure.savefig(target, format=kind, metadata=undated)
 
 
+def _canvas_of(image: Energyscape, dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None) -> Canvas:
+    _require("image", image, Energyscape, "Pipeline.process returns")
+    return _canvas(dynamic_range_db, look, peaks)
+
+
 def _canvas(dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None = None) -> Canvas:
     checks.positive("dynamic_range_db", dynamic_range_db)
     return Canvas(style_of(**look), dynamic_range_db, tuple(peaks or ()))
+
+
+def _require(name: str, value: object, wanted: type, source: str) -> None:
+    if not isinstance(value, wanted):
+        raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")

@@ -29,6 +29,7 @@ _LEGEND_LINES = 1.4  # height of its lines, by the size of their letters
 _MOST_NAMES = 64
 _BAND_WAVES = 17
 _STEP_DEG = 0.2
+_FINE_DEG = np.geomspace(1e-3, 4.0, 170)  # to either side, 5 % apart: lobes from 0.01° on fall off over many of them
 _HALF_POWER_DB = 10 * math.log10(0.5)
 
 
@@ -54,9 +55,8 @@ def draw(
     lines = _lines(settings, frequencies_hz)
     low_m, high_m = (edge(layout.enabled_positions_m, axis=0) for edge in (np.min, np.max))
     size_mm = 1e3 * (high_m - low_m)
-    spread = f"aperture {size_mm[1]:.3g} × {size_mm[2]:.3g} mm" + (
-        f", {size_mm[0]:.3g} mm deep" if size_mm[0] > 1e-6 else ""
-    )
+    deep_mm, wide_mm, tall_mm = map(_words.number, np.round(size_mm, 6))
+    spread = f"aperture {wide_mm} × {tall_mm} mm" + (f", {deep_mm} mm deep" if size_mm[0] > 1e-6 else "")
     steering = f"steered to azimuth {_words.angle(azimuth_deg)}, elevation {_words.angle(elevation_deg)}"
     legend_pt = (_LEGEND_LINES * (len(lines) + 1) + 1.0) * style.tick_pt
     page, boxes, _ = lay_out(
@@ -73,14 +73,16 @@ def draw(
     ]
     page.caption(_above(inner[0], em_pt), "microphones, seen from behind")
     _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
-    sweep_deg = np.arange(-90.0, 90.0 + _STEP_DEG / 2, _STEP_DEG)
-    still = np.ones_like(sweep_deg)
     told = [f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))]
-    cuts = (
-        (inner[1], "azimuth", sweep_deg, elevation_deg * still, azimuth_deg, told[1]),
-        (inner[2], "elevation", azimuth_deg * still, sweep_deg, elevation_deg, told[0]),
-    )
-    for box, axis, across_deg, up_deg, at_deg, other in cuts:
+    for box, axis, at_deg, other in (
+        (inner[1], "azimuth", azimuth_deg, told[1]),
+        (inner[2], "elevation", elevation_deg, told[0]),
+    ):
+        sweep_deg = _sweep(at_deg)
+        across_deg, up_deg = (
+            sweep_deg if name == axis else np.full_like(sweep_deg, still_deg)
+            for name, still_deg in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
+        )
         page.caption(_above(box, em_pt), f"along {axis}, at {other}")
         axes = page.axes(box.inset(top=legend_pt), x=f"{axis} (°)", y="level (dB)")
         for number, line in enumerate(lines):
@@ -94,7 +96,7 @@ def draw(
                 LINES[number % len(LINES)],
                 color=_colour(style, number),
                 linewidth=1.2 * style.line_pt,
-                label=f"{line.name}: " + ("none" if width is None else f"{width:.3g}°"),
+                label=f"{line.name}: " + ("none" if width is None else f"{_words.number(width)}°"),
             )
         _finish(style, axes, dynamic_range_db, mirrored=axis == "azimuth")
     return page.figure
@@ -124,6 +126,13 @@ def pattern_db(
     return np.asarray(10 * np.log10(np.maximum(power / len(frequencies_hz), 1e-20)))
 
 
+def _sweep(at_deg: float) -> NDArray[np.float64]:
+    """Return angles from -90 to 90°, rising, finer the nearer to one: large arrays have lobes of few hundredths."""
+    even_deg = np.arange(-90.0, 90.0 + _STEP_DEG / 2, _STEP_DEG)
+    near_deg = np.concatenate([at_deg - _FINE_DEG, [at_deg], at_deg + _FINE_DEG])
+    return np.unique(np.concatenate([even_deg, near_deg[np.abs(near_deg) <= 90.0]]))
+
+
 def width_deg(angle_deg: NDArray[np.float64], level_db: NDArray[np.float64], at_deg: float) -> float | None:
     """Return the width at half power of the lobe at an angle; None if it does not fall so far on both sides."""
     middle = int(np.argmin(np.abs(angle_deg - at_deg)))
@@ -144,18 +153,20 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
     Raises
     ------
     ArgumentError
-        A frequency is not positive, or there are too many.
+        A frequency is not positive, or there are too many, or no list of them.
     """
     if frequencies_hz is None:
         low_hz, high_hz = settings.call.low_frequency_hz, settings.call.high_frequency_hz
-        band = f"{low_hz / 1e3:g}–{high_hz / 1e3:g} kHz"
+        band = f"{_words.khz(low_hz)}–{_words.khz(high_hz)} kHz"
         waves_hz = tuple(np.linspace(low_hz, high_hz, _BAND_WAVES).tolist())
-        ends = [Cut(f"{frequency_hz / 1e3:g} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
+        ends = [Cut(f"{_words.khz(frequency_hz)} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
         return [*ends, Cut(f"{band}, mean power", waves_hz)]
+    if isinstance(frequencies_hz, int | float | str):
+        raise ArgumentError(f"frequencies_hz is {frequencies_hz!r}; give a list, of one as [40e3]")
     if not 1 <= len(frequencies_hz) <= _MOST_LINES:
         raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MOST_LINES}")
     return [
-        Cut(f"{checks.positive('frequencies_hz', frequency_hz) / 1e3:g} kHz", (float(frequency_hz),))
+        Cut(f"{_words.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
         for frequency_hz in frequencies_hz
     ]
 

@@ -1,5 +1,6 @@
 """What pictures of levels share: the raster, its scale of colours, the reflectors in it and their list."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,10 @@ __all__ = ["Canvas"]
 _RING_PT = 5.0
 _ROW = 1.6  # height of a row of the list, by the size of its letters
 _MOST_ROWS = 24  # below a picture
+_LEAST_ROWS = 12  # beside one, whatever its height
+_LABEL_EMS = 13.0  # length of what is written along the scale
+_SHARE_ALONE = 0.8  # of its box that a scale takes which no list is under
+_LEVEL_EMS = 5.8  # what a scale that lies takes, with its ticks and its label
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +39,13 @@ class Canvas:
     def lay_out(
         self, heading: Heading, panels: Sequence[Callable[[float], float]], *, width_pt: float
     ) -> tuple[Page, list[Box], Box]:
-        """Return a page with boxes for pictures, and the box of their scale and of the list of reflectors."""
+        """Return a page with boxes for pictures, and the box of their scale and of the list of reflectors.
+
+        However low the pictures are, the scale and some reflectors find room.
+        """
         style, rows = self.style, self._rows()
+        list_pt = _ROW * style.list_pt
+        lying_pt = (_LEVEL_EMS + 0.5) * style.em_pt + list_pt * min(len(rows), _LEAST_ROWS)
         widest_pt = max((text_width_pt(row, style.list_pt, MONOSPACE) for row in rows), default=0.0)
         return lay_out(
             style,
@@ -43,7 +53,8 @@ class Canvas:
             panels,
             width_pt=width_pt,
             side_pt=max(widest_pt + 3 * style.em_pt, 7 * style.em_pt),
-            below_pt=6 * style.em_pt + _ROW * style.list_pt * min(len(rows), _MOST_ROWS),
+            side_tall_pt=lying_pt if rows else _LABEL_EMS / _SHARE_ALONE * style.em_pt + 1.0,
+            below_pt=6 * style.em_pt + list_pt * min(len(rows), _MOST_ROWS),
         )
 
     def level_db(self, energy: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -103,9 +114,9 @@ class Canvas:
     def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB below the strongest") -> Figure:
         """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
         style, em_pt = self.style, self.style.em_pt
-        upright = box.height > 8 * em_pt and box.width < 30 * em_pt
+        height_pt = min(16 * em_pt, (0.45 if self.peaks else _SHARE_ALONE) * box.height)
+        upright = height_pt >= _LABEL_EMS * em_pt and box.width < 30 * em_pt
         if upright:
-            height_pt = min(16 * em_pt, (0.45 if self.peaks else 0.8) * box.height)
             bar = Box(box.left + em_pt, box.bottom + box.height - height_pt - 2 * em_pt, 1.3 * em_pt, height_pt)
             axes = page.axes(bar, y=label)
         else:
@@ -131,11 +142,14 @@ class Canvas:
         if not self.peaks:
             return []
         spatial = any(abs(peak.elevation_deg) >= 0.05 for peak in self.peaks)
-        rows = [f" #  azimuth {'elevat. ' if spatial else ''}  range    dB"]
+        farthest_m = max(peak.range_m for peak in self.peaks)
+        decimals = 2 if farthest_m >= 1 else 2 - math.floor(math.log10(max(farthest_m, 1e-4)))  # three digits of it
+        width = max(5, len(f"{farthest_m:.{decimals}f}"))
+        rows = [f" #  azimuth {'elevat. ' if spatial else ''}  {'range':>{width}}    dB"]
         for number, peak in enumerate(self.peaks, 1):
             angles = (peak.azimuth_deg, peak.elevation_deg) if spatial else (peak.azimuth_deg,)
             directions = " ".join(f"{_tenth(angle_deg):+6.1f}°" for angle_deg in angles)
-            row = f"{number:>2}  {directions}  {peak.range_m:5.2f} m {_tenth(peak.level_db):5.1f}"
+            row = f"{number:>2}  {directions}  {peak.range_m:{width}.{decimals}f} m {_tenth(peak.level_db):5.1f}"
             rows.append(minus(row))
         return rows
 

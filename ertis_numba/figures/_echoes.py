@@ -15,7 +15,8 @@ from ertis_numba.frames import Measurement
 
 __all__ = ["draw"]
 
-_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.0
+_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
+_LEVEL = "dB below the strongest"
 _CURVE_EMS = 14.0
 _MOST_PLACES = 1000
 
@@ -25,7 +26,11 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
     em_pt = canvas.style.em_pt
     heard = chosen(echoes(measurement), microphone)
     heading = _words.of_measurement(
-        "Matched-filter output", measurement.settings, measurement.stamp, *_axis_in_words(heard)
+        "Matched-filter output",
+        measurement.settings,
+        measurement.stamp,
+        *_axis_in_words(heard),
+        values=heard.values,
     )
     rows_pt = min(30.0, 8 + 0.8 * len(heard.values)) * em_pt
     below_pt = (_FLOOR_EMS + _ROOF_EMS) * em_pt
@@ -33,23 +38,24 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         page, (box,), _ = lay_out(
             canvas.style,
             heading,
-            [lambda width_pt: 0.35 * width_pt + below_pt],
+            [lambda width_pt: max(0.35 * width_pt, _CURVE_EMS * em_pt) + below_pt],
             width_pt=720.0,
             side_pt=0.0,
             below_pt=0.0,
         )
-        axes = page.axes(_within(box, em_pt), x="range (m)", y=f"microphone {heard.channels[0]} (dB)")
+        page.caption(box, f"microphone {heard.channels[0]}")
+        axes = page.axes(_within(box, em_pt), x="range (m)", y=_LEVEL)
         _curve(canvas, axes, heard)
         return page.figure
     panel_pt = (_CURVE_EMS + 1.0) * em_pt + rows_pt + below_pt
     page, (box,), side = canvas.lay_out(heading, [lambda _: panel_pt], width_pt=720.0)
     inner = _within(box, em_pt)
-    upper = page.axes(inner.inset(bottom=rows_pt + em_pt), y="mean (dB)")
+    # A mean is below the strongest, as microphones differ: both parts of the picture have the same 0 dB.
+    page.caption(box, f"mean of {len(heard.values)} microphones, and each of them")
+    upper = page.axes(inner.inset(bottom=rows_pt + em_pt), y=_LEVEL)
     _curve(canvas, upper, heard)
     upper.tick_params(labelbottom=False)
-    lower = page.axes(
-        Box(inner.left, inner.bottom, inner.width, rows_pt), x="range (m)", y="microphone (bit of the word)"
-    )
+    lower = page.axes(Box(inner.left, inner.bottom, inner.width, rows_pt), x="range (m)", y="microphone (channel)")
     shown = _rows(canvas, lower, heard)
     row_ticks(lower, heard.channels, height_pt=rows_pt, em_pt=em_pt)
     lower.set_xlim(upper.get_xlim())
@@ -57,9 +63,9 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
 
 
 def _axis_in_words(heard: Heard) -> tuple[str, ...]:
-    if len(heard.axis) == 1:
-        return (f"{heard.axis[0]:.3g} m",)
-    return (f"{heard.axis[0]:.3g}–{heard.axis[-1]:.3g} m every {1e3 * (heard.axis[1] - heard.axis[0]):.2g} mm",)
+    range_m = heard.axis
+    every = f" every {_words.number(1e3 * (range_m[1] - range_m[0]), 2)} mm" if len(range_m) > 1 else ""
+    return (f"{_words.span(range_m)} m{every}",)
 
 
 def _within(box: Box, em_pt: float) -> Box:

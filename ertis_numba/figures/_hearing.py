@@ -9,14 +9,14 @@ from ertis_numba import fft, kernels
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.fast import chain_taps
 from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.window import TimeWindow, time_window
-from ertis_numba.waveform import decimation_taps, matched_band_hz, whole_taps
+from ertis_numba.stages.signals import signals_of
+from ertis_numba.stages.window import time_window
 
 __all__ = ["Heard", "echoes", "signals"]
 
-_MOST_SAMPLES = 2**19  # of the PDM clock, 0.1 s of an eRTIS: what a picture can show
+_MOST_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can show
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,21 +39,10 @@ class Heard:
 
 
 def signals(measurement: Measurement) -> Heard:
-    """Return what is left of the words after the decimation's low pass, of the first 524,288 samples at most."""
+    """Return the signals of the first 524,288 samples at most."""
     settings = measurement.settings
-    n_samples = min(settings.recording.n_samples, _MOST_SAMPLES)
-    count = -(-n_samples // settings.decimation)
-    window = TimeWindow(
-        range_m=np.zeros(0),
-        first_sample=0,
-        n_samples=count,
-        n_fft=count,
-        n_outputs=0,
-        lead=0,
-        start_s=0.0,
-    )
-    values = _demodulated(measurement, settings, window)
-    return Heard(values, np.arange(count) / settings.signal_rate_hz, _channels(settings))
+    values = signals_of(measurement, most_samples=_MOST_SAMPLES)
+    return Heard(values, np.arange(values.shape[1]) / settings.signal_rate_hz, _channels(settings))
 
 
 def echoes(measurement: Measurement) -> Heard:
@@ -68,10 +57,10 @@ def echoes(measurement: Measurement) -> Heard:
         accuracy=Accuracy(oversampling=1),
     )
     layout = microphones(settings.array)
-    own_s, gains = layout.delay_s[layout.enabled], layout.gain[layout.enabled]
-    taps = _taps(settings)
+    own_s = layout.delay_s[layout.enabled]
+    taps = chain_taps(settings)
     window = time_window(settings, largest_delay_s=float(np.abs(own_s).max()), n_taps=len(taps))
-    heard = _demodulated(measurement, settings, window)
+    heard = signals_of(measurement, settings=settings, window=window)
     plain = kernels.load("numpy")
     memory = plain.memory()
     matched = MatchedFilter(
@@ -81,33 +70,12 @@ def echoes(measurement: Measurement) -> Heard:
         memory,
         taps=taps,
         n_mics=len(heard),
-        gain=lambda frequency_hz: np.exp(2j * np.pi * own_s[:, None] * frequency_hz) / gains[:, None],
+        gain=lambda frequency_hz: np.exp(2j * np.pi * own_s[:, None] * frequency_hz),
     )
     analytic = memory.zeros(matched.shape, np.complex64)
     matched(fft.plan(plain.transforms, heard, analytic, zeros=memory.zeros, stream=None), analytic, threads=1)
     envelope = np.abs(analytic[:, 0, window.lead : window.lead + len(window.range_m)])
     return Heard(envelope, window.range_m, _channels(settings))
-
-
-def _demodulated(measurement: Measurement, settings: Settings, window: TimeWindow) -> NDArray[np.float32]:
-    """Return (mic, sample) float32. NumPy's kernels are at hand without being compiled."""
-    layout = microphones(settings.array)
-    plain = kernels.load("numpy")
-    memory = plain.memory()
-    demodulate = Demodulate(settings, layout, window, plain, memory, taps=_taps(settings))
-    out: NDArray[np.float32] = memory.zeros(demodulate.shape, np.float32)
-    demodulate(measurement.words.reshape(len(measurement.words), -1), out)
-    return out
-
-
-def _taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
-    return whole_taps(
-        decimation_taps(
-            pdm_rate_hz=settings.recording.pdm_rate_hz,
-            decimation=settings.decimation,
-            pass_hz=matched_band_hz(settings.call)[1],
-        )
-    )
 
 
 def _channels(settings: Settings) -> NDArray[np.int64]:

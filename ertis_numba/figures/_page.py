@@ -147,6 +147,7 @@ def lay_out(
     width_pt: float,
     side_pt: float,
     below_pt: float,
+    side_tall_pt: float = 0.0,
 ) -> tuple[Page, list[Box], Box]:
     """Return a page, the boxes of its pictures and that of what goes with them.
 
@@ -165,13 +166,15 @@ def lay_out(
         Width of the rest, if it is beside the pictures.
     below_pt : float
         Its height, if it is below them.
+    side_tall_pt : float
+        Its height at least, if it is beside them.
     """
     width_pt = width_pt if style.width_pt is None else style.width_pt
     gap_pt, margin_pt = _GAP_EMS * style.em_pt, min(style.margin_pt, style.em_pt)
     if style.is_wide(width_pt):
         side_pt = max(side_pt, style.side_pt) if side_pt else 0.0
         each_pt = (width_pt - side_pt - 2 * margin_pt - gap_pt * (len(panels) - 1)) / len(panels)
-        tall_pt = max(panel(each_pt) for panel in panels)
+        tall_pt = max(side_tall_pt, *(panel(each_pt) for panel in panels))
         page = Page(
             style,
             heading,

@@ -7,23 +7,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import azimuth_columns, is_closed, reach_rad, spacing_rad, unit_vectors, unrolled_rad
 
 __all__ = [
     "PIXELS",
     "flattened",
     "join_ranges",
-    "maximum_over_elevation",
     "polar_raster",
-    "spacing_rad",
     "sphere_raster",
+    "thickened",
     "volume_raster",
 ]
 
 PIXELS = 1000  # along the longer side of a raster
 _RADIAL_BINS = 500
 _NEAREST = 4  # directions that a place between them is interpolated from
-_FAR = 1.3  # spacings from the nearest direction, beyond which nothing is known
+_SAME_RAD = 1e-9  # between directions that are one
+_THIN = 0.005  # of the range, to either side: ranges within it would be too thin to be seen
 
 
 def join_ranges(
@@ -38,6 +38,18 @@ def join_ranges(
     return (range_m[starts] + range_m[ends]) / 2, np.maximum.reduceat(level_db, starts, axis=1)
 
 
+def thickened(
+    range_m: NDArray[np.float64], level_db: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the ranges and levels to draw: what is too thin to be seen becomes a hundredth of its range thick."""
+    first_m, last_m = float(range_m[0]), float(range_m[-1])
+    half_m = _THIN * last_m
+    if last_m - first_m >= 2 * half_m:
+        return range_m, level_db
+    middle_m = (first_m + last_m) / 2
+    return np.array([middle_m - half_m, middle_m + half_m]), np.repeat(level_db.max(axis=1)[:, None], 2, axis=1)
+
+
 def polar_raster(
     level_db: NDArray[np.float32],
     azimuth_rad: NDArray[np.float64],
@@ -48,24 +60,27 @@ def polar_raster(
 ) -> NDArray[np.float32]:
     """Return levels at points of the horizontal plane: (row, column), NaN outside of the image.
 
-    Bilinear between directions and ranges.
+    Bilinear between directions and ranges; NaN as well where no direction is near.
 
     Parameters
     ----------
     level_db : (direction, range) float32
     azimuth_rad : (direction,) float64
-        Rising.
+        Rising, within a turn.
     range_m : (range,) float64
         Rising.
     left_m : (column,) float64
     ahead_m : (row,) float64
     """
     radius_m = np.hypot(left_m, ahead_m[:, None])
-    direction = np.interp(
-        np.arctan2(left_m, ahead_m[:, None]), azimuth_rad, np.arange(len(azimuth_rad)), left=np.nan, right=np.nan
-    )
+    first_rad = azimuth_rad[0]
+    look_rad = first_rad + (np.arctan2(left_m, ahead_m[:, None]) - first_rad) % (2 * math.pi)
+    direction = np.interp(look_rad, azimuth_rad, np.arange(len(azimuth_rad)), right=np.nan)
     column = np.interp(radius_m, range_m, np.arange(len(range_m)), left=np.nan, right=np.nan)
-    inside = np.isfinite(direction) & np.isfinite(column)
+    nearest_rad = azimuth_rad[np.rint(np.nan_to_num(direction)).astype(np.intp)]
+    gap = np.minimum(np.nan_to_num(direction).astype(np.intp), len(azimuth_rad) - 2)
+    near = np.abs(look_rad - nearest_rad) <= reach_rad(np.diff(azimuth_rad))[gap] + _SAME_RAD
+    inside = np.isfinite(direction) & np.isfinite(column) & near
     raster = np.full(radius_m.shape, np.nan, dtype=np.float32)
     raster[inside] = _bilinear(level_db, direction[inside], column[inside])
     return raster
@@ -150,39 +165,23 @@ def _around(
     distance = distance.reshape(-1, nearest)
     weight = 1 / np.maximum(distance, 1e-6) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
-    if len(directions) > 1:
-        weight[distance[:, 0] > _FAR * spacing_rad(directions)] = np.nan
+    gaps_rad = np.full(max(1, len(directions) - 1), spacing_rad(directions))
+    weight[distance[:, 0] > reach_rad(gaps_rad)[0]] = np.nan
     return place.reshape(-1, nearest), weight.astype(np.float32)
 
 
-def spacing_rad(directions: NDArray[np.float64]) -> float:
-    """Return the usual distance from a direction to its nearest neighbour."""
-    distance, _ = cKDTree(directions).query(directions, k=2)
-    return 2 * math.asin(min(1.0, float(np.median(distance[:, 1])) / 2))
-
-
-def maximum_over_elevation(
-    level_db: NDArray[np.float32], azimuth_rad: NDArray[np.float64], *, spacing_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Gather directions of about the same azimuth; return the azimuths and their maxima.
-
-    Parameters
-    ----------
-    level_db : (direction, range) float32
-    azimuth_rad : (direction,) float64
-    spacing_rad : float
-        Between the azimuths to return, where there are directions.
-    """
-    first = azimuth_rad.min()
-    bins = np.rint((azimuth_rad - first) / max(spacing_rad, 1e-9)).astype(np.intp)
-    order = np.argsort(bins, kind="stable")
-    filled, starts = np.unique(bins[order], return_index=True)
-    return first + filled * spacing_rad, np.maximum.reduceat(level_db[order], starts, axis=0)
-
-
 def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return azimuths and their levels, (direction, range): the strongest where there are several elevations."""
-    if image.is_planar or len(image.azimuth_rad) == 1:
-        return image.azimuth_rad, level_db
-    spacing = spacing_rad(unit_vectors(image.azimuth_rad, image.elevation_rad))
-    return maximum_over_elevation(level_db, image.azimuth_rad, spacing_rad=spacing)
+    """Return rising azimuths and their levels, (direction, range): the strongest where there are several elevations.
+
+    They run on without a jump, and if they go all around the first is the last as well, a turn later.
+    """
+    columns = azimuth_columns(image.azimuth_rad, image.elevation_rad)
+    highest_db = np.maximum.reduceat(level_db[columns.order], columns.starts, axis=0)
+    azimuth_rad = unrolled_rad(columns.azimuth_rad)
+    order = np.argsort(azimuth_rad, kind="stable")
+    azimuth_rad, highest_db = azimuth_rad[order], highest_db[order]
+    starts = np.flatnonzero(np.diff(azimuth_rad, prepend=-np.inf) > _SAME_RAD)
+    azimuth_rad, highest_db = azimuth_rad[starts], np.maximum.reduceat(highest_db, starts, axis=0)
+    if is_closed(azimuth_rad):
+        return np.append(azimuth_rad, azimuth_rad[0] + 2 * math.pi), np.concatenate([highest_db, highest_db[:1]])
+    return azimuth_rad, highest_db

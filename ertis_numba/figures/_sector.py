@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Box, Page
-from ertis_numba.figures._sampling import PIXELS, flattened, join_ranges, polar_raster
+from ertis_numba.figures._sampling import PIXELS, flattened, join_ranges, polar_raster, thickened
+from ertis_numba.figures._style import text_width_pt
 from ertis_numba.frames import Energyscape, Peak
 
 __all__ = ["draw", "draw_into", "height_of"]
@@ -54,9 +55,8 @@ def draw_into(
     *,
     title: str = "",
 ) -> AxesImage:
-    """Draw levels (direction, range) as a sector with rings, rays and the reflectors."""
-    order = np.argsort(azimuth_rad, kind="stable")
-    azimuth_rad, level_db = _fan(azimuth_rad[order], level_db[order])
+    """Draw levels (direction, range), of rising azimuths, as a sector with rings, rays and the reflectors."""
+    azimuth_rad, level_db = _fan(azimuth_rad, level_db)
     extent = _extent(azimuth_rad, range_m)
     left, right, bottom, top = extent
     em_pt = canvas.style.em_pt
@@ -64,7 +64,7 @@ def draw_into(
     axes = page.axes(inner.fitted((top - bottom) / (right - left)))
     page.caption(box, title)
     step_m = max(right - left, top - bottom) / PIXELS
-    rings_m, levels_db = join_ranges(range_m, level_db)
+    rings_m, levels_db = thickened(*join_ranges(range_m, level_db))
     raster = polar_raster(
         levels_db,
         azimuth_rad,
@@ -76,7 +76,7 @@ def draw_into(
     axes.set_xlim(left, right)
     axes.set_ylim(bottom, top)
     axes.set_axis_off()
-    _rings(canvas, axes, azimuth_rad, range_m)
+    _rings(canvas, axes, azimuth_rad, range_m, half_m=step_m / 2)
     _rays(canvas, axes, azimuth_rad, range_m)
     triangle: dict[str, Any] = {"marker": "^", "markersize": 0.9 * em_pt, "color": canvas.style.ink}
     axes.plot(0, 0, **triangle, clip_on=False, scalex=False, scaley=False)
@@ -123,31 +123,40 @@ def _extent(azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> t
     return float(min(across_m)), float(max(across_m)), float(min(ahead_m)), float(max(ahead_m))
 
 
-def _rings(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> None:
+def _rings(
+    canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64], *, half_m: float
+) -> None:
+    """Draw rings and their names, of ranges of the image or half a pixel off."""
     last_m, size_pt = range_m[-1], canvas.style.tick_pt
     arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
-    # Names stand beside the eastern edge, or under it where that edge runs level.
-    level = abs(math.degrees(azimuth_rad[0]) + 90) < 20
-    offset, align = (
-        ((0.0, -1.4 * size_pt), "center")
-        if level
-        else ((0.8 * size_pt, math.copysign(0.8 * size_pt, -math.cos(azimuth_rad[0]))), "left")
-    )
-    for ring_m in MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(0.0, last_m):
-        if not 0 < ring_m <= last_m * (1 + 1e-9):
-            continue
-        if ring_m >= range_m[0]:
+    # Names stand beside the first edge, outside of the sector, or under or over it where that edge runs level.
+    outwards = math.copysign(1.0, -math.cos(azimuth_rad[0]))
+    level = abs(math.degrees(math.asin(math.cos(azimuth_rad[0])))) < 20
+    if level:
+        offset, align = (0.0, 1.4 * size_pt * math.copysign(1.0, math.sin(azimuth_rad[0]))), "center"
+    else:
+        offset, align = (0.8 * size_pt, 0.8 * size_pt * outwards), "left"
+    ticks_m = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(0.0, last_m)
+    rings_m = [float(ring_m) for ring_m in ticks_m if 0 < ring_m <= last_m + half_m]
+    names = [f"{ring_m:g} m" for ring_m in rings_m]
+    widest_pt = max((text_width_pt(name, size_pt, canvas.style.font) for name in names), default=0.0) + 0.5 * size_pt
+    (left_m, right_m), width_pt = axes.get_xlim(), axes.bbox.width * 72 / axes.figure.dpi
+    every = math.ceil(widest_pt * (right_m - left_m) / (rings_m[0] * width_pt)) if level and names else 1
+    for number, (ring_m, name) in enumerate(zip(rings_m, names, strict=True), 1):
+        if ring_m >= range_m[0] - half_m:
             _line(canvas, axes, -ring_m * np.sin(arc), ring_m * np.cos(arc))
-        _name(canvas, axes, _place(azimuth_rad[0], ring_m), f"{ring_m:g} m", offset=offset, align=(align, "center"))
+        if (len(names) - number) % every == 0:
+            _name(canvas, axes, _place(azimuth_rad[0], ring_m), name, offset=offset, align=(align, "center"))
 
 
 def _rays(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> None:
     first_deg, last_deg = np.degrees(azimuth_rad[[0, -1]])
     spacing_deg = 15 if last_deg - first_deg < 100 else 30
     gap_pt = 0.5 * canvas.style.tick_pt
-    for ray_deg in range(-180, 181, spacing_deg):
-        if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6 or (ray_deg == -180 and last_deg > 180 - 1e-6):
-            continue
+    first, last = math.ceil((first_deg - 1e-6) / spacing_deg), math.floor((last_deg + 1e-6) / spacing_deg)
+    if (last - first) * spacing_deg == 360:  # the last is the first
+        first += 1
+    for ray_deg in range(first * spacing_deg, last * spacing_deg + 1, spacing_deg):
         ray = math.radians(ray_deg)
         across, ahead = _place(ray, 1.0)
         _line(canvas, axes, range_m[[0, -1]] * across, range_m[[0, -1]] * ahead)
@@ -155,7 +164,7 @@ def _rays(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m:
             canvas,
             axes,
             _place(ray, range_m[-1]),
-            _words.angle(ray_deg),
+            _words.angle(math.remainder(ray_deg, 360.0)),
             offset=(gap_pt * across, gap_pt * ahead),
             align=(_side(across, "right", "left"), _side(ahead, "top", "bottom")),
         )

@@ -25,7 +25,8 @@ __all__ = ["chosen", "draw", "row_ticks", "spectrogram"]
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
 _MOST_TRACES = 64
 _COLUMNS = 1200  # of a trace: the least and the greatest of each are drawn
-_MOST_SPECTRA = 600
+_MOST_SPECTRA = 600  # columns of a spectrogram: of the spectra in each the greatest is drawn
+_CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 _LOUDEST = 0.999  # share of the samples that stay within their row
 
 
@@ -44,13 +45,15 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         return 0.62 * width_pt + (_FLOOR_EMS + _ROOF_EMS) * em_pt
 
     some_ms, all_ms = 1e3 * len(heard.axis) / settings.signal_rate_hz, 1e3 * settings.recording.duration_s
+    some_in_words, all_in_words = _words.number(some_ms, 4), _words.number(all_ms, 4)
     page, boxes, side = canvas.lay_out(
         _words.of_measurement(
             "Microphone signals",
             settings,
             measurement.stamp,
-            f"{settings.signal_rate_hz / 1e3:.4g} kHz sample rate",
-            f"{all_ms:.4g} ms" if some_ms > 0.999 * all_ms else f"the first {some_ms:.4g} of {all_ms:.4g} ms",
+            f"{_words.number(settings.signal_rate_hz / 1e3, 4)} kHz sample rate",
+            f"{all_in_words} ms" if some_ms > 0.999 * all_ms else f"the first {some_in_words} of {all_in_words} ms",
+            values=heard.values,
         ),
         [traces_pt, spectrogram_pt],
         width_pt=1008.0,
@@ -60,8 +63,8 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         for box in boxes
     ]
     loudest = float(np.quantile(np.abs(heard.values), _LOUDEST)) or 1.0
-    page.caption(_above(inner[0], em_pt), f"a row is ±{loudest:.2g} of full scale")
-    axes = page.axes(inner[0], x="time (ms)", y="microphone (bit of the word)")
+    page.caption(_above(inner[0], em_pt), f"a row is ±{_words.number(loudest, 2)} of full scale")
+    axes = page.axes(inner[0], x="time (ms)", y="microphone (channel)")
     _traces(canvas, axes, heard, loudest)
     whose = f"mean of {rows} microphones" if rows > 1 else f"microphone {heard.channels[0]}"
     page.caption(_above(inner[1], em_pt), f"spectrogram, {whose}")
@@ -100,25 +103,34 @@ def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_p
 def spectrogram(
     heard: Heard, settings: Settings
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean power of short spectra: (frequency, time) float32, the frequencies and the times.
+    """Return the power of short spectra, mean over the microphones: (frequency, time) float32, frequencies and times.
 
     The Hann window is about as long as the call stays within the bandwidth of the window, ``2 √(T / B)``: where a
-    sweep looks sharpest.
+    sweep looks sharpest. Of a long record a column is the greatest of many spectra, which overlap by half at least, so
+    that no echo falls between them.
     """
     call, rate_hz = settings.call, settings.signal_rate_hz
     swept_hz = call.high_frequency_hz - call.low_frequency_hz
     count = len(heard.axis)
     size = min(count, max(16, round(2 * math.sqrt(call.duration_s / swept_hz) * rate_hz)))
     n_fft = scipy.fft.next_fast_len(4 * size)
-    starts = np.unique(np.linspace(0, count - size, min(_MOST_SPECTRA, count - size + 1)).astype(np.intp))
+    joined = max(1, math.ceil((count - size) / (size / 2) / _MOST_SPECTRA))
+    n_spectra = min(joined * _MOST_SPECTRA, count - size + 1)
+    starts = np.rint(np.linspace(0, count - size, n_spectra)).astype(np.intp)
+    columns = starts.reshape(-1, joined)
     window = np.hanning(size + 2)[1:-1].astype(np.float32)
     frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
     inside = frequency_hz <= min(rate_hz / 2, 1.3 * call.high_frequency_hz)
-    power = np.zeros((len(starts), int(inside.sum())), dtype=np.float32)
-    for values in heard.values:
-        pieces = np.lib.stride_tricks.sliding_window_view(values, size)[starts] * window
-        power += np.abs(scipy.fft.rfft(pieces, n_fft)[:, inside]) ** 2
-    times_s = heard.axis[starts] + (size - 1) / 2 / rate_hz
+    power = np.empty((len(columns), int(inside.sum())), dtype=np.float32)
+    step = max(1, _CHUNK // (joined * n_fft))
+    for first in range(0, len(columns), step):
+        some = columns[first : first + step]
+        summed = np.zeros((some.size, power.shape[1]), dtype=np.float32)
+        for values in heard.values:
+            pieces = np.lib.stride_tricks.sliding_window_view(values, size)[some.ravel()] * window
+            summed += np.abs(scipy.fft.rfft(pieces, n_fft)[:, inside]) ** 2
+        power[first : first + step] = summed.reshape(*some.shape, -1).max(axis=1)
+    times_s = heard.axis[columns].mean(axis=1) + (size - 1) / 2 / rate_hz
     return power.T / np.float32(len(heard.values)), frequency_hz[inside], times_s
 
 

@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Box, Page
-from ertis_numba.figures._sampling import join_ranges, volume_raster
+from ertis_numba.figures._sampling import join_ranges, thickened, volume_raster
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 
@@ -24,12 +24,23 @@ _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
 _MOST_RATIO = 1.1
 
 
-def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float) -> Figure:
-    """Draw the plane of a height and the upright one that runs forward at a distance to the left."""
+def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float | None) -> Figure:
+    """Draw the plane of a height and the upright one that runs forward at a distance to the left.
+
+    Raises
+    ------
+    ArgumentError
+        The image does not reach to a plane, or it is planar and the upright one was asked for.
+    """
+    if image.is_planar and left_m is not None:
+        raise ArgumentError(
+            f"left_m is {left_m:g}, but a planar image has no upright plane; "
+            "leave it out, or give an image with elevations"
+        )
     level_db = canvas.level_db(image.energy)
     cuts = [_level(image, height_m)]
     if not image.is_planar:
-        cuts.append(_upright(image, left_m))
+        cuts.append(_upright(image, left_m or 0.0))
     rasters = [cut.sample(level_db, image) for cut in cuts]
     page, boxes, side = canvas.lay_out(
         _words.of_image(image), [cut.height_at(canvas) for cut in cuts], width_pt=720.0 if len(cuts) == 1 else 1008.0
@@ -76,7 +87,7 @@ class _Cut:
         points_m = np.full((len(up_m), len(across_m), 3), self.at_m)
         points_m[..., self.across] = across_m
         points_m[..., self.up] = up_m[:, None]
-        range_m, joined_db = join_ranges(image.range_m, level_db, most=_PIXELS)
+        range_m, joined_db = thickened(*join_ranges(image.range_m, level_db, most=_PIXELS))
         directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         raster = volume_raster(joined_db, directions, range_m, points_m=points_m)
         if np.isnan(raster).all():
@@ -107,6 +118,7 @@ class _Cut:
         shown = canvas.show(axes, raster, extent=self.extent_m)
         axes.set_xlim(*self.extent_m[:2])
         axes.set_ylim(*self.extent_m[2:])
+        axes.locator_params(min_n_ticks=1)  # more would run into each other in a narrow picture
         canvas.grid(axes)
         canvas.mark_peaks(axes, self._place)
         return shown

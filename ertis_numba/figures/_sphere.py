@@ -6,15 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import FuncFormatter, MultipleLocator
 from numpy.typing import NDArray
 
 from ertis_numba.figures import _sector, _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Box, Page
-from ertis_numba.figures._sampling import PIXELS, flattened, spacing_rad, sphere_raster
+from ertis_numba.figures._sampling import PIXELS, flattened, sphere_raster
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import spacing_rad, unit_vectors, unrolled_rad
 
 __all__ = ["draw", "draw_map"]
 
@@ -50,8 +50,11 @@ class _Map:
         self._canvas, self._em_pt = canvas, canvas.style.em_pt
         self._directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         half_deg = math.degrees(spacing_rad(self._directions)) / 2 if len(self._directions) > 1 else 1.0
-        azimuth_deg, elevation_deg = np.degrees(image.azimuth_rad), np.degrees(image.elevation_rad)
+        azimuth_deg = np.degrees(unrolled_rad(image.azimuth_rad, 3 * math.radians(half_deg)))
+        elevation_deg = np.degrees(image.elevation_rad)
         self._west, self._east = float(azimuth_deg.max() + half_deg), float(azimuth_deg.min() - half_deg)
+        if self._west - self._east > 360.0 - half_deg:  # all around
+            self._west, self._east = 180.0, -180.0
         self._low = max(-90.0, float(elevation_deg.min() - half_deg))
         self._high = min(90.0, float(elevation_deg.max() + half_deg))
         ratio = (self._high - self._low) / (self._west - self._east)
@@ -83,7 +86,7 @@ class _Map:
         axes.set_ylim(low, high)
         self._ticks(axes, inner.width)
         canvas.grid(axes)
-        canvas.mark_peaks(axes, lambda peak: (peak.azimuth_deg, peak.elevation_deg))
+        canvas.mark_peaks(axes, lambda peak: (east + (peak.azimuth_deg - east) % 360.0, peak.elevation_deg))
         return shown
 
     def _ticks(self, axes: Axes, width_pt: float) -> None:
@@ -93,3 +96,9 @@ class _Map:
             spacing_deg *= 2
         for axis, span in ((axes.xaxis, spans[0]), (axes.yaxis, spans[1])):
             axis.set_major_locator(MultipleLocator(spacing_deg if span > spacing_deg else max(1.0, round(span / 2))))
+        axes.xaxis.set_major_formatter(FuncFormatter(_name))
+
+
+def _name(azimuth_deg: float, _: object = None) -> str:
+    """Return the name of a tick, as reflectors have azimuths: from -180 to 180."""
+    return _words.minus(f"{math.remainder(azimuth_deg, 360.0):g}")

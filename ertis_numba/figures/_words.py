@@ -1,15 +1,21 @@
 """What pictures say above themselves: what is seen, of which sensor, when, and with which settings."""
 
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["Heading", "angle", "minus", "of_array", "of_image", "of_measurement"]
+__all__ = ["Heading", "angle", "khz", "minus", "number", "of_array", "of_image", "of_measurement", "span"]
+
+
+_FAINT_DB = -100.0
+"""Of full scale: about what the noise of one-bit conversion alone has; bits that never change stay below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +38,11 @@ def of_image(image: Energyscape) -> Heading:
     adaptive = "" if processing.beamformer == "delay_and_sum" else f", {processing.beamformer.replace('_', ' ')}"
     budget_db = settings.accuracy.max_error_db
     return Heading(
-        ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}"),
+        ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.energy)),
         (
             *_of_sensor(settings),
             directions,
-            f"{image.range_m[0]:.3g}–{image.range_m[-1]:.3g} m in {len(image.range_m)} ranges",
+            f"{span(image.range_m)} m in {len(image.range_m)} range{'s' if len(image.range_m) > 1 else ''}",
             f"method {processing.method}{adaptive}",
             *((f"error up to {minus(f'{budget_db:g}')} dB",) if processing.method == "fast" else ()),
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
@@ -45,10 +51,19 @@ def of_image(image: Energyscape) -> Heading:
     )
 
 
-def of_measurement(what: str, settings: Settings, stamp: Stamp, *parts: str) -> Heading:
-    """Return the words above what was recorded."""
+def _if_faint(values: NDArray[np.floating]) -> tuple[str, ...]:
+    """Return what to say where there is next to nothing: colours, from the strongest down, look like any picture."""
+    strongest = float(np.abs(values).max(initial=0.0))
+    if not strongest:
+        return ("silence: all values are 0",)
+    level_db = 20 * math.log10(strongest)
+    return (f"the strongest is {minus(f'{level_db:.0f}')} dB of full scale",) if level_db < _FAINT_DB else ()
+
+
+def of_measurement(what: str, settings: Settings, stamp: Stamp, *parts: str, values: NDArray[np.floating]) -> Heading:
+    """Return the words above ``values`` that were recorded."""
     return Heading(
-        (what, stamp.sensor, f"measurement {stamp.sequence}"),
+        (what, stamp.sensor, f"measurement {stamp.sequence}", *_if_faint(values)),
         (
             *_of_sensor(settings),
             *parts,
@@ -78,7 +93,7 @@ def _of_sensor(settings: Settings) -> tuple[str, str]:
     call = settings.call
     return (
         settings.array.layout,
-        f"call {call.low_frequency_hz / 1e3:g}–{call.high_frequency_hz / 1e3:g} kHz, {call.duration_s * 1e3:g} ms",
+        f"call {khz(call.low_frequency_hz)}–{khz(call.high_frequency_hz)} kHz, {number(1e3 * call.duration_s, 6)} ms",
     )
 
 
@@ -92,6 +107,28 @@ def _time(stamp: Stamp) -> tuple[str, ...]:
     except (OverflowError, OSError, ValueError):  # a clock that was never set
         return ()
     return (f"{moment:%Y-%m-%d %H:%M:%S}.{nanoseconds // 10**6:03d} UTC",)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number to so many digits, of large ones all before the point; never with an exponent."""
+    before = math.floor(math.log10(abs(value))) + 1 if value else 1
+    text = f"{value:.{max(0, digits - before)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def khz(frequency_hz: float) -> str:
+    """Return a frequency in kilohertz."""
+    return number(frequency_hz / 1e3, 6)
+
+
+def span(values: NDArray[np.float64]) -> str:
+    """Return the first and the last of rising values, to so many digits that they differ, or the only one."""
+    first, last = float(values[0]), float(values[-1])
+    for digits in range(3, 10):
+        low, high = number(first, digits), number(last, digits)
+        if low != high:
+            return f"{low}–{high}"
+    return low
 
 
 def angle(degrees: float) -> str:

@@ -1,7 +1,19 @@
 """Foreign formats."""
 
 from ertis_numba.interop._export import FORMATS, TOPICS, export, files_of, format_of
+from ertis_numba.interop.pcm import PcmReader, open_pcm
 from ertis_numba.interop.rtis import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
 
-__all__ = ["FORMATS", "TOPICS", "RawReader", "export", "files_of", "format_of", "open_raw", "open_rtis_folder"]
+__all__ = [
+    "FORMATS",
+    "TOPICS",
+    "PcmReader",
+    "RawReader",
+    "export",
+    "files_of",
+    "format_of",
+    "open_pcm",
+    "open_raw",
+    "open_rtis_folder",
+]

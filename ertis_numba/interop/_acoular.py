@@ -1,4 +1,4 @@
-"""Microphone signals for Acoular: an HDF5 file of them, and an XML file of the array.
+"""Microphone signals of Acoular and for it: an HDF5 file of them, and an XML file of the array.
 
 What `acoular.TimeSamples` and `acoular.MicGeom` of Acoular 24 to 26 read (https://www.acoular.org).
 """
@@ -6,25 +6,28 @@ What `acoular.TimeSamples` and `acoular.MicGeom` of Acoular 24 to 26 read (https
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.atomic import require_room
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, self_contained
-from ertis_numba.stages.fast import chain_taps
+from ertis_numba.settings import Array, Recording, Settings
+from ertis_numba.stages.signals import signals_of
 
-__all__ = ["signals_of", "write_acoular"]
+__all__ = ["read_acoular", "write_acoular"]
 
 
 def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
     """Write the signals of a measurement, and the positions of the microphones that they come from.
 
-    Positions are in the sensor frame, x forward, y left and z up, in metres.
+    Signals are divided by the calibrated gains; calibrated delays are left in. Positions are in the sensor frame, x
+    forward, y left and z up, in metres.
     """
     layout = microphones(measurement.settings.array)
     signals = signals_of(measurement)
@@ -40,31 +43,49 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
             facts[name] = value
 
 
-def signals_of(measurement: Measurement) -> NDArray[np.float32]:
-    """Return the demodulated signals of the enabled microphones: (mic, sample) float32, full scale 1.
+def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
+    """Return the rate in hertz, the signals, (sample, channel), and the settings of a file that `write_acoular` made.
 
-    Sample n is the one at the PDM word n times the decimation. They are low-passed and divided by the calibrated
-    gain; calibrated delays are left in.
+    The settings are those of what is in the file: only the microphones that were enabled, without gains, which the
+    signals were divided by, and ranges counted in its samples. Of other files they are None.
+
+    Raises
+    ------
+    DataError
+        The file is not one of Acoular.
     """
-    settings = measurement.settings
-    layout = microphones(settings.array)
-    channels = np.flatnonzero(layout.enabled).astype(np.int32)
-    taps = chain_taps(settings)
-    count = -(-settings.recording.n_samples // settings.decimation)
-    signals = np.zeros((len(channels), count), dtype=np.float32)
-    # All devices give the same bits, and this one has nothing to compile.
-    kernels.load("numpy").demodulate_words(
-        measurement.words.reshape(settings.recording.n_samples, -1),
-        channels,
-        taps,
-        np.float32(1 / taps.sum(dtype=np.int64)),
-        settings.decimation,
-        0,
-        count,
-        signals,
+    try:
+        with h5py.File(path, "r") as file:
+            numbers = np.asarray(file["time_data"][()])
+            rate_hz = float(file["time_data"].attrs["sample_freq"])
+            told = file["metadata"].attrs.get("settings") if "metadata" in file else None
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            f"{path} holds no time_data with a sample_freq; give a file of Acoular, or a recording to 'ertis process'"
+        ) from error
+    numbers = numbers[:, None] if numbers.ndim == 1 else numbers
+    if numbers.ndim != 2 or not numbers.size or numbers.dtype.kind not in "fi":
+        raise DataError(
+            f"{path}: time_data is {numbers.dtype} of shape {numbers.shape}; give floating or signed numbers of shape "
+            "(sample, channel)"
+        )
+    return rate_hz, numbers, None if told is None else _of_signals(Settings.from_toml(str(told), str(path)), rate_hz)
+
+
+def _of_signals(settings: Settings, rate_hz: float) -> Settings:
+    """Return the settings of a recording for the signals that were made of it."""
+    layout, step = microphones(settings.array), round(settings.recording.sample_rate_hz / rate_hz)
+    array = Array(
+        layout=layout.name,
+        positions_m=tuple((float(x), float(y), float(z)) for x, y, z in layout.enabled_positions_m),
+        delay_s=tuple(layout.delay_s[layout.enabled].tolist()),
     )
-    signals /= layout.gain[layout.enabled, None].astype(np.float32)
-    return signals
+    processing = settings.processing
+    return settings.replace(
+        array=array,
+        recording=Recording(sample_rate_hz=rate_hz, n_samples=1, encoding="float32"),
+        processing=processing.replace(range_decimation=max(1, processing.range_decimation // step), decimation=None),
+    )
 
 
 def _xml(layout: Layout) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.atomic import check_target, replacing
+from ertis_numba.atomic import check_target, remedy, replacing
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.interop._mountings import Mountings, checked
@@ -21,6 +21,7 @@ _POINTS = (
     *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
     *("sensor", "sequence", "sec", "nanosec"),
 )
+_FINDING = ("mounting", "top", "min_level_db")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,22 +34,26 @@ class Format:
         Of the file.
     holds : tuple of str
         Names of what is in the file.
+    options : tuple of str
+        Of `export`, which other formats have no use for.
     """
 
     ending: str
     holds: tuple[str, ...]
+    options: tuple[str, ...] = ()
 
 
 FORMATS: Final = {
-    "mcap": Format(ending=".mcap", holds=(*TOPICS, "tf_static")),
-    "ply": Format(ending=".ply", holds=_POINTS),
-    "pcd": Format(ending=".pcd", holds=_POINTS),
+    "mcap": Format(ending=".mcap", holds=(*TOPICS, "tf_static"), options=(*_FINDING, "topics")),
+    "ply": Format(ending=".ply", holds=_POINTS, options=(*_FINDING, "text")),
+    "pcd": Format(ending=".pcd", holds=_POINTS, options=(*_FINDING, "text")),
     "csv": Format(
         ending=".csv",
         holds=(
             *("sensor", "epoch", "sequence", "sync_count", "timestamp_ns"),
             *("x_m", "y_m", "z_m", "energy", "uncertainty_range_m", "uncertainty_across_m"),
         ),
+        options=_FINDING,
     ),
     "npz": Format(
         ending=".npz",
@@ -80,8 +85,19 @@ def format_of(path: str | Path, name: str | None = None) -> str:
 
 
 def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
-    """Return the files that an export makes: for ``acoular`` also that of the array, with the ending ``.xml``."""
-    return (Path(path), Path(path).with_suffix(".xml"))[: 1 + (name == "acoular")]
+    """Return the files that an export makes: for ``acoular`` also that of the array, with the ending ``.xml``.
+
+    Raises
+    ------
+    ArgumentError
+        Both would be one.
+    """
+    if name != "acoular":
+        return (Path(path),)
+    files = Path(path), Path(path).with_suffix(".xml")
+    if files[0] == files[1]:
+        raise ArgumentError(f"{path} is where the array would be written, beside the signals; give a name in .h5")
+    return files
 
 
 def export(
@@ -90,9 +106,9 @@ def export(
     *,
     file_format: str | None = None,
     mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
-    topics: Collection[str] = TOPICS,
-    top: int = 256,
-    min_level_db: float = -20.0,
+    topics: Collection[str] | None = None,
+    top: int | None = None,
+    min_level_db: float | None = None,
     text: bool = False,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
@@ -112,10 +128,10 @@ def export(
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Where each sensor is on its platform, by its name, as for `RecordingWriter`; points of ``ply``, ``pcd`` and
         ``csv`` are then in the frame of the platform, else in that of the sensor.
-    topics : collection of {"points", "image", "sonar_image"}
-        What of each sensor goes into ``mcap``.
-    top, min_level_db
-        Which points: see `ertis_numba.stages.points.PointExtractor`.
+    topics : collection of {"points", "image", "sonar_image"}, optional
+        What of each sensor goes into ``mcap``; all by default.
+    top, min_level_db : optional
+        Which points: see `ertis_numba.stages.points.PointExtractor`, whose defaults hold.
     text : bool
         ``ply`` and ``pcd`` as text.
     overwrite : bool
@@ -134,12 +150,11 @@ def export(
         The disk is full or cannot be written.
     """
     name = format_of(path, file_format)
-    for topic in topics:
+    finding = {"top": top, "min_level_db": min_level_db}
+    _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding})
+    chosen = TOPICS if topics is None else topics
+    for topic in chosen:
         checks.choice("topic", topic, TOPICS)
-    if set(topics) != set(TOPICS) and name != "mcap":
-        raise ArgumentError(f"topics are chosen, which format {name!r} has none of; leave them out or give 'mcap'")
-    if text and name not in {"ply", "pcd"}:
-        raise ArgumentError(f"text is asked for, which format {name!r} knows nothing of; leave it out")
     paths = files_of(path, name)
     for each in paths:
         check_target(each, overwrite=overwrite)
@@ -151,15 +166,23 @@ def export(
             elif name == "npz":
                 _write_npz(parts[0], items)
             else:
-                options = {"top": top, "min_level_db": min_level_db}
-                _write_points(name, parts[0], _energyscapes(items), checked(mounting), topics, options, text=text)
+                _write_points(name, parts[0], _energyscapes(items), checked(mounting), chosen, finding, text=text)
     except OSError as error:
         if isinstance(error, ErtisError):  # of what the images come from
             raise
-        raise DataError(
-            f"{path} cannot be written ({error.strerror or error}); free some space or write elsewhere"
-        ) from error
+        raise DataError(f"{path} cannot be written ({error.strerror or error}); {remedy(error)}") from error
     return paths
+
+
+def _require_options(name: str, given: Mapping[str, object]) -> None:
+    """Refuse options that a format has no use for; None is one that is not given."""
+    for option, value in given.items():
+        if value is not None and option not in FORMATS[name].options:
+            *others, last = [other for other, each in FORMATS.items() if option in each.options]
+            fitting = f"{', '.join(others)} or {last}" if others else last
+            raise ArgumentError(
+                f"option {option!r} is given, which format {name!r} does not have; leave it out, or write {fitting}"
+            )
 
 
 # Writers are imported when they are needed: they bring scipy.spatial, and one of them an extra.

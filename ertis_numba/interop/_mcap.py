@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
@@ -59,7 +60,8 @@ def write_mcap(
     Raises
     ------
     ArgumentError
-        What writes MCAP is not installed, two sensors have one topic, or a time is beyond that of ROS 2.
+        What writes MCAP is not installed, two sensors have one topic, a sensor has a name that is none of a frame, or a
+        time is beyond that of ROS 2.
     """
     try:
         from mcap.writer import Writer  # noqa: PLC0415  an extra
@@ -103,7 +105,7 @@ class _Bag:
 
     def _greet(self, image: Energyscape) -> None:
         """Find a name for the topics of a sensor, and keep its settings."""
-        sensor = image.stamp.sensor
+        sensor = checks.sensor_name(image.stamp.sensor)
         name = _NAMED.sub("_", sensor).strip("_")
         name = f"sensor_{name}" if not name[:1].isalpha() else name
         for other, taken in self._names.items():

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import spacing_rad, unit_vectors
 
 __all__ = ["DYNAMIC_RANGE_DB", "Picture"]
 
@@ -48,13 +48,12 @@ def _map(image: Energyscape) -> NDArray[np.int64]:
     """Return the direction that each pixel shows, the number of directions where it shows none: (row, column) int64."""
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     tree = KDTree(directions)
-    apart = float(np.median(tree.query(directions, k=2)[0][:, 1]))  # infinite for a single direction
-    spacing_rad = 2 * math.asin(min(1.0, apart / 2)) or math.pi
+    apart_rad = spacing_rad(directions) or math.pi
     axes = []
     for angle_rad in (image.azimuth_rad, image.elevation_rad):
         span_rad = float(np.ptp(angle_rad))
-        count = min(_MOST_PIXELS, 1 + round(span_rad / max(spacing_rad, span_rad / _MOST_PIXELS)))
+        count = min(_MOST_PIXELS, 1 + round(span_rad / max(apart_rad, span_rad / _MOST_PIXELS)))
         axes.append(np.linspace(angle_rad.max(), angle_rad.min(), count))
     looks = unit_vectors(*np.meshgrid(*axes))
     distance, nearest = tree.query(looks)
-    return np.where(distance > _GAP * spacing_rad, len(directions), nearest).astype(np.int64)
+    return np.where(distance > _GAP * apart_rad, len(directions), nearest).astype(np.int64)

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.interop._points import PointTable
 
 __all__ = ["CSV_COLUMNS", "POINT_FIELDS", "write_csv", "write_pcd", "write_ply"]
@@ -47,7 +48,13 @@ _HEADING = "Point cloud of ertis-numba"
 
 
 def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
-    """Write points as PLY, little-endian or as text."""
+    """Write points as PLY, little-endian or as text.
+
+    Raises
+    ------
+    ArgumentError
+        A number is beyond its type, or a sensor has a name that no header can hold.
+    """
     properties = [f"property {_PLY_TYPES[dtype]} {name}" for name, dtype in POINT_FIELDS.items()]
     head = [
         "ply",
@@ -61,7 +68,13 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
 
 
 def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
-    """Write points as PCD 0.7, little-endian or as text."""
+    """Write points as PCD 0.7, little-endian or as text.
+
+    Raises
+    ------
+    ArgumentError
+        A number is beyond its type, or a sensor has a name that no header can hold.
+    """
     kinds = [np.dtype(dtype) for dtype in POINT_FIELDS.values()]
     count = len(table.rows)
     head = [
@@ -93,8 +106,8 @@ def write_csv(path: Path, table: PointTable) -> None:
 
 
 def _about(table: PointTable) -> list[str]:
-    """Return what stands in comments, a word and its value each."""
-    numbered = [f"sensor {number} {name}" for number, name in enumerate(table.sensors)]
+    """Return what stands in comments, a word and its value each: no name may end a line of the header."""
+    numbered = [f"sensor {number} {checks.sensor_name(name)}" for number, name in enumerate(table.sensors)]
     return [_HEADING, f"frame {table.frame}", *numbered]
 
 

@@ -20,8 +20,6 @@ _POINT: Final = np.dtype(
         *((name, "<f4") for name in ("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across")),
         ("sensor", "<u2"),
         *((name, "<i8") for name in ("epoch", "sequence", "sync_count", "timestamp_ns")),
-        ("sec", "<i4"),
-        ("nanosec", "<u4"),
     ]
 )
 _NS = 1_000_000_000
@@ -33,12 +31,13 @@ class PointFinder:
 
     Parameters
     ----------
-    top, min_level_db
+    top, min_level_db : optional
         As for `ertis_numba.stages.points.PointExtractor`.
     """
 
-    def __init__(self, *, top: int, min_level_db: float) -> None:
-        self._top, self._min_level_db = top, min_level_db
+    def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:
+        given = {"top": top, "min_level_db": min_level_db}
+        self._finding: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
 
     def __call__(self, image: Energyscape) -> PointCloud:
@@ -46,7 +45,7 @@ class PointFinder:
         known = self._extractors.get(image.stamp.sensor)
         if known is None or not same_directions(known[0], image):
             grid = Grid(image.azimuth_rad, image.elevation_rad)
-            extractor = PointExtractor(image.settings, grid, top=self._top, min_level_db=self._min_level_db)
+            extractor = PointExtractor(image.settings, grid, **self._finding)
             known = self._extractors[image.stamp.sensor] = image, extractor
         return known[1](image)
 
@@ -66,8 +65,7 @@ class PointTable:
     Attributes
     ----------
     rows : (point,) structured
-        x, y, z and their uncertainty in metres, intensity, number of the sensor, the stamp of the measurement, and
-        its time once more in whole seconds and nanoseconds.
+        x, y, z and their uncertainty in metres, intensity, number of the sensor, and the stamp of the measurement.
     sensors : tuple of str
         By their numbers.
     frame : str
@@ -104,18 +102,28 @@ class PointTable:
     def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
         """Return some columns, packed, in the types that a format has for them.
 
+        ``sec`` and ``nanosec`` are the time of the measurement as ROS 2 has it.
+
         Raises
         ------
         ArgumentError
-            A number is beyond its type.
+            A number is beyond its type, or a time beyond that of ROS 2.
         """
         made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
+        times = self._ros_times() if {"sec", "nanosec"} & dtypes.keys() else {}
         for name, dtype in dtypes.items():
-            column: NDArray[Any] = self.rows[name]
+            column: NDArray[Any] = times[name] if name in times else self.rows[name]
             made[name] = column.astype(dtype)
             if not np.array_equal(made[name], column, equal_nan=column.dtype.kind == "f"):
                 raise ArgumentError(f"{name} of a measurement is {column.max()}, more than the format holds; use csv")
         return made
+
+    def _ros_times(self) -> dict[str, NDArray[np.int64]]:
+        sec, nanosec = np.divmod(self.rows["timestamp_ns"], _NS)
+        beyond = self.rows[(sec < 0) | (sec > _MOST_SEC)]
+        if len(beyond):
+            raise _no_ros_time(beyond["sequence"][0], beyond["timestamp_ns"][0])
+        return {"sec": sec, "nanosec": nanosec}
 
 
 def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.void]:
@@ -135,7 +143,6 @@ def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.vo
     made["sensor"] = number
     for name in ("epoch", "sequence", "sync_count", "timestamp_ns"):
         made[name] = getattr(stamp, name)
-    made["sec"], made["nanosec"] = ros_time(stamp)
     return made
 
 
@@ -149,8 +156,11 @@ def ros_time(stamp: Stamp) -> tuple[int, int]:
     """
     sec, nanosec = divmod(stamp.timestamp_ns, _NS)
     if not 0 <= sec <= _MOST_SEC:
-        raise ArgumentError(
-            f"measurement {stamp.sequence} has the time {stamp.timestamp_ns} ns, wanted one from 1970 to 2038; use npz "
-            "or csv"
-        )
+        raise _no_ros_time(stamp.sequence, stamp.timestamp_ns)
     return sec, nanosec
+
+
+def _no_ros_time(sequence: int, timestamp_ns: int) -> ArgumentError:
+    return ArgumentError(
+        f"measurement {sequence} has the time {timestamp_ns} ns, wanted one from 1970 to 2038; use npz or csv"
+    )

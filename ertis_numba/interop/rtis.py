@@ -7,8 +7,8 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.geometry import microphones
 from ertis_numba.settings import PRESETS, Settings
+from ertis_numba.words import word_format
 
 __all__ = ["RawReader", "open_raw"]
 
@@ -37,13 +37,9 @@ class RawReader:
     def __init__(
         self, paths: Sequence[Path], settings: Settings, *, sensor: str = "sensor", first: Sequence[int] | None = None
     ) -> None:
-        layout = microphones(settings.array)
         self.settings = settings
         self._sensor = sensor
-        self._dtype = np.dtype(f"<u{layout.word_bits // 8}")
-        n_samples = settings.recording.n_samples
-        self._shape = (n_samples,) if layout.n_words == 1 else (n_samples, layout.n_words)
-        self._n_bytes = n_samples * layout.n_words * self._dtype.itemsize
+        self._format = word_format(settings)
         counts = [self._count(path) for path in paths]
         if not counts:
             raise ArgumentError("no raw file is given; give at least one")
@@ -64,10 +60,10 @@ class RawReader:
         for path, count, start in self._files:
             with path.open("rb") as file:
                 for sequence in range(start, start + count):
-                    block = file.read(self._n_bytes)
-                    if len(block) != self._n_bytes:
+                    block = file.read(self._format.n_bytes)
+                    if len(block) != self._format.n_bytes:
                         raise DataError(f"{path} became shorter while it was read; copy it again")
-                    words = np.frombuffer(block, self._dtype).reshape(self._shape)
+                    words = self._format.of_bytes(block)
                     stamp = Stamp(sensor=self._sensor, sequence=sequence, sync_count=sequence)
                     yield Measurement(words, self.settings, stamp)
 
@@ -80,25 +76,28 @@ class RawReader:
                 n_bytes = file.seek(0, 2)
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a file of raw words") from error
-        count, rest = divmod(n_bytes, self._n_bytes)
+        count, rest = divmod(n_bytes, self._format.n_bytes)
         if count and not rest:
             return count
-        wanted = f"wanted a multiple of {self._n_bytes} ({self._words()})"
+        wanted = f"wanted a multiple of {self._format.n_bytes} ({self._words()})"
         if not n_bytes:
             raise DataError(f"{path} is empty, {wanted}; record it again")
-        if n_bytes % self._dtype.itemsize:
+        if n_bytes % self._format.dtype.itemsize:
             raise DataError(f"{path} has {n_bytes} bytes, which are no whole words, {wanted}; copy it again")
         raise DataError(f"{path} has {n_bytes} bytes, {wanted}; {_remedy(n_bytes)}")
 
     def _words(self) -> str:
-        return f"{self._n_bytes // self._dtype.itemsize} words of {self._dtype.itemsize} bytes"
+        return f"{self._format.n_bytes // self._format.dtype.itemsize} words of {self._format.dtype.itemsize} bytes"
+
+
+_OTHERWISE = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
 
 
 def _remedy(n_bytes: int) -> str:
     """Return what to do about a file of another length: another preset, where one fits."""
     lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}
     fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (4 * n_samples) == 0]
-    return f"its length fits the presets {', '.join(fitting)}" if fitting else "it is cut short: copy it again"
+    return f"its length fits the presets {', '.join(fitting)}" if fitting else _OTHERWISE
 
 
 def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, sensor: str = "sensor") -> RawReader:

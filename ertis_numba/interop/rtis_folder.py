@@ -163,11 +163,11 @@ def _recorded(folder: Path, told: dict[str, Any]) -> Settings:
         sample_rate_hz=number["callSampleFrequency"],
     )
     n_samples = checks.whole(f"{folder}: microphoneSamples", told.get("microphoneSamples", 163_840), 1)
-    recording = Recording(pdm_rate_hz=number["microphoneSampleFrequency"], n_samples=n_samples)
+    recording = Recording(sample_rate_hz=number["microphoneSampleFrequency"], n_samples=n_samples)
     echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
     last_m = min(_FARTHEST_M, math.floor(10 * echo_m) / 10)
     least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
-    step = next((step for step in _RANGE_STEPS if recording.pdm_rate_hz / step >= least_hz), _RANGE_STEPS[-1])
+    step = next((step for step in _RANGE_STEPS if recording.sample_rate_hz / step >= least_hz), _RANGE_STEPS[-1])
     processing = Processing(range_m=(min(0.5, max(0.0, last_m)), max(0.0, last_m)), range_decimation=step)
     return Settings(call=call, recording=recording, processing=processing)
 
@@ -189,7 +189,10 @@ def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Proc
     if "directions" not in told:
         return processing
     count = checks.whole(f"{folder}: directions", told["directions"], 1)
-    planar = not any(told[_ELEVATIONS]) if _ELEVATIONS in told else bool(number("2D", 1))
+    is_flat = told.get("2D", True)
+    if not isinstance(is_flat, bool):
+        is_flat = bool(number("2D", 1))
+    planar = not any(told[_ELEVATIONS]) if _ELEVATIONS in told else is_flat
     half_turn = (-math.pi / 2, math.pi / 2)
     azimuth_rad = told.get(_AZIMUTHS, half_turn) if planar else half_turn
     return processing.replace(

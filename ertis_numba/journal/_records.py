@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.geometry import microphones, mounting, self_contained, storable
+from ertis_numba.geometry import mounting, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
 from ertis_numba.settings import Air, Settings
+from ertis_numba.words import word_format
 
 __all__ = ["Entry", "Gap", "Key", "Sensor", "checked", "require_same"]
 
@@ -105,7 +106,7 @@ class Sensor:
     ) -> Self:
         """Return a sensor, or refuse what no recording could hold."""
         settings = storable(settings)
-        layout = microphones(settings.array)
+        words = word_format(settings)
         place = mounting(checks.sensor_name(name), translation_m, rotation_xyzw)
         made = cls(
             name=name,
@@ -113,8 +114,8 @@ class Sensor:
             firmware=firmware,
             translation_m=tuple(place["translation_m"].tolist()),
             rotation_xyzw=tuple(place["rotation_xyzw"].tolist()),
-            shape=layout.words_shape(settings.recording.n_samples),
-            dtype=layout.word_type,
+            shape=words.shape,
+            dtype=words.dtype,
         )
         if made.n_bytes > _MOST_BYTES:
             raise ArgumentError(

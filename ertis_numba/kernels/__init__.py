@@ -1,7 +1,7 @@
 """The kernels of the signal chain, and the only door to Numba.
 
 `load` returns the kernels of one device as a `KernelSet`. What each kernel does is written once, in
-``_contract.py``; ``_cpu``, ``_cuda`` and ``_numpy`` hold the twins under the same names.
+``_contract``; ``_cpu``, ``_cuda`` and ``_numpy`` hold the twins under the same names.
 """
 
 from ertis_numba.kernels._dispatch import DEVICES, load, usable

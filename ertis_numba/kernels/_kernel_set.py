@@ -42,6 +42,7 @@ class KernelSet:
     memory: NewMemory
     threads: Threads
     unpack_bits: _contract.UnpackBits
+    unpack_pcm: _contract.UnpackPcm
     decimate: _contract.Decimate
     remove_group_delay: _contract.RemoveGroupDelay
     demodulate_words: _contract.DemodulateWords

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, Index, Real, Short, Taps, Words
+from ertis_numba.kernels._contract import Complex, Index, Pcm, Real, Short, Taps, Words
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet
 
@@ -34,6 +34,16 @@ def unpack_bits(words: Words, channels: Index, out: Real) -> None:
     out[:] = np.unpackbits(octets, axis=1, bitorder="little")[:, channels].T
     out *= np.float32(2)
     out -= np.float32(1)
+
+
+def unpack_pcm(words: Pcm, channels: Index, scale: np.float32, silence: np.float32, first: int, out: Real) -> None:
+    """See `UnpackPcm`."""
+    start, stop = max(first, 0), min(first + out.shape[1], len(words))
+    out[:] = 0
+    if start < stop:
+        heard = words[start:stop, channels].T.astype(np.float32)
+        heard[np.abs(heard) < silence] = 0
+        np.multiply(heard, scale, out=out[:, start - first : stop - first])
 
 
 def decimate(signals: Real, taps: Real, factor: int, out: Real) -> None:

@@ -64,6 +64,8 @@ class KeyPair:
             The name cannot be that of a file.
         """
         public, secret = zmq.curve_keypair()
+        while public.startswith(b"-"):  # as one in 85 does, and a command would take it for an option
+            public, secret = zmq.curve_keypair()
         return cls(public.decode(), secret.decode(), name)
 
     @classmethod

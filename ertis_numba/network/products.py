@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
-from ertis_numba.geometry import microphones
 from ertis_numba.network.messages import Description, Group, Image, Points, Raw, Report
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Settings
+from ertis_numba.words import word_format
 
 __all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader"]
 
@@ -171,8 +171,8 @@ def _points(header: Points, payload: Payload, described: _Described, stamp: Stam
 
 def _measurement(header: Raw, payload: Payload, described: _Described, stamp: Stamp) -> Measurement:
     settings = described.settings
-    layout = microphones(settings.array)
-    words = _array(payload, layout.words_shape(settings.recording.n_samples), f"uint{layout.word_bits}")
+    wanted = word_format(settings)
+    words = _array(payload, wanted.shape, wanted.dtype.name)
     if zlib.crc32(words.data) != header.crc32:
         raise DataError(f"measurement {header.sequence} of sensor {header.sensor} has another CRC-32 than its header")
     air = settings.air.replace(

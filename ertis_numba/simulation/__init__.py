@@ -1,4 +1,4 @@
-"""Scenes with known truth, rendered to the PDM words of their sensors.
+"""Scenes with known truth, rendered to the words of their sensors.
 
 `render` and `Simulator` are reached as ``ertis_numba.simulation.render``; they bring the compiled kernels in,
 which the description of a scene does not need.

@@ -1,4 +1,4 @@
-"""From a scene and its effects to PDM words."""
+"""From a scene and its effects to words: PDM bits, or PCM numbers."""
 
 from collections.abc import Iterator
 
@@ -11,12 +11,14 @@ from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.simulation import synthesis
 from ertis_numba.simulation.arrivals import arrivals, effect, gains
+from ertis_numba.simulation.converter import Converter
 from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
 from ertis_numba.simulation.truth import reflectors
+from ertis_numba.words import word_format
 
 __all__ = ["Engine"]
 
@@ -45,7 +47,8 @@ class Engine:
     clock : Stopwatch
         What each effect has cost so far.
     loudest : float
-        The highest amplitude that a modulator has met so far; they follow up to about 0.6.
+        The highest amplitude that a modulator or converter has met so far; modulators follow up to about 0.6,
+        converters up to 1.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, active: frozenset[str], *, threads: int | None = None) -> None:
@@ -58,7 +61,7 @@ class Engine:
         self._layout = microphones(self.sensor.array)
         self._settings = self.sensor.settings()
         self._threads = kernels.load("cpu").max_threads if threads is None else threads
-        rate_hz = self.sensor.recording.pdm_rate_hz
+        rate_hz = self.sensor.recording.sample_rate_hz
         calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
         self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
 
@@ -68,8 +71,11 @@ class Engine:
         Channels without a microphone hold zeros.
         """
         shot = self._shot(index)
-        n_samples, n_words = self.sensor.recording.n_samples, self._layout.n_words
-        words = np.empty((n_samples, n_words), dtype=f"<u{self._layout.word_bits // 8}")
+        form = word_format(self._settings)
+        words = np.zeros(form.rows, form.dtype)
+        if not self.sensor.recording.is_pdm:
+            self._convert(shot, index, words)
+            return Measurement(words, self._settings, self._stamp(shot, index))
         for channels in range(0, len(self._layout.enabled), _CHANNELS):
             part = slice(channels, channels + _CHANNELS)
             columns = slice(channels // self._layout.word_bits, (channels + _CHANNELS) // self._layout.word_bits)
@@ -77,7 +83,7 @@ class Engine:
         if "microphone_faults" in self.active:
             with self.clock("microphone_faults"):
                 effect("microphone_faults", "stick")(words.view(np.uint8), self.sensor.electronics)
-        return Measurement(words if n_words > 1 else words[:, 0], self._settings, self._stamp(shot, index))
+        return Measurement(words.reshape(form.shape), self._settings, self._stamp(shot, index))
 
     def signals(self, index: int = 0) -> NDArray[np.float64]:
         """Return what the modulators receive, their own noise apart: (mic, sample) float64, full scale 1."""
@@ -97,7 +103,6 @@ class Engine:
         """Fill the words of some channels."""
         mics = np.flatnonzero((shot.channels >= part.start) & (shot.channels < part.stop))
         if not len(mics):
-            out[:] = 0
             return
         chosen = slice(mics[0], mics[-1] + 1)
         electronics, recording = self.sensor.electronics, self.sensor.recording
@@ -107,7 +112,7 @@ class Engine:
             np.full(len(mics), self._noise_rms()),
             order=electronics.modulator_order,
             dither=electronics.dither,
-            band=min(self.sensor.call.high_frequency_hz / recording.pdm_rate_hz, 0.25),
+            band=min(self.sensor.call.high_frequency_hz / recording.sample_rate_hz, 0.25),
             threads=self._threads,
         )
         for first, block in zip(_begins(len(out)), self._signals(shot.of_mics(chosen), index), strict=True):
@@ -117,13 +122,28 @@ class Engine:
                 self.loudest = max(self.loudest, float(block[:, ::_EVERY].max()), -float(block[:, ::_EVERY].min()))
             out[first : first + len(words)] = words
 
+    def _convert(self, shot: Snapshot, index: int, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
+        """Fill the numbers of all channels."""
+        converter = Converter(self.sensor.recording, self._keys(index, len(shot.channels)), self._noise_rms())
+        numbers = np.empty((synthesis.BLOCK, len(shot.channels)), out.dtype)
+        for first, block in zip(_begins(len(out)), self._signals(shot, index), strict=True):
+            rows = out[first : first + synthesis.BLOCK]
+            with self.clock("modulation"):
+                converter.process(block, out=numbers[: len(rows)])
+                self.loudest = max(self.loudest, float(np.abs(block[:, : len(rows)]).max()))
+            rows[:, shot.channels] = numbers[: len(rows)]
+        if "microphone_faults" in self.active:
+            with self.clock("microphone_faults"):
+                full = self.sensor.recording.full_scale
+                effect("microphone_faults", "stick_numbers")(out, self.sensor.electronics, full)
+
     def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
         active, recording = self.active, self.sensor.recording
         arrived = arrivals(shot, active, self._node_hz, self.clock)
         blocks = synthesis.signals(
             arrived,
             n_samples=recording.n_samples,
-            rate_hz=recording.pdm_rate_hz,
+            rate_hz=recording.sample_rate_hz,
             n_mics=len(shot.channels),
             threads=self._threads,
             clock=self.clock,

@@ -22,12 +22,12 @@ EFFECTS: Final = {
     "microphone_noise": "white noise of each microphone",
     "microphone_spread": "gains and delays that no calibration knows",
     "microphone_faults": "dead and stuck microphones",
-    "modulation": "sigma-delta modulators make bits",
+    "modulation": "sigma-delta modulators make bits, converters numbers",
 }
 """What each effect is."""
 
 INDISPENSABLE: Final = {
     "propagation": "an image is made of delays",
-    "modulation": "a recording holds bits",
+    "modulation": "a recording holds bits or numbers",
 }
 """Effects of every scene, and why."""

@@ -129,7 +129,8 @@ def _doppler(sight: Sight) -> Estimate | None:
     """Ask how far the motion of targets and sensors shifts the pulses.
 
     A call of hyperbolic frequency modulation, stretched by s, is the call shifted by ``-(s - 1) p₀ / p'``, p₀
-    being its first period and p' the growth of its periods with time.
+    being its first period and p' the growth of its periods with time. In the mean over its frequencies that is so of a
+    linear one, too.
     """
     shot = sight.shot
     scene = shot.scene

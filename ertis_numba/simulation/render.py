@@ -1,4 +1,4 @@
-"""From a scene to the PDM words that its sensors would record."""
+"""From a scene to the words that its sensors would record."""
 
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Processing, Recording

@@ -5,7 +5,7 @@ keep all PDM bits at one value.
 """
 
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import msgspec
 
@@ -49,6 +49,8 @@ class Scene(Document, frozen=True, kw_only=True):
     tones, noises, sonars, ambient
         What else is to be heard.
     """
+
+    former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
 
     seed: int = 0
     rate_hz: float = 20.0
@@ -117,22 +119,23 @@ class Scene(Document, frozen=True, kw_only=True):
             checks.choice("sensor", name, names)
         return self.sensors[0 if name is None else names.index(name)]
 
-    def with_layouts_of(self, folder: Path) -> Self:
-        """Return a scene that depends on no layout file; those it names are looked for in ``folder``."""
-        return self.replace(sensors=tuple(sensor.replace(array=_read(sensor.array, folder)) for sensor in self.sensors))
+    def with_files_of(self, folder: Path) -> Self:
+        """Return a scene that depends on no layout file; those it names are looked for in ``folder``, as are grids."""
+        sensors = [sensor.beside(folder) for sensor in self.sensors]
+        return self.replace(sensors=tuple(sensor.replace(array=_read(sensor.array)) for sensor in sensors))
 
 
-def _read(array: Array, folder: Path) -> Array:
+def _read(array: Array) -> Array:
     if array.positions_m is not None or Path(array.layout).suffix.lower() not in {".toml", ".csv"}:
         return array
-    return load_layout(folder / array.layout).to_array()
+    return load_layout(array.layout).to_array()
 
 
 def load_scene(path: str | Path) -> Scene:
     """Read a scene file.
 
-    A layout file that it names is looked for beside it and written out, so that the scene depends on no
-    other file.
+    Files that it names, of layouts and of directions, are looked for beside it; layouts are written out, so that the
+    scene depends on none.
 
     Raises
     ------
@@ -142,7 +145,7 @@ def load_scene(path: str | Path) -> Scene:
         A layout cannot be read or used, or a sensor has no such channel.
     """
     path = Path(path)
-    scene = Scene.load(path).with_layouts_of(path.parent)
+    scene = Scene.load(path).with_files_of(path.parent)
     for sensor in scene.sensors:
         try:
             sensor.require_microphones()

@@ -54,8 +54,8 @@ class Electronics(Table, frozen=True, kw_only=True):
     Attributes
     ----------
     noise_dbfs : float, optional
-        Root mean square of each microphone's white noise, over the whole band up to half of the PDM
-        rate; none by default. In a band B it is lower by ``10 log10(pdm_rate / 2 B)`` decibels.
+        Root mean square of each microphone's white noise, over the whole band up to half of the
+        record's rate; none by default. In a band B it is lower by ``10 log10(sample_rate / 2 B)`` decibels.
     modulator_order : int
         Order of the sigma-delta modulators, 1 to 4.
     dither : float
@@ -67,7 +67,7 @@ class Electronics(Table, frozen=True, kw_only=True):
     dead_channels : tuple of int
         Microphones that hear nothing; their modulators run on silence.
     stuck_low, stuck_high : tuple of int
-        Channels whose bit is always 0 or always 1.
+        Channels whose bit is always 0 or always 1, or whose number is that at either end of the scale.
     """
 
     noise_dbfs: float | None = None
@@ -138,7 +138,9 @@ class Sensor(Settings, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not _NAME.fullmatch(self.name):
-            raise ArgumentError(f"sensor.name is {self.name!r}; give letters, digits and _ . @ + -")
+            raise ArgumentError(
+                f"sensor.name is {self.name!r}; give letters, digits and _, after the first also . @ + -"
+            )
         checks.between("sensor.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("sensor.pitch_deg", self.pitch_deg, -90.0, 90.0)
         checks.between("sensor.roll_deg", self.roll_deg, -180.0, 180.0)

@@ -14,6 +14,7 @@ from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import pulse
 from ertis_numba.simulation.arrivals import echoes, effect, responses
+from ertis_numba.simulation.converter import QUANTISATION_DBFS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
@@ -114,10 +115,12 @@ class Sight:
 
     @functools.cached_property
     def noise(self) -> float:
-        """The highest amplitude that the modulators' noise reaches in the image."""
+        """The highest amplitude that the noise of modulators or converters reaches in the image."""
+        if not self.settings.recording.is_pdm:
+            return self.of_white_noise(QUANTISATION_DBFS[self.settings.recording.encoding])
         order = self.shot.sensor.electronics.modulator_order
         # Shaped noise rises with the band's share of the clock, by 6 dB per octave and order.
-        slower = ERTIS_PDM_RATE_HZ / self.settings.recording.pdm_rate_hz
+        slower = ERTIS_PDM_RATE_HZ / self.settings.recording.sample_rate_hz
         dbfs = _MODULATOR_DBFS[order] + 20 * order * math.log10(slower)
         return self.of_white_noise(min(dbfs, _MOST_NOISE_DBFS))
 
@@ -227,7 +230,7 @@ class Sight:
         """
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
-        low_hz, high_hz = band_hz or (0.0, self.settings.recording.pdm_rate_hz / 2)
+        low_hz, high_hz = band_hz or (0.0, self.settings.recording.sample_rate_hz / 2)
         across_hz = np.linspace(low_hz, high_hz, _ACROSS)
         response = np.interp(across_hz, heard_hz, np.abs(matched.values), left=0.0, right=0.0)
         # A density σ² / B, one-sided, through the filter, and as the modulus of the analytic signal.

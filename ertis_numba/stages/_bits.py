@@ -1,4 +1,4 @@
-"""Figures of PDM bits: shares, spectra over time, and lines in them. What they mean is told in health.py."""
+"""Figures of bits and signals: shares, spectra over time, and lines in them. What they mean is told in health.py."""
 
 from typing import Any, NamedTuple
 
@@ -7,10 +7,17 @@ import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
-from ertis_numba.geometry import Layout
-
-__all__ = ["ROUNDING", "Shares", "bit_shares", "common_lines", "decibels", "octets_of", "rises", "spectrogram"]
+__all__ = [
+    "ROUNDING",
+    "Shares",
+    "bit_shares",
+    "common_lines",
+    "decibels",
+    "octets_of",
+    "rises",
+    "signal_of",
+    "spectrogram",
+]
 
 ROUNDING = 1e-14
 """Power below which spectra in single precision tell nothing, full scale 1."""
@@ -39,22 +46,15 @@ class Shares(NamedTuple):
     repeats: NDArray[np.bool_]
 
 
-def octets_of(words: NDArray[np.unsignedinteger[Any]], layout: Layout) -> NDArray[np.uint8]:
-    """Return words as (sample, octet), bit b of octet k being channel 8 k + b.
+def octets_of(words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.uint8]:
+    """Return words, (sample, word), as (sample, octet), bit b of octet k being channel 8 k + b."""
+    return np.ascontiguousarray(words).view(np.uint8)
 
-    Raises
-    ------
-    DataError
-        The words are not those of the layout.
-    """
-    dtype, n_words = np.dtype(f"u{layout.word_bits // 8}"), layout.n_words
-    shape = (len(words), n_words)
-    if words.dtype != dtype or (words.shape != shape and (n_words > 1 or words.ndim != 1)):
-        raise DataError(
-            f"measurement holds {words.dtype} words of shape {words.shape}; its array wants {dtype} and {n_words} "
-            "per sample: give the array that it was recorded with"
-        )
-    return np.ascontiguousarray(words).reshape(shape).view(np.uint8)
+
+def signal_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.float32]:
+    """Return the bits of a channel as −1 and 1: (sample,) float32."""
+    bits = octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1)
+    return np.asarray(2 * bits.astype(np.float32) - 1)
 
 
 def bit_shares(column: NDArray[np.uint8]) -> Shares:
@@ -73,16 +73,15 @@ def _ones(column: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.asarray(np.bincount(column, minlength=256) @ _BITS / len(column))
 
 
-def spectrogram(octets: NDArray[np.uint8], channel: int, *, size: int, n_lines: int) -> NDArray[np.float32]:
-    """Return the power of one channel over time and frequency: (segment, line) float32.
+def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDArray[np.float32]:
+    """Return the power of a signal over time and frequency: (segment, line) float32.
 
     Periodograms under a Hann window, of segments that overlap by half (P. D. Welch, The use of fast Fourier
     transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). All ``size / 2``
     lines of white noise add up to its mean square, full scale 1. scipy.signal, which has the same, takes
     longer to import than everything here to run.
     """
-    bits = octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1)
-    segments = sliding_window_view(2 * bits.astype(np.float32) - 1, size)[:: size // 2]
+    segments = sliding_window_view(signal, size)[:: size // 2]
     window = np.hanning(size + 1)[:-1].astype(np.float32)
     lines = scipy.fft.rfft(segments * window)[:, :n_lines]
     return np.asarray((lines.real**2 + lines.imag**2) * np.float32(2 / size / (window @ window)))

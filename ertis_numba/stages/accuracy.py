@@ -35,7 +35,7 @@ PARTS: Final = {
     "beams": "interpolation of beams between nodes",
     "zones": "one set of delays for all ranges of a zone",
     "samples": "16-bit samples and weights",
-    "filter": "modulator noise that the decimation lets through",
+    "filter": "noise that the decimation lets through",
     "arithmetic": "single precision",
 }
 """Name of each part of the error, and what it is due to."""
@@ -68,7 +68,7 @@ class Texture:
     crest : float
         Largest power of any sample of a tile of ranges, the mean over tiles, by the mean power of samples.
     noise : (bin,) float64
-        Power density of the bits from 0 to half the PDM rate, by that of white bits.
+        Power density of the words from 0 to half their rate, by that of white bits.
     level : float
         Power after the matched filter, in the ranges of the image, by that of white bits.
     places : (quantile,) float64
@@ -92,8 +92,10 @@ class Texture:
     def unknown(cls, settings: Settings) -> "Texture":
         """Return the texture that is assumed where none was measured: on the safe side."""
         _, shares = matched_spectrum(settings.call, n_waves=WAVES)
-        frequency_hz = np.linspace(0, settings.recording.pdm_rate_hz / 2, 1025)
-        corner_hz = _NOISE_CORNER_HZ * settings.recording.pdm_rate_hz / _NOISE_RATE_HZ
+        if not settings.recording.is_pdm:  # beyond the band there may be as much sound as within
+            return cls(shares, _SAFE_GAIN, _SAFE_CREST, np.ones(2), 1.0, np.ones(1), colour=_SAFE_COLOUR)
+        frequency_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, 1025)
+        corner_hz = _NOISE_CORNER_HZ * settings.recording.sample_rate_hz / _NOISE_RATE_HZ
         noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
         return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
 
@@ -215,7 +217,7 @@ class ErrorModel:
         n_fft = 2 * (len(noise) - 1)
         n_fft *= max(1, -(-8 * len(taps) // n_fft))  # fine enough for the filter's side lobes
         gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
-        frequency_hz = np.arange(len(gain_2)) * settings.recording.pdm_rate_hz / n_fft
+        frequency_hz = np.arange(len(gain_2)) * settings.recording.sample_rate_hz / n_fft
         folded = gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
         rate_hz = settings.signal_rate_hz
         distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))

@@ -1,4 +1,4 @@
-"""What stands out of its surroundings in range, at a probability of false alarm that is asked for."""
+"""What stands out of its surroundings in range, at a constant false alarm rate (CFAR) that is asked for."""
 
 import math
 from typing import Literal
@@ -12,17 +12,16 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.settings import Settings
-from ertis_numba.stages.detect import find_peaks
+from ertis_numba.stages.detect import SIDE_LOBE_DB, find_peaks
 
 __all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "clean", "threshold_factor"]
 
 Method = Literal["ordered_statistic", "cell_averaging", "greatest_of"]
 METHODS: tuple[Method, ...] = ("ordered_statistic", "cell_averaging", "greatest_of")
-"""How the noise is told from the reference bins: a high rank of them, their mean, or the greater mean of two halves."""
+"""How the noise is estimated from the reference bins: OS-CFAR, CA-CFAR and GO-CFAR."""
 
 _RANK = 0.75  # of the reference bins: H. Rohling's choice, which a quarter of them may spoil
 _GUARD = 6.0  # resolutions on each side of a bin: a compressed pulse is 26 dB down there, more than what stands out
-_SIDE_LOBE_DB = 10.0  # below the strongest of the same range, beyond which side lobes of eRTIS_v3D1 begin
 
 
 def cfar(
@@ -32,14 +31,14 @@ def cfar(
     method: Method = "ordered_statistic",
     n_reference: int = 32,
 ) -> NDArray[np.bool_]:
-    """Return which bins stand out of the bins around them in range.
+    """Return which bins stand out of the bins around them in range, at a constant false alarm rate (CFAR).
 
-    Each bin is compared with reference bins of the same direction, half of them before it and half behind, a
-    resolution ``c / 2B`` apart, so that their noise is independent. Six resolutions on each side of the bin are left
-    out, since its own echo reaches there; at both ends of the range axis all reference bins come from one side. In
-    noise whose envelope is a Rayleigh variable, such as that of delay-and-sum, the share of bins that stand out is
-    ``false_alarm``, whatever the level is. Where the level changes it is less on the lower side; what it is on
-    the higher one, and beside reflectors, is in ``docs/plots.md``.
+    Each bin is compared with reference bins (training cells) of the same direction, half of them before it and half
+    behind, a resolution ``c / 2B`` apart, so that their noise is independent. Six resolutions on each side of the bin
+    are left out (guard cells), since its own echo reaches there; at both ends of the range axis all reference bins
+    come from one side. In noise whose envelope is a Rayleigh variable, such as that of delay-and-sum, the share of
+    bins that stand out is ``false_alarm``, whatever the level is. Where the level changes it is less on the lower
+    side; what it is on the higher one, and beside reflectors, is in the guide, under "Pictures and reflectors".
 
     Parameters
     ----------
@@ -47,8 +46,9 @@ def cfar(
     false_alarm : float
         1e-9 to 0.5.
     method : {"ordered_statistic", "cell_averaging", "greatest_of"}
-        The first sees a reflector beside others, up to a quarter of the reference bins; the second sees the weakest
-        single one; the third gives the fewest false alarms where the level changes.
+        The noise is a high rank of the reference bins (OS-CFAR), their mean (CA-CFAR) or the greater mean of two
+        halves (GO-CFAR). The first sees a reflector beside others, up to a quarter of the reference bins; the second
+        sees the weakest single one; the third gives the fewest false alarms where the level changes.
     n_reference : int
         Even, 4 to 512.
 
@@ -81,11 +81,11 @@ def cfar(
 
 
 def threshold_factor(method: Method, n_reference: int, false_alarm: float) -> float:
-    """Return by what factor the power of a bin must exceed what is told of the noise.
+    """Return by what factor the power of a bin must exceed the estimate of the noise.
 
     The noise is the mean of the N reference bins, ``P = (1 + α/N)^−N`` (H. M. Finn and R. S. Johnson, RCA Review 29,
-    1968); the k-th lowest, k = 3N/4, ``P = Π_{i<k} (N − i) / (N − i + α)`` (H. Rohling, IEEE Trans. AES 19, 1983);
-    or the greater mean of the halves of n = N/2,
+    1968); the k-th lowest, k = 3N/4, rounded, ``P = Π_{i<k} (N − i) / (N − i + α)`` (H. Rohling, IEEE Trans. AES 19,
+    1983); or the greater mean of the halves of n = N/2,
     ``P / 2 = (1 + α/n)^−n − Σ_{i<n} C(n+i−1, i) (2 + α/n)^−(n+i)`` (V. G. Hansen and J. H. Sawyers, IEEE Trans. AES
     16, 1980).
 
@@ -136,7 +136,7 @@ def _log_greatest(factor: float, n_reference: int) -> float:
 
 
 def _reference(image: Energyscape, n_reference: int) -> NDArray[np.intp]:
-    """Return the ranges that each range is compared with: (reference, range), those before it first."""
+    """Return the ranges that each range is compared with, the nearest that there are, rising: (reference, range)."""
     n_ranges = len(image.range_m)
     step, guard = 1, 1
     if n_ranges > 1:
@@ -150,13 +150,12 @@ def _reference(image: Energyscape, n_reference: int) -> NDArray[np.intp]:
             "or a smaller n_reference"
         )
     here = np.arange(n_ranges)
-    before, behind = ((room - guard) // step for room in (here, n_ranges - 1 - here))
+    before, behind = (np.maximum(room - guard, 0) // step for room in (here, n_ranges - 1 - here))
     n_behind = np.minimum(behind, n_reference - np.minimum(before, n_reference // 2))
     n_before = n_reference - n_behind
     number = np.arange(n_reference)[:, None]
-    return np.where(
-        number < n_before, here - guard - step * (number + 1), here + guard + step * (number - n_before + 1)
-    )
+    first, last = here - guard - step * (n_before - number), here + guard + step * (number - n_before + 1)
+    return np.asarray(np.where(number < n_before, first, last))
 
 
 def _resolution_m(settings: Settings) -> float:
@@ -200,7 +199,7 @@ def cfar_peaks(
     *,
     false_alarm: float = 1e-4,
     method: Method = "ordered_statistic",
-    within_db: float = _SIDE_LOBE_DB,
+    within_db: float = SIDE_LOBE_DB,
     top: int | None = 10,
     min_level_db: float = -200.0,
 ) -> list[Peak]:

@@ -196,11 +196,26 @@ def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
         with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:
             part = Path(file.name)
             json.dump(costs.seconds, file, indent=1)
-        part.replace(path)
+        return _first_of(costs, part, path)
     except OSError as error:
         _LOG.info("costs cannot be kept (%s)", error)
+        return costs
+    finally:
         if part is not None:
             part.unlink(missing_ok=True)
+
+
+def _first_of(costs: Costs, part: Path, path: Path) -> Costs:
+    """Keep costs, or return those that another process has kept meanwhile: by other costs it plans another image."""
+    try:
+        os.link(part, path)  # which a file that is there prevents
+    except FileExistsError:
+        kept = _kept(path)
+        if kept is not None:
+            return kept
+        part.replace(path)
+    except OSError:  # a disk without links
+        part.replace(path)
     return costs
 
 

@@ -1,6 +1,6 @@
-"""From PDM words, or what would be modulated, to signals: low-pass, decimate, group delay removed."""
+"""From words to signals: of PDM bits or PCM numbers, low-pass, decimate, group delay removed."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,16 @@ from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["Demodulate"]
+__all__ = ["Demodulate", "DemodulatePdm", "FilterPcm", "demodulation"]
 
 # Of full scale, -260 dB. Signals that decay further become denormal numbers in this stage or the next, and an image of
 # them would take 13 times as long.
 _SILENCE = 1e-13
 
+Room = tuple[NDArray[np.float32], ...]
 
-class Demodulate:
+
+class Demodulate(Protocol):
     """Words to signals.
 
     Attributes
@@ -26,43 +28,116 @@ class Demodulate:
         Of the signals, zeros at the end included.
     """
 
+    shape: tuple[int, int]
+
+    def new_room(self) -> Room:
+        """Return what one measurement at a time is worked on in."""
+        ...
+
+    def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word) or (sample, channel)."""
+        ...
+
+
+def demodulation(
+    settings: Settings,
+    layout: Layout,
+    window: TimeWindow,
+    kernels: KernelSet,
+    memory: Memory,
+    *,
+    taps: NDArray[np.int16] | NDArray[np.int32],
+) -> Demodulate:
+    """Return the stage that suits what the microphones give."""
+    channels = np.flatnonzero(layout.enabled).astype(np.int32)
+    recording, factor = settings.recording, settings.decimation
+    if recording.is_pdm:
+        return DemodulatePdm(channels, window, kernels, memory, taps=taps, factor=factor)
+    return FilterPcm(channels, window, kernels, memory, taps=taps, factor=factor, full_scale=recording.full_scale)
+
+
+class DemodulatePdm:
+    """Bits to signals, in one pass; full scale is 1. See `Demodulate`.
+
+    Parameters
+    ----------
+    channels : (mic,) int32
+    window, kernels, memory
+    taps : (tap,) int16 or int32
+        Of the low pass, whose sum is a gain of 1.
+    factor : int
+        Samples of the record per signal sample.
+    """
+
     def __init__(
         self,
-        settings: Settings,
-        layout: Layout,
+        channels: NDArray[np.int32],
         window: TimeWindow,
         kernels: KernelSet,
         memory: Memory,
         *,
         taps: NDArray[np.int16] | NDArray[np.int32],
+        factor: int,
     ) -> None:
-        self._kernels, self._memory = kernels, memory
-        self._taps = memory.table(taps)
-        self._scale = np.float32(1 / taps.sum(dtype=np.int64))
-        self._plain_taps = memory.table((taps * np.float64(self._scale)).astype(np.float32))
-        channels = np.flatnonzero(layout.enabled).astype(np.int32)
-        self._channels = memory.table(channels)
-        self._factor = settings.decimation
-        self._window = window
+        self._kernel = kernels.demodulate_words
+        self._taps, self._scale = memory.table(taps), np.float32(1 / taps.sum(dtype=np.int64))
+        self._channels, self._factor, self._window = memory.table(channels), factor, window
         self.shape = (len(channels), window.n_fft)
 
-    def __call__(self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word)."""
+    def new_room(self) -> Room:
+        """See `Demodulate.new_room`."""
+        return ()
+
+    def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:  # noqa: ARG002
+        """See `Demodulate`."""
         window = self._window
-        self._kernels.demodulate_words(
+        self._kernel(
             words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
         )
 
-    def filtered(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
-        """Fill ``out`` from signals that were never modulated, (mic, sample) at the PDM rate, full scale 1."""
-        half, ahead = len(self._plain_taps) // 2, -(-len(self._plain_taps) // self._factor)
-        count = self._window.n_samples
-        first = (self._window.first_sample - ahead) * self._factor + half
-        here = np.arange(first, first + (count + ahead) * self._factor)
-        inside = (here >= 0) & (here < signals.shape[1])
-        heard = np.zeros((len(signals), len(here)), dtype=np.float32)
-        heard[:, inside] = signals[:, here[inside]]
-        heard[np.abs(heard) < _SILENCE] = 0.0
-        decimated = self._memory.zeros((len(signals), count + ahead), np.float32)
-        self._kernels.decimate(self._memory.table(heard), self._plain_taps, self._factor, decimated)
-        self._kernels.remove_group_delay(decimated, ahead, out)
+
+class FilterPcm:
+    """Numbers to signals: nothing is modulated, but the rate may be higher than signals need. See `Demodulate`.
+
+    Parameters
+    ----------
+    channels, window, kernels, memory, taps, factor
+        As for `DemodulatePdm`.
+    full_scale : float
+        What becomes 1.
+    """
+
+    def __init__(
+        self,
+        channels: NDArray[np.int32],
+        window: TimeWindow,
+        kernels: KernelSet,
+        memory: Memory,
+        *,
+        taps: NDArray[np.int16] | NDArray[np.int32],
+        factor: int,
+        full_scale: float = 1.0,
+    ) -> None:
+        self._kernels, self._memory = kernels, memory
+        self._taps = memory.table((taps / taps.sum(dtype=np.int64)).astype(np.float32))
+        self._scale, self._silence = np.float32(1 / full_scale), np.float32(full_scale * _SILENCE)
+        self._channels, self._factor = memory.table(channels), factor
+        self._ahead = -(-len(taps) // factor)
+        self._first = (window.first_sample - self._ahead) * factor + len(taps) // 2
+        self._n_decimated = window.n_samples + self._ahead
+        self.shape = (len(channels), window.n_fft)
+
+    def new_room(self) -> Room:
+        """See `Demodulate.new_room`."""
+        n_mics = self.shape[0]
+        return (
+            self._memory.zeros((n_mics, self._n_decimated * self._factor), np.float32),
+            self._memory.zeros((n_mics, self._n_decimated), np.float32),
+        )
+
+    def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:
+        """See `Demodulate`."""
+        heard, decimated = room
+        self._kernels.unpack_pcm(words, self._channels, self._scale, self._silence, self._first, heard)
+        self._kernels.decimate(heard, self._taps, self._factor, decimated)
+        self._kernels.remove_group_delay(decimated, self._ahead, out)

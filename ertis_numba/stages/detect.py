@@ -13,12 +13,17 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import matched_filter
 
-__all__ = ["ONE_SIDED", "PULSE_M", "find_peaks", "neighbours_of"]
+__all__ = ["ONE_SIDED", "PULSE_M", "SIDE_LOBE_DB", "find_peaks", "neighbours_of"]
 
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
 PULSE_M = 0.04
 """How far off a compressed pulse of 25 kHz bandwidth is 26 dB down, and 40 dB at 2.5 times as far."""
+SIDE_LOBE_DB = 10.0
+"""Below the strongest of the same range, from which on side lobes are expected.
+
+Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `PULSE_M`.
+"""
 ONE_SIDED = 0.25
 """Mean offset of neighbours, by their reach, that tells the edge of a grid."""
 

@@ -22,7 +22,7 @@ from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import Buffers, beamform
 from ertis_numba.stages.delays import DelayTable, Zone
-from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.demodulate import FilterPcm, demodulation
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.window import time_window
@@ -31,6 +31,7 @@ from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spect
 
 __all__ = ["FastChain", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
 
+_TINY = 1e-30
 _SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
 
 
@@ -46,10 +47,12 @@ def _spectrum_of(call: Call) -> Spectrum:
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return the decimation filter of a complete plan."""
+    """Return the decimation filter of a complete plan; PCM that is not decimated needs none."""
+    if settings.decimation == 1 and not settings.recording.is_pdm:
+        return whole_taps(np.ones(1))
     stop_band_db = settings.accuracy.stop_band_db or 60.0
     taps = decimation_taps(
-        pdm_rate_hz=settings.recording.pdm_rate_hz,
+        sample_rate_hz=settings.recording.sample_rate_hz,
         decimation=settings.decimation,
         pass_hz=matched_band_hz(settings.call)[1],
         stop_band_db=stop_band_db,
@@ -66,6 +69,7 @@ class _Buffers(NamedTuple):
     """What one measurement at a time is written to on its way."""
 
     lane: Lane
+    room: tuple[NDArray[np.float32], ...]
     signals: NDArray[np.float32]
     analytic: NDArray[np.complex64]
     transforms: fft.Transforms
@@ -143,7 +147,12 @@ class FastChain:
         self._lead = window.lead
         self._kernels = kernels
         self._threads = threads
-        self._demodulate = Demodulate(settings, layout, window, kernels, memory, taps=taps)
+        self._demodulate = demodulation(settings, layout, window, kernels, memory, taps=taps)
+        self._made_unmodulated = functools.cache(
+            lambda: FilterPcm(
+                np.arange(len(own_s), dtype=np.int32), window, kernels, memory, taps=taps, factor=settings.decimation
+            )
+        )
         self._matched_filter = MatchedFilter(
             settings,
             window,
@@ -243,8 +252,10 @@ class FastChain:
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
         with self._taken(self._threads) as buffers:
-            image = buffers.lane.target(out)
-            self._demodulate.filtered(signals, buffers.signals)
+            unmodulated, image = self._made_unmodulated(), buffers.lane.target(out)
+            heard = np.where(np.abs(signals.T) < _TINY, 0.0, signals.T)  # which would become denormal on its way
+            numbers = buffers.lane.send(np.ascontiguousarray(heard, dtype=np.float32))
+            unmodulated(numbers, unmodulated.new_room(), buffers.signals)
             self._image(buffers, image, self._threads)
             buffers.lane.fetch(image, out)
         self._finish(buffers)
@@ -267,7 +278,7 @@ class FastChain:
             self._closed = True
             self._change.wait_for(lambda: not self._n_busy)
             self._spare.clear()
-        for name in ("_demodulate", "_matched_filter", "_beamform", "_adaptive"):
+        for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
             self.__dict__.pop(name, None)
         self._memory.close()
 
@@ -280,7 +291,7 @@ class FastChain:
             image = buffers.lane.target(self._no_image if out is None else out)
 
             def steps() -> None:
-                self._demodulate(here, buffers.signals)
+                self._demodulate(here, buffers.room, buffers.signals)
                 self._image(buffers, image, threads)
 
             buffers.lane.run(steps)
@@ -342,7 +353,7 @@ class FastChain:
         signals = memory.zeros(self._demodulate.shape, np.float32)
         analytic = memory.zeros(self._matched_filter.shape, np.complex64)
         transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
-        return _Buffers(lane, signals, analytic, transforms, self._beamform.new_buffers())
+        return _Buffers(lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers())
 
 
 def _dither(n_mics: int) -> NDArray[np.float64]:

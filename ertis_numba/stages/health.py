@@ -1,8 +1,9 @@
-"""What state the microphones of a recording are in, told from its bits alone."""
+"""What state the microphones of a recording are in, told from its words alone."""
 
+import functools
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages import _bits
+from ertis_numba.words import word_format
 
 __all__ = ["ChannelHealth", "Health", "health", "merge"]
 
@@ -25,6 +27,7 @@ _SATURATED = 2e-3
 _CHANCE_RUN = 20  # places in the longest run that white bits have by chance, which counts in short records
 # A twentieth takes a tenth of the half of full scale that modulators follow. A real sensor has 0.0002.
 _OFFSET = 0.05
+_FULL = 1 - 2.0**-15  # of full scale: the largest number of 16 bits; float32 has no end, and clips where it did before
 _OFFSET_DEVIATIONS = 5.0  # of the mean of white bits, which count in short records
 _SEGMENTS = 8  # without overlap, so that some are loud and some are quiet
 _LONGEST_SEGMENT = 2**14  # 3.6 ms of an eRTIS, about a call, in lines of 275 Hz
@@ -50,15 +53,17 @@ class ChannelHealth:
         Its bit in the words, counted from 0.
     faults : tuple of str
         Of ``stuck at 0``, ``stuck at 1``, ``stuck in a pattern``, ``saturated``, ``offset``, ``idle tone`` and
-        ``dead``.
+        ``dead``; PCM is ``stuck`` at any number.
     offset : float or None
-        Mean of the bits taken as −1 and 1.
+        Mean of the bits taken as −1 and 1, or of PCM, full scale 1.
     changes : float or None
-        Share of samples at which the bit changes.
+        Share of samples that differ from the one before.
     overload : float or None
-        Share of samples at which 17 equal bits begin.
+        Share of samples at which 17 equal bits begin, or that are at full scale; of float32, at the highest amplitude
+        of the record.
     level_db : float or None
-        Of the sound in the call's band while it is loud, the noise taken off, beside the median of all channels.
+        Of the sound in the call's band while it is loud, the noise taken off and the calibrated gain, beside the
+        median of all channels.
     noise_dbfs : float or None
         In the call's band while it is quiet: mean square of the signal, full scale 1.
     tone_hz, tone_db : float or None
@@ -124,7 +129,7 @@ class Health:
 def health(measurement: Measurement) -> Health:
     """Return the state of the microphones of one measurement.
 
-    Only the bits of enabled channels are looked at, in the first 524,288 samples. Loud and quiet are the eighths of
+    Only enabled channels are looked at, in the first 524,288 samples. Loud and quiet are the eighths of
     the record in which the median channel has most and least power in the call's band.
 
     The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale, against the noise in the call's
@@ -139,23 +144,32 @@ def health(measurement: Measurement) -> Health:
     Raises
     ------
     DataError
-        The words are not those of the array in the settings.
+        The words are not those of the settings.
     """
-    layout = microphones(measurement.settings.array)
-    octets = _bits.octets_of(measurement.words, layout)[:_MOST_SAMPLES]
-    enabled = np.flatnonzero(layout.enabled)
-    if len(octets) < _LEAST_SAMPLES:
-        too_short = f"anything: {len(octets)} samples are fewer than {_LEAST_SAMPLES}"
+    settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
+    words = word_format(settings).checked(measurement.words, any_length=True)[:_MOST_SAMPLES]
+    if len(words) < _LEAST_SAMPLES:
+        too_short = f"anything: {len(words)} samples are fewer than {_LEAST_SAMPLES}"
         return Health(channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,))
-    found = {item.channel: item for item in _by_bits(octets, enabled)}
-    moving = [item for item in found.values() if not any(name.startswith("stuck") for name in item.faults)]
-    told, tones_hz, unknown = _by_spectra(octets, moving, measurement.settings)
+    signal_of: Callable[[int], NDArray[np.float32]]
+    if settings.recording.is_pdm:
+        octets = _bits.octets_of(words)
+        signal_of = functools.partial(_bits.signal_of, octets)
+        told = _by_bits(octets, enabled)
+    else:
+        scale = np.float32(1 / settings.recording.full_scale)
+        signal_of = lambda channel: np.multiply(words[:, channel], scale, dtype=np.float32)  # noqa: E731
+        is_float = settings.recording.encoding == "float32"
+        told = [_by_numbers(channel, signal_of(channel), is_float=is_float) for channel in enabled.tolist()]
+    found = {item.channel: item for item in told}
+    moving = [item for item in told if not any(name.startswith("stuck") for name in item.faults)]
+    told, tones_hz, unknown = _by_spectra(signal_of, len(words), moving, settings)
     channels = tuple((found | {item.channel: item for item in told}).values())
     noise = [10 ** (item.noise_dbfs / 10) for item in told if not item.faults and item.noise_dbfs is not None]
     report = Health(channels=channels, tones_hz=tones_hz, unknown=unknown)
     if not noise:
         return report
-    call = measurement.settings.call
+    call = settings.call
     noise_dbfs = 10 * math.log10(math.fsum(noise) / len(noise))
     duration_s = call.duration_s * (1 - 5 / 4 * call.ramp_fraction)
     gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
@@ -212,27 +226,48 @@ def _by_bits(octets: NDArray[np.uint8], enabled: NDArray[np.int64]) -> list[Chan
     return told
 
 
+def _by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:
+    """Return what PCM tells without a spectrum."""
+    changes = float(np.mean(signal[1:] != signal[:-1]))
+    level = np.abs(signal)
+    peak = float(level.max())
+    overload = float(np.mean(level >= (peak if is_float else _FULL)))
+    offset = float(np.mean(signal, dtype=np.float64))
+    if changes < _STUCK:
+        faults: tuple[str, ...] = (f"stuck at {float(np.median(signal)):g}",)
+    else:
+        full = max(1.0, peak) if is_float else 1.0
+        deviation = float(np.std(signal, dtype=np.float64)) / math.sqrt(len(signal))
+        most_offset = _OFFSET * full + _OFFSET_DEVIATIONS * deviation
+        faults = ("saturated",) * (overload > _SATURATED) + ("offset",) * (abs(offset) > most_offset)
+    return ChannelHealth(channel=channel, faults=faults, offset=offset, changes=changes, overload=overload)
+
+
 def _by_spectra(
-    octets: NDArray[np.uint8], found: Sequence[ChannelHealth], settings: Settings
+    signal_of: Callable[[int], NDArray[np.float32]],
+    n_samples: int,
+    found: Sequence[ChannelHealth],
+    settings: Settings,
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...]]:
     """Return the channels with what spectra add, the tones that most of them hear, and what cannot be told."""
     call = settings.call
-    size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(len(octets) / _SEGMENTS)))
-    line_hz = settings.recording.pdm_rate_hz / size
+    size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
+    line_hz = settings.recording.sample_rate_hz / size
     low = round(call.low_frequency_hz / line_hz)
     high = min(round(call.high_frequency_hz / line_hz) + 1, size // 2)
     if not found:
         return [], (), ()
     if high - low < _LEAST_LINES or low < _FIRST_LINE:
-        why = f"{len(octets)} samples do not resolve the call's band"
+        why = f"{n_samples} samples do not resolve the call's band"
         return list(found), (), (f"dead microphones, tones and noise: {why}",)
-    spectra = [_bits.spectrogram(octets, item.channel, size=size, n_lines=high) for item in found]
+    spectra = [_bits.spectrogram(signal_of(item.channel), size=size, n_lines=high) for item in found]
     power = np.stack([lines[:, low:].sum(axis=1, dtype=np.float64) for lines in spectra])
     order = np.argsort(np.median(power, axis=0), kind="stable")
     few = max(1, len(order) // 8)
     noise, loud = power[:, order[:few]].mean(axis=1), power[:, order[-few:]].mean(axis=1)
     noise_db = _bits.decibels(noise)
-    sound_db = _bits.decibels(np.maximum(loud - noise, _LEAST_SOUND * loud))
+    sensitivity = microphones(settings.array).gain[[item.channel for item in found]]
+    sound_db = _bits.decibels(np.maximum(loud - noise, _LEAST_SOUND * loud)) - 20 * np.log10(sensitivity)
     level_db = sound_db - np.median(sound_db)
     unknown: tuple[str, ...] = ()
     if len(found) == 1:

@@ -58,7 +58,7 @@ class MatchedFilter:
         n_phases = settings.accuracy.oversampling or 1
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
         flat = matched.values / filter_response(
-            taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.pdm_rate_hz
+            taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz
         )
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s

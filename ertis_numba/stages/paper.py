@@ -58,6 +58,7 @@ class PaperChain:
         lead = int(np.max(np.abs(delays)))
         self._starts: list[list[int]] = (delays + lead).tolist()
         self._channels = np.flatnonzero(layout.enabled).tolist()
+        self._is_pdm, self._scale = settings.recording.is_pdm, np.float32(0.5 / settings.recording.full_scale)
         self._demodulate = _Demodulate(settings)
         self._low_pass = _LowPass(settings)
         self._make_matched_filter(settings, lead, 1 / (layout.gain[layout.enabled] * len(self._channels)))
@@ -104,7 +105,8 @@ class PaperChain:
         threads: int | None = None,  # noqa: ARG002  its own is the only one
     ) -> None:
         """See `Chain.process`."""
-        signals = self._demodulate(_unpacked(words, self._channels))
+        unpacked = _unpacked(words, self._channels) if self._is_pdm else _halved(words, self._channels, self._scale)
+        signals = self._demodulate(unpacked)
         spectra = scipy.fft.rfft(signals, self._n_fft)
         spectra *= self._template
         rows = list(scipy.fft.irfft(spectra, self._n_fft, overwrite_x=True))
@@ -156,6 +158,11 @@ def _unpacked(words: NDArray[np.unsignedinteger[Any]], channels: list[int]) -> N
     return signals
 
 
+def _halved(words: NDArray[Any], channels: list[int], scale: np.float32) -> NDArray[np.float32]:
+    """Return PCM as (mic, sample) float32 whose full scale is ±½, as that of bits."""
+    return np.ascontiguousarray(words[:, channels].T) * scale
+
+
 class _Demodulate:
     """Low pass at the PDM rate, every ``decimation``-th sample, band pass at the signal rate.
 
@@ -168,7 +175,7 @@ class _Demodulate:
         cutoff_hz = max(_CUTOFF * rate_hz, call.high_frequency_hz)
         band_hz = call.low_frequency_hz, call.high_frequency_hz
         butter = scipy.signal.butter
-        self._low_pass = butter(_ORDER, cutoff_hz, fs=settings.recording.pdm_rate_hz, output="sos")
+        self._low_pass = butter(_ORDER, cutoff_hz, fs=settings.recording.sample_rate_hz, output="sos")
         self._band_pass = butter(_ORDER, band_hz, "bandpass", fs=rate_hz, output="sos")
         self._decimation = settings.decimation
 
@@ -181,7 +188,7 @@ class _Demodulate:
 
 def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.float64]:
     """Return what a microphone of amplitude ±½ makes of the call: (sample,) float64 at the signal rate."""
-    call, rate_hz = settings.call, settings.recording.pdm_rate_hz
+    call, rate_hz = settings.call, settings.recording.sample_rate_hz
     narrowest_hz = min(call.high_frequency_hz - call.low_frequency_hz, call.low_frequency_hz)
     length_s = call.duration_s + _RINGING / narrowest_hz
     time_s = np.arange(math.ceil(length_s * rate_hz)) / rate_hz

@@ -12,16 +12,11 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Settings
-from ertis_numba.stages.detect import ONE_SIDED, PULSE_M, neighbours_of
+from ertis_numba.stages.detect import ONE_SIDED, PULSE_M, SIDE_LOBE_DB, neighbours_of
 from ertis_numba.waveform import matched_spectrum
 
 __all__ = ["PointExtractor"]
 
-_SIDE_LOBE_DB = -10.0
-"""Below the strongest of the same range, up to which side lobes are expected.
-
-Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `PULSE_M`.
-"""
 _BINS_OF_POINT = 64
 """Of noise alone, so many bins are looked at for each point that is wanted, and not a third of the image."""
 _THINNED = 16  # ranges of which one is looked at to tell how strong those are
@@ -48,10 +43,12 @@ class PointExtractor:
     about its centre (P. M. Woodward, Probability and Information Theory, 1953, for the range ``cτ / 2``); k the
     root mean square of its wave numbers; and λ the variance of the microphones' positions along the direction, across
     the line of sight, in which it is least (H. L. Van Trees, Optimum Array Processing, 2002, section 8.4). An image
-    of one elevation has the azimuth to go across only. The noise is told from the median of the image, which of a
+    of one elevation has the azimuth to go across only. The noise is estimated from the median of the image, which of a
     Rayleigh variable is √ln 2 of the root mean square; where echoes fill an image it counts them as noise. Infinite
-    is what the array cannot tell. Errors of layout, temperature and near-field curvature come on top, and so does what
-    echoes at the same place do to each other.
+    is what the array cannot tell. NaN is where the noise is not known: in images of other beamformers than
+    delay-and-sum, whose noise is no Rayleigh variable, and where half of the image or more is 0, as `clean` leaves it.
+    Errors of layout, temperature and near-field curvature come on top, and so does what echoes at the same place do to
+    each other.
 
     Parameters
     ----------
@@ -113,7 +110,7 @@ class PointExtractor:
             return none, none
         reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
         highest = scipy.ndimage.maximum_filter1d(profile, 2 * reach + 1, mode="nearest")
-        floor = np.maximum(highest * np.float32(10 ** (_SIDE_LOBE_DB / 20)), profile.max() * np.float32(self._least))
+        floor = np.maximum(highest * np.float32(10 ** (-SIDE_LOBE_DB / 20)), profile.max() * np.float32(self._least))
         floor[[0, -1]] = np.inf
         # Two passes over all of the image, this and the profile, are what takes the time; few bins are left.
         above = energy >= floor
@@ -267,10 +264,10 @@ class _Spread:
     def __call__(
         self, image: Energyscape, position_m: NDArray[np.float32], levels: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return standard deviations along range and across: (point, 2) float32, in metres."""
-        some = image.energy[:, ::_THINNED]
-        some = some[:: max(1, some.size // _SAMPLE)]
-        noise = float(np.median(some)) / math.sqrt(math.log(2)) if len(levels) else 0.0
+        """Return standard deviations along range and across: (point, 2) float32, in metres; NaN if they are unknown."""
+        noise = _noise(image) if len(levels) else 0.0
+        if not noise:
+            return np.full((len(levels), 2), np.nan, dtype=np.float32)
         relative = noise / (math.sqrt(2) * levels.astype(np.float64))
         speed_m_s = sound_speed_m_s(image.settings.air)
         along_m = speed_m_s / (4 * math.pi * self.width_hz) * relative
@@ -296,3 +293,12 @@ class _Spread:
         least = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
         # What is left of rounding is no aperture.
         return np.asarray(np.where(least > _FLAT * (aa + bb), least, 0.0))
+
+
+def _noise(image: Energyscape) -> float:
+    """Return the root mean square of the noise of an image; 0 if it is not known."""
+    if image.settings.processing.beamformer != "delay_and_sum":
+        return 0.0
+    some = image.energy[:, ::_THINNED]
+    some = some[:: max(1, some.size // _SAMPLE)]
+    return float(np.median(some)) / math.sqrt(math.log(2))

@@ -16,11 +16,12 @@ from ertis_numba.stages.beam_nodes import estimated_mics
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.fitting import WAVES
 from ertis_numba.waveform import matched_band_hz, matched_filter, matched_spectrum
+from ertis_numba.words import word_format
 
 __all__ = ["texture_of"]
 
 _TILE = 96  # ranges
-_MOST_MICS = 8  # whose bits are looked at
+_MOST_MICS = 8  # whose noise is looked at
 _SEGMENT = 4096
 _TAPERED = 0.5  # of the ranges, at each end
 _QUANTILES = (np.arange(16) + 0.5) / 16
@@ -46,7 +47,7 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
         processing=settings.processing.replace(beamformer="delay_and_sum"),
     )
     chain = FastChain(rough, kernels, threads=threads)
-    words = np.require(measurement.words, requirements=["C", "A", "W"]).reshape(len(measurement.words), -1)
+    words = word_format(settings).checked(measurement.words)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
     heard, lead = chain.analytic(words, image)
     analytic = heard[:, :, lead:]
@@ -117,12 +118,16 @@ def _white_power(settings: Settings) -> float:
     return float(np.sum(np.abs(matched.values) ** 2) / n_fft / settings.decimation)
 
 
-def _noise(words: NDArray[np.unsignedinteger[Any]], settings: Settings, kernels: KernelSet) -> NDArray[np.float64]:
-    """Return the power density of the bits by that of white bits, from 0 to half the PDM rate: (bin,) float64."""
+def _noise(words: NDArray[Any], settings: Settings, kernels: KernelSet) -> NDArray[np.float64]:
+    """Return the power density of words by that of white bits, from 0 to half of their rate: (bin,) float64."""
     channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
     channels = np.ascontiguousarray(channels[:: max(1, len(channels) // _MOST_MICS)])
     signals = np.empty((len(channels), len(words)), dtype=np.float32)
-    kernels.unpack_bits(words, channels, signals)
+    if settings.recording.is_pdm:
+        kernels.unpack_bits(words, channels, signals)
+    else:
+        scale = np.float32(1 / settings.recording.full_scale)
+        kernels.unpack_pcm(words, channels, scale, np.float32(0), 0, signals)
     segment = min(_SEGMENT, len(words) // 2 * 2)
     cut = signals[:, : len(words) // segment * segment].reshape(-1, segment)
     window = np.hanning(segment).astype(np.float32)

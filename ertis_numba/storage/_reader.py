@@ -77,8 +77,8 @@ class Reader(ABC, Generic[Item]):
     """
 
     _kind: ClassVar[str]
-    _data: ClassVar[str]
-    _table: ClassVar[tuple[Variable, ...]]
+    _data: str
+    _table: tuple[Variable, ...]
 
     def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
         self.path = Path(path)
@@ -89,6 +89,7 @@ class Reader(ABC, Generic[Item]):
                 self.sensors: tuple[str, ...] = tuple(self._file["sensors"])
                 self.sensor = self._choose(sensor)
                 self._group = self._file["sensors"][self.sensor]
+                self._look()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data)
                 self.attributes = {name: plain(value) for name, value in self._file.attrs.items()}
@@ -100,6 +101,9 @@ class Reader(ABC, Generic[Item]):
         except BaseException:
             self._file.close()
             raise
+
+    def _look(self) -> None:
+        """Find out which variables a sensor should have, where there are several ways."""
 
     @abstractmethod
     def _item(self, index: int) -> Item:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
-from ertis_numba.atomic import check_target, replacing, require_room
+from ertis_numba.atomic import check_target, remedy, replacing, require_room
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
@@ -66,6 +66,10 @@ class Writer(ABC, Generic[Item]):
     def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
         """Return the array of an item and what it adds to the columns; refuse what does not fit."""
 
+    def _data_of(self, group: h5py.Group) -> str:  # noqa: ARG002  what overrides it looks into it
+        """Return the variable with one array per measurement."""
+        return self._data
+
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write what is known at the end only."""
 
@@ -97,7 +101,7 @@ class Writer(ABC, Generic[Item]):
             if sensor not in self._rows:
                 group = self._file.create_group(sensor_path(sensor), track_order=True)
                 self._begin(group, item)
-                self._rows[sensor] = RowWriter(group, self._data)
+                self._rows[sensor] = RowWriter(group, self._data_of(group))
             row, columns = self._row(item)
             self._rows[sensor].append(row, item.stamp, **columns)
 
@@ -171,7 +175,8 @@ class Writer(ABC, Generic[Item]):
         """Read every row back from the closed file and compare it with what was given."""
         with h5py.File(self._part, "r") as file:
             for sensor, written in self._rows.items():
-                rows = RowReader(file[sensor_path(sensor)], self._data)
+                group = file[sensor_path(sensor)]
+                rows = RowReader(group, self._data_of(group))
                 check = 0
                 for index in range(len(rows)):
                     check = zlib.crc32(rows.row(index).data, check)
@@ -183,9 +188,7 @@ class Writer(ABC, Generic[Item]):
         try:
             yield
         except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails
-            raise DataError(
-                f"{self.path} cannot be written ({_reason(error)}); free some space or write elsewhere"
-            ) from error
+            raise DataError(f"{self.path} cannot be written ({_reason(error)}); {remedy(error)}") from error
 
 
 def _reason(error: Exception) -> str:

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.atomic import check_target
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import self_contained
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer
-from ertis_numba.storage.recording import RecordingReader
+from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth
 
@@ -40,6 +41,9 @@ class EnergyscapeWriter(Writer[Energyscape]):
         keeps its uuid and SHA-256, and the truth of each measurement an energyscape came from.
     truth : mapping of str to Truth, optional
         What each sensor should show, by its name, in place of what the recording says.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Where each sensor is, by its name, as for `RecordingWriter`, in place of what the recording says. Where neither
+        says it, the file does not either.
     dtype : {"float32", "float16"}
         float16 halves the file; it keeps three digits down to -84 dB of full scale and fewer below, and
         netCDF programs cannot read it.
@@ -57,6 +61,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         *,
         recording: RecordingReader | Sequence[RecordingReader] | None = None,
         truth: Mapping[str, Truth] | None = None,
+        mounting: Mapping[str, Mounting] | None = None,
         dtype: Literal["float32", "float16"] = "float32",
         overwrite: bool = False,
     ) -> None:
@@ -67,6 +72,21 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
+        self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
+        self._mounting = {
+            reader.sensor: mounted(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
+            for reader in readers
+        } | self._given
+
+    def note_mounting(self, sensor: str, translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
+        """Say where a sensor is; what is said after its first energyscape counts no more.
+
+        Raises
+        ------
+        ArgumentError
+            A number is missing or not finite, or the quaternion has not length 1.
+        """
+        self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
 
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         self._first[first.stamp.sensor] = first
@@ -78,6 +98,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             dtypes={"energy": self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},
         )
+        describe(group, self._mounting.get(first.stamp.sensor, {}))
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
         describe(group["energy"], {"coordinates": "azimuth elevation"})
@@ -91,6 +112,10 @@ class EnergyscapeWriter(Writer[Energyscape]):
             if ours is not theirs and not np.array_equal(ours, theirs):
                 raise ArgumentError(f"an energyscape has another {field} than the first; write it to its own file")
         return item.energy, {}
+
+    def _finish(self, file: h5py.File) -> None:
+        super()._finish(file)
+        self._require_sensors("mounting", self._given)
 
     def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | None:
         given = super()._truth_of(sensor, group)
@@ -135,19 +160,35 @@ class EnergyscapeReader(Reader[Energyscape]):
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
     range_m : (range,) float64
+    translation_m : (3,) float64, or None
+        Where the sensor is; None where the file does not say it, as older ones do not.
+    rotation_xyzw : (4,) float64, or None
+        The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
     """
 
     _kind: ClassVar[str] = "energyscape"
-    _data: ClassVar[str] = "energy"
-    _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
+    _data = "energy"
+    _table = ENERGYSCAPE
 
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
     range_m: NDArray[np.float64]
+    translation_m: NDArray[np.float64] | None
+    rotation_xyzw: NDArray[np.float64] | None
 
     def _load(self) -> None:
         for name, field in _AXES.items():
             setattr(self, field, np.asarray(self._group[name][:]))
+        said = self._group.attrs
+        if "translation_m" not in said and "rotation_xyzw" not in said:
+            self.translation_m = self.rotation_xyzw = None
+            return
+        try:
+            self.translation_m, self.rotation_xyzw = mounted(
+                self.sensor, said["translation_m"], said["rotation_xyzw"]
+            ).values()
+        except ArgumentError as error:
+            raise DamagedError(f"{self.path}: {error}") from error
 
     def _sizes(self) -> dict[str, int]:
         return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"])}
@@ -188,6 +229,7 @@ def write_energyscapes(
     *,
     recording: RecordingReader | Sequence[RecordingReader] | None = None,
     truth: Mapping[str, Truth] | None = None,
+    mounting: Mapping[str, Mounting] | None = None,
     dtype: Literal["float32", "float16"] = "float32",
     overwrite: bool = False,
 ) -> Path:
@@ -200,7 +242,9 @@ def write_energyscapes(
     DataError
         The disk is full or cannot be written.
     """
-    with EnergyscapeWriter(path, recording=recording, truth=truth, dtype=dtype, overwrite=overwrite) as writer:
+    with EnergyscapeWriter(
+        path, recording=recording, truth=truth, mounting=mounting, dtype=dtype, overwrite=overwrite
+    ) as writer:
         for image in images:
             writer.write(image)
     return writer.path

@@ -20,9 +20,10 @@ from ertis_numba.storage._gaps import Missing
 from ertis_numba.storage._reader import Reader, plain
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
-from ertis_numba.storage.schema import RECORDING, Variable, describe, lay_out
+from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
+from ertis_numba.words import word_format
 
 __all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
 
@@ -114,26 +115,20 @@ class RecordingWriter(Writer[Measurement]):
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
-        layout = microphones(settings.array)
+        layout, words = microphones(settings.array), word_format(settings)
         samples = call_samples(settings.call)
-        several = {"word": layout.n_words} if layout.n_words > 1 else {}
-        sizes = {
-            "sample": settings.recording.n_samples,
-            "microphone": len(layout.enabled),
-            "axis": 3,
-            "call_sample": len(samples),
-            **several,
-        }
+        data, table = _data_and_table(pdm=settings.recording.is_pdm)
         lay_out(
             group,
-            RECORDING,
-            sizes=sizes,
-            dtypes={"pdm": f"<u{layout.word_bits // 8}"},
+            table,
+            sizes={**_sizes(settings), "call_sample": len(samples)},
+            dtypes={data: words.dtype},
             texts={"settings": settings.to_toml()},
         )
         identity = _identity(sensor, settings, self._firmware.get(sensor, ""))
         describe(group, identity | self._mounting.get(sensor, mounted(sensor)))
-        describe(group["pdm"], {"sample_rate_hz": settings.recording.pdm_rate_hz, "bit_order": "lsb_first"})
+        bits = {"bit_order": "lsb_first"} if settings.recording.is_pdm else {}
+        describe(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
         describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
         group["microphone"][:] = np.arange(len(layout.enabled))
         group["call"][:] = samples
@@ -160,6 +155,10 @@ class RecordingWriter(Writer[Measurement]):
         for name, given in (("mounting", self._mounting), ("firmware", self._firmware), ("a gap", self._noted)):
             self._require_sensors(name, given)
 
+    def _data_of(self, group: h5py.Group) -> str:
+        data, _ = _data_and_table(pdm="pdm" in group)
+        return data
+
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         sensor = group.name.rpartition("/")[2]
         gaps = rows.runs.missing(self._noted.get(sensor, ()))
@@ -174,6 +173,18 @@ class RecordingWriter(Writer[Measurement]):
             group[name].resize((len(gaps),))
             if len(column):
                 group[name][:] = column
+
+
+def _data_and_table(*, pdm: bool) -> tuple[str, tuple[Variable, ...]]:
+    """Return the variable with the words, and all that a sensor has."""
+    return ("pdm", RECORDING) if pdm else ("pcm", RECORDING_OF_PCM)
+
+
+def _sizes(settings: Settings) -> dict[str, int]:
+    """Return the length that the settings give to each axis."""
+    layout = microphones(settings.array)
+    several = {"word": layout.n_words} if layout.n_words > 1 and settings.recording.is_pdm else {}
+    return {"sample": settings.recording.n_samples, "microphone": len(layout.enabled), "axis": 3, **several}
 
 
 def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
@@ -206,13 +217,14 @@ class RecordingReader(Reader[Measurement]):
     """
 
     _kind: ClassVar[str] = "recording"
-    _data: ClassVar[str] = "pdm"
-    _table: ClassVar[tuple[Variable, ...]] = RECORDING
 
     gaps: tuple[Gap, ...]
     firmware: str
     translation_m: NDArray[np.float64]
     rotation_xyzw: NDArray[np.float64]
+
+    def _look(self) -> None:
+        self._data, self._table = _data_and_table(pdm="pcm" not in self._group)
 
     def _load(self) -> None:
         self._require_agreement()
@@ -233,17 +245,16 @@ class RecordingReader(Reader[Measurement]):
         return Measurement(self._rows.row(index), settings, self._rows.stamp(index, self.sensor))
 
     def _sizes(self) -> dict[str, int]:
-        layout = microphones(self.settings.array)
-        several = {"word": layout.n_words} if layout.n_words > 1 else {}
-        return {
-            "sample": self.settings.recording.n_samples,
-            "microphone": len(layout.enabled),
-            "axis": 3,
-            **several,
-        }
+        return _sizes(self.settings)
 
     def _require_agreement(self) -> None:
         """Refuse a file whose arrays say something else than its settings, which are what is used."""
+        came, words = self._group[self._data].dtype, word_format(self.settings)
+        if came != words.dtype:
+            raise DataError(
+                f"{self.path}: {self._data} holds {came}, the settings in the file want {words.dtype} "
+                f"(recording.encoding {self.settings.recording.encoding!r}); change the settings with it"
+            )
         for name, wanted in _copies(microphones(self.settings.array)).items():
             values = self._group[name][:]
             wrong = np.argwhere(values != wanted)  # NaN, too

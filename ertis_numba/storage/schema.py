@@ -26,6 +26,7 @@ __all__ = [
     "ENERGYSCAPE",
     "FORMAT_VERSION",
     "RECORDING",
+    "RECORDING_OF_PCM",
     "STAMPS",
     "TRUTH",
     "Variable",
@@ -80,7 +81,7 @@ STAMPS: Final = (
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
     Variable("epoch", ("time",), "<i8", "run of the sensor that gave the sequence numbers"),
-    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm or energy, as its bytes lie in the file"),
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or energy, as its bytes lie in the file"),
 )
 
 _SETTINGS = Variable("settings", (), "str", "settings as TOML; they hold the array itself")
@@ -103,6 +104,14 @@ RECORDING: Final = (
     Variable("gap_reason", ("gap",), "str", "why they are missing"),
     Variable("gap_epoch", ("gap",), "<i8", "run of the sensor that would have given the numbers", optional=True),
 )
+
+RECORDING_OF_PCM: Final = tuple(
+    Variable("pcm", ("time", "sample", "microphone"), "", "PCM; full scale is 32768 of int16, 1 of float32")
+    if variable.name == "pdm"
+    else variable
+    for variable in RECORDING
+)
+"""Of microphones that give numbers instead of bits."""
 
 ENERGYSCAPE: Final = (
     *STAMPS,

@@ -3,14 +3,18 @@
 import io
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-__all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes"]
+if TYPE_CHECKING:
+    from matplotlib.transforms import BboxBase
+
+__all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes", "draw_text"]
 
 PAGE: Final = (11, 13, 18)
 """Colour of what is not the image: red, green, blue."""
@@ -19,10 +23,13 @@ SIDE_PX: Final = 44
 
 _FAINT: Final = "#9aa0b0"
 _DPI: Final = 100
-_LETTERS_PT: Final = 8.5
+_LETTERS: Final[dict[str, Any]] = {"color": _FAINT, "fontsize": 8.5}
+_LINE: Final[dict[str, Any]] = {"color": _FAINT, "alpha": 0.4, "linewidth": 0.7}
+_TEXT_PT: Final = 11.0
 _ROOF_PX, _FLOOR_PX = 26, 66  # above and below the sector, for the names of rays, and of rings and the scale of colours
 _SCALE_PX: Final = 10  # height of the scale of colours
 _RING_PX: Final = 36  # between rings at least, so that their names have room
+_APART_PX: Final = 2  # between names at least
 _LEAST_RATIO, _MOST_RATIO = 0.25, 1.0  # of the sector's height to its width
 
 
@@ -134,45 +141,76 @@ def draw_axes(place: Place, fan_rad: NDArray[np.float64], range_m: tuple[float, 
     range_m : (first, last)
     dynamic_range_db : float
     """
-    rows, columns = place.height_px, place.width_px
-    figure = Figure(figsize=(columns / _DPI, rows / _DPI), dpi=_DPI)
-    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
-    axes.set_xlim(0, columns)
-    axes.set_ylim(rows, 0)
-    axes.set_axis_off()
-    text: dict[str, Any] = {"color": _FAINT, "fontsize": _LETTERS_PT}
-    line: dict[str, Any] = {"color": _FAINT, "alpha": 0.4, "linewidth": 0.7}
+    figure, axes = _sheet(place)
     first_deg, last_deg = math.degrees(fan_rad[0]), math.degrees(fan_rad[-1])
+    _draw_rings(axes, place, first_deg, last_deg, range_m)
+    _draw_rays(axes, place, first_deg, last_deg, range_m)
+    x, y = place.sensor_px
+    if 0 <= x <= place.width_px and 0 <= y <= place.height_px - _FLOOR_PX + 1:
+        axes.plot(x, y, marker="^", markersize=8, color="#e8eaf0")
+    left, right, _, bottom = place.scale_px
+    for share in (0.0, 0.5, 1.0):
+        name = f"{-dynamic_range_db * (1 - share):g}".replace("-", "−").replace("−0", "0")
+        axes.text(left + share * (right - left), bottom + 3, name, ha="center", va="top", **_LETTERS)
+    axes.text(right + 14, bottom - _SCALE_PX / 2, "dB", ha="left", va="center", **_LETTERS)
+    return _ink(figure)
+
+
+def _draw_rings(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
+    """Draw rings with their names, but those that would lie on another's: in a narrow window they have many digits."""
     arc_deg = np.linspace(first_deg, last_deg, 181)
     named_deg = first_deg if last_deg - first_deg < 350 else -135  # where no ray has its name
     level = abs(first_deg + 90) < 20  # then the names of rings stand under the edge, else beside it
     (low_m, high_m), half_m = range_m, 0.5 / place.scale_px_m
     rings = max(1, min(6, int((high_m - low_m) * place.scale_px_m / _RING_PX)))
+    named: list[BboxBase] = []
     for ring_m in MaxNLocator(nbins=rings, steps=[1, 2, 5, 10]).tick_values(low_m, high_m):
         if not low_m - half_m <= ring_m <= high_m + half_m or ring_m <= 0:
             continue
-        axes.plot(*np.array([place.pixel_of(at, ring_m) for at in arc_deg]).T, **line)
+        axes.plot(*np.array([place.pixel_of(at, ring_m) for at in arc_deg]).T, **_LINE)
         x, y = place.pixel_of(named_deg, ring_m)
         at_px = (x, y + 5) if level else (x + 6, y + 4)
-        axes.text(*at_px, f"{ring_m:g} m", ha="center" if level else "left", va="top", **text)
+        name = axes.text(*at_px, f"{ring_m:g} m", ha="center" if level else "left", va="top", **_LETTERS)
+        name.set_x(at_px[0] - max(0.0, name.get_window_extent().x1 - place.width_px))
+        box = name.get_window_extent().padded(_APART_PX)
+        if any(box.overlaps(other) for other in named):
+            name.remove()
+        else:
+            named.append(box)
+
+
+def _draw_rays(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
+    """Draw rays with their names."""
     step_deg = 15 if last_deg - first_deg < 100 else 30
-    for ray_deg in range(-180, 181, step_deg):
-        if not first_deg - 1e-6 <= ray_deg <= last_deg + 1e-6 or (ray_deg == -180 and last_deg > 180 - 1e-6):
-            continue
-        axes.plot(*np.array([place.pixel_of(ray_deg, at_m) for at_m in (low_m, high_m)]).T, **line)
-        x, y = place.pixel_of(ray_deg, high_m + 4 / place.scale_px_m)
+    first, last = math.ceil((first_deg - 1e-6) / step_deg), math.floor((last_deg + 1e-6) / step_deg)
+    for ray_deg in sorted({180 - (180 - number * step_deg) % 360 for number in range(first, last + 1)}):
+        axes.plot(*np.array([place.pixel_of(ray_deg, at_m) for at_m in range_m]).T, **_LINE)
+        x, y = place.pixel_of(ray_deg, range_m[1] + 4 / place.scale_px_m)
         across = -math.sin(math.radians(ray_deg))
         side = "center" if abs(across) < 0.3 else "left" if across > 0 else "right"
         below = "top" if math.cos(math.radians(ray_deg)) < -0.3 else "bottom"
-        axes.text(x, y, f"{ray_deg:+d}°".replace("-", "−").replace("+0", "0"), ha=side, va=below, **text)
-    x, y = place.sensor_px
-    if 0 <= x <= columns and 0 <= y <= rows - _FLOOR_PX + 1:
-        axes.plot(x, y, marker="^", markersize=8, color="#e8eaf0")
-    left, right, _, bottom = place.scale_px
-    for share in (0.0, 0.5, 1.0):
-        name = f"{-dynamic_range_db * (1 - share):g}".replace("-", "−").replace("−0", "0")
-        axes.text(left + share * (right - left), bottom + 3, name, ha="center", va="top", **text)
-    axes.text(right + 14, bottom - _SCALE_PX / 2, "dB", ha="left", va="center", **text)
+        axes.text(x, y, f"{ray_deg:+d}°".replace("-", "−").replace("+0", "0"), ha=side, va=below, **_LETTERS)
+
+
+def draw_text(place: Place, text: str) -> Ink:
+    """Draw a text in the middle of the picture, where there is nothing to draw."""
+    figure, axes = _sheet(place)
+    at_px = place.width_px / 2, place.height_px / 2
+    axes.text(*at_px, text, color=_FAINT, fontsize=_TEXT_PT, ha="center", va="center", parse_math=False)
+    return _ink(figure)
+
+
+def _sheet(place: Place) -> tuple[Figure, Axes]:
+    """Return what is drawn on, in pixels from the upper left corner."""
+    figure = Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
+    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
+    axes.set_xlim(0, place.width_px)
+    axes.set_ylim(place.height_px, 0)
+    axes.set_axis_off()
+    return figure, axes
+
+
+def _ink(figure: Figure) -> Ink:
     file = io.BytesIO()
     figure.savefig(file, format="rgba", dpi=_DPI, transparent=True)
     drawn = np.frombuffer(file.getvalue(), np.uint8).reshape(-1, 4)

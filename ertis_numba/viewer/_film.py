@@ -1,15 +1,16 @@
 """Images of a file along its time: recordings are processed while they are shown."""
 
+import atexit
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, Self
 
+from ertis_numba import kernels
 from ertis_numba.errors import DataError
-from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import (
     EnergyscapeReader,
@@ -19,29 +20,12 @@ from ertis_numba.storage import (
     open_recording,
     sensor_names,
 )
-from ertis_numba.viewer._shapes import UNTURNED, Pose, Taken
+from ertis_numba.viewer._moments import UNTIMED_S, Moment, Track, moments_of
+from ertis_numba.viewer._shapes import Pose, Taken
 
 __all__ = ["Film", "Moment"]
 
-_TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are shown as one
-_UNTIMED_S: Final = 0.1  # between measurements that have no time
 _LOOK_S: Final = 1 / 60
-_STOP_S: Final = 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """What is shown at once: one measurement of each sensor at most.
-
-    Attributes
-    ----------
-    time_s : float
-        Since the first.
-    measurements : tuple of (sensor, number)
-    """
-
-    time_s: float
-    measurements: tuple[tuple[str, int], ...]
 
 
 class Film:
@@ -59,12 +43,17 @@ class Film:
 
     Attributes
     ----------
+    path : Path
     moments : tuple of Moment
     place, shown : int
         Number of the moment that is due, and of the one that was taken last.
+    anew : bool
+        What was taken last stands alone: what was taken before is of another time, as after `seek`.
     playing : bool
+    held : bool
+        Time does not begin, as nobody sees it yet; the first moment is made all the same.
     received, skipped : int
-        How many images were made, and moments for which there was no time.
+        How many images were made, and moments of which nothing was shown, as there was no time while this played.
 
     Raises
     ------
@@ -72,6 +61,8 @@ class Film:
         The file cannot be read or holds nothing.
     ArgumentError
         There is no such sensor.
+    DeviceError
+        There is no such device to process recordings.
     """
 
     is_film: Literal[True] = True
@@ -85,7 +76,8 @@ class Film:
         device: Literal["auto", "cpu", "cuda", "numpy"] = "auto",
         loop: bool = False,
     ) -> None:
-        self.title = Path(path).name
+        self.path = Path(path)
+        self.title = self.path.name
         self._device, self._loop = device, loop
         self._pipelines: dict[str, Pipeline] = {}
         self._readers: dict[str, RecordingReader | EnergyscapeReader] = {}
@@ -97,15 +89,21 @@ class Film:
             for name in sensors or sensor_names(path):
                 self._readers[name] = reader = opened(path, sensor=name)
                 self._stack.callback(reader.close)
-            self.moments = _moments({name: reader.stamps() for name, reader in self._readers.items()})
+            if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):
+                kernels.load(device)  # what is not there is told before anything is shown
+            self.moments, self._notes = moments_of({name: reader.stamps() for name, reader in self._readers.items()})
             if not self.moments:
                 raise DataError(f"{path} holds no measurement; give a file with one")
             self._stack = self._stack.pop_all()
-        self.playing, self.place, self.shown = True, 0, 0
+        self._tracks = {name: Track.of(name, self.moments) for name in self._readers}
+        self.playing, self.place, self.shown, self.anew = True, 0, 0, True
+        self.held = False
         self.received = self.skipped = 0
         self._begun: tuple[float, int] | None = None  # when which moment was due
-        self._made: int | None = None
-        self._ready: list[Taken] = []
+        self._made: int | None = None  # None where what is made next stands alone
+        self._jumps = self._plays = self._made_in = 0  # how often somebody went elsewhere, or began or ended a play
+        self._ready: dict[str, Taken] = {}
+        self._ready_for, self._ready_anew = 0, True
         self._turn = threading.Lock()
         self._closed = threading.Event()
         self._failure: Exception | None = None
@@ -115,42 +113,65 @@ class Film:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._closed.set()
-        if self._thread is not None:
-            self._thread.join(_STOP_S)
-            if self._thread.is_alive():  # kernels are being compiled: who ends does not wait for that
-                return
+        self._end()
         for pipeline in self._pipelines.values():
             pipeline.close()
         self._stack.close()
+
+    def _end(self) -> None:
+        """End the thread; while kernels are being compiled that takes some seconds.
+
+        An interpreter that ends while a thread is in the compiler crashes: LLVM is taken apart under it.
+        """
+        self._closed.set()
+        if self._thread is not None:
+            self._thread.join()
+        atexit.unregister(self._end)
 
     @property
     def state(self) -> str:
         """What to tell of the film."""
         return f"{self.moments[self.shown].time_s:.2f} s of {self.moments[-1].time_s:.2f} s"
 
+    @property
+    def clock_s(self) -> float:
+        """The time of the moment that is shown and, while this plays, what has passed since, until the next one."""
+        with self._turn:
+            shown_s, after = self.moments[self.shown].time_s, self.shown + 1
+            if not self.playing or self._begun is None:
+                return shown_s
+            next_s = self.moments[after].time_s if after < len(self.moments) else shown_s + UNTIMED_S
+            return min(max(self._due_s(self._begun, time.monotonic()), shown_s), next_s)
+
     def notes(self) -> list[str]:
-        """Return what has happened, which is nothing."""
-        return []
+        """Return what there is to know of the times in the file, once."""
+        told, self._notes = self._notes, []
+        return told
 
     def play(self, *, playing: bool) -> None:
         """Go on, from the beginning where this is at the end; or stay."""
         with self._turn:
             if playing and self.place == len(self.moments) - 1:
-                self.place = 0
+                self._jump(0)
             self.playing, self._begun = playing, None
+            self._plays += 1
 
     def seek(self, place: int) -> None:
         """Show a moment next, and go on from there."""
         with self._turn:
-            self.place = min(max(place, 0), len(self.moments) - 1)
-            self._begun = None
+            self._jump(min(max(place, 0), len(self.moments) - 1))
+
+    def _jump(self, place: int) -> None:
+        self.place, self._begun, self._made = place, None, None
+        self._jumps += 1
+        self._plays += 1
 
     def take(self) -> list[Taken]:
         """Return the images of the moment that was due last, nothing where they were taken.
 
-        At recorded speed: moments for which there was no time are skipped and counted. Images are made in a thread, as
-        the first takes long where kernels are to be compiled.
+        At recorded speed: moments for which there was no time are skipped and counted. Of a sensor that measured in
+        them the last image is returned; after `seek`, of each sensor the last one at or before the moment. Images are
+        made in a thread, as the first takes long where kernels are to be compiled.
 
         Raises
         ------
@@ -160,18 +181,18 @@ class Film:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="ertis-film", daemon=True)
             self._thread.start()
+            atexit.register(self._end)  # where nobody closes this
         with self._turn:
             if self._failure is not None:
                 raise self._failure
-            ready, self._ready = self._ready, []
-            if ready and self._made is not None:
-                self.shown = self._made
+            ready, self._ready = [*self._ready.values()], {}
+            if ready:
+                self.shown, self.anew = self._ready_for, self._ready_anew
         return ready
 
     def at(self, place: int) -> list[Taken]:
         """Return the images of a moment."""
-        moment = self.moments[place]
-        return [self._taken(name, number, moment.time_s) for name, number in moment.measurements]
+        return [self._taken(name, place, number) for name, number in self.moments[place].measurements]
 
     def latency_s(self, _: Sequence[Taken]) -> float | None:
         """Return None: what was recorded is as old as it is."""
@@ -184,47 +205,66 @@ class Film:
                 with self._turn:
                     if self.playing:
                         self._advance(time.monotonic())
-                    place, made = self.place, self._made
+                    place, made, jumps, plays = self.place, self._made, self._jumps, self._plays
                 if place == made:
                     self._closed.wait(_LOOK_S)
                     continue
-                taken = self.at(place)
+                last = {name: track.last(-1 if made is None else made, place) for name, track in self._tracks.items()}
+                due = {name: each for name, each in last.items() if each is not None}
+                taken = {name: self._taken(name, *each) for name, each in due.items()}
                 with self._turn:
-                    if made is not None and self.playing:
-                        self.skipped += max(0, place - made - 1)
-                    self._ready, self._made = taken, place
-                    self.received += len(taken)
+                    if made is not None and plays == self._made_in:
+                        self.skipped += place - made - len({at for at, _ in due.values()})
+                        self.skipped += bool(self._ready.keys() & taken.keys())  # which nobody took in time
+                    self._put(place, taken, anew=made is None)
+                    self._made_in = plays
+                    if jumps == self._jumps:
+                        self._made = place
         except Exception as error:  # noqa: BLE001  whoever looks is to know
             self._failure = error
+
+    def _put(self, place: int, taken: dict[str, Taken], *, anew: bool) -> None:
+        """Have images ready, with those that nobody took yet where they are of the same play."""
+        self.received += len(taken)
+        self._ready_anew = anew or (bool(self._ready) and self._ready_anew)
+        self._ready = taken if anew else self._ready | taken
+        self._ready_for = place
+
+    def _due_s(self, begun: tuple[float, int], now_s: float) -> float:
+        """Return the time of the film that it is now, of a play that began then and there."""
+        begun_s, first = begun
+        return self.moments[first].time_s + now_s - begun_s
 
     def _advance(self, now_s: float) -> None:
         """Go to the moment that is due."""
         if self._begun is None:
-            if self._made != self.place:  # time begins when it is shown, which may take long where kernels are compiled
+            # Time begins when it is shown, which may take long where kernels are compiled.
+            if self.held or self._made != self.place:
                 return
             self._begun = now_s, self.place
-        begun_s, first = self._begun
-        due_s = self.moments[first].time_s + now_s - begun_s
+        due_s = self._due_s(self._begun, now_s)
         last = len(self.moments) - 1
         while self.place < last and self.moments[self.place + 1].time_s <= due_s:
             self.place += 1
-        if self.place < last or due_s < self.moments[last].time_s + _UNTIMED_S:
+        if self.place < last or due_s < self.moments[last].time_s + UNTIMED_S:
             return
         if self._loop:
-            self.place, self._begun = 0, (now_s, 0)
-            self._made = None if last == 0 else self._made
+            if self._made is not None and self._made_in == self._plays:
+                self.skipped += last - self._made
+            self.place, self._begun, self._made = 0, (now_s, 0), None
         else:
             self.playing = False
 
-    def _taken(self, name: str, number: int, time_s: float) -> Taken:
+    def _taken(self, name: str, place: int, number: int) -> Taken:
         reader = self._readers[name]
         item = reader[number]
         image = item if isinstance(item, Energyscape) else self._processed(name, item)
-        if isinstance(reader, RecordingReader):
+        pose = None
+        if reader.translation_m is not None and reader.rotation_xyzw is not None:
             x, y, z = reader.translation_m.tolist()
             i, j, k, w = reader.rotation_xyzw.tolist()
-            return Taken(image, Pose((x, y, z), (i, j, k, w)), time_s)
-        return Taken(image, UNTURNED, time_s)
+            pose = Pose((x, y, z), (i, j, k, w))
+        return Taken(image, pose, self.moments[place].time_s, self._tracks[name].interval_s)
 
     def _processed(self, name: str, measurement: Measurement) -> Energyscape:
         """Return the image of a measurement; other air makes other ranges, and another pipeline."""
@@ -234,26 +274,3 @@ class Film:
                 pipeline.close()
             pipeline = self._pipelines[name] = Pipeline(measurement.settings, device=self._device)
         return pipeline.process(measurement)
-
-
-def _moments(stamps: dict[str, list[Stamp]]) -> tuple[Moment, ...]:
-    """Return the moments of measurements in the order of their times, or of their numbers where they have none."""
-    timed = any(len({stamp.timestamp_ns for stamp in each}) > 1 for each in stamps.values())
-    rows = sorted(
-        (stamp.timestamp_ns if timed else round(number * _UNTIMED_S * 1e9), name, number)
-        for name, each in stamps.items()
-        for number, stamp in enumerate(each)
-    )
-    moments: list[Moment] = []
-    together: dict[str, int] = {}
-    begun_ns = rows[0][0] if rows else 0
-    for at_ns, name, number in rows:
-        if together and (name in together or at_ns - begun_ns > _TOGETHER_NS):
-            moments.append(Moment((begun_ns - rows[0][0]) / 1e9, tuple(together.items())))
-            together = {}
-        if not together:
-            begun_ns = at_ns
-        together[name] = number
-    if together:
-        moments.append(Moment((begun_ns - rows[0][0]) / 1e9, tuple(together.items())))
-    return tuple(moments)

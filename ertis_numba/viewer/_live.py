@@ -4,17 +4,25 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 from ertis_numba.frames import Energyscape
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
+from ertis_numba.viewer._moments import usual_s
 from ertis_numba.viewer._shapes import Pose, Taken
+
+if TYPE_CHECKING:
+    from ertis_numba.network.messages import Product
+    from ertis_numba.network.products import Item
 
 __all__ = ["Live"]
 
 _LOOK_S: Final = 0.1
 _STOP_S: Final = 2.0
+_SOON_S: Final = 3.0  # after which it is told that nobody answers, or that there is no sensor of a name
+_INTERVALS: Final = 9  # from which the usual one is taken: so that a single pause does not count
 
 
 class Live:
@@ -28,6 +36,11 @@ class Live:
         All by default.
     keys : ClientKeys, optional
 
+    Attributes
+    ----------
+    received : int
+        How many images have come.
+
     Raises
     ------
     ArgumentError
@@ -38,12 +51,20 @@ class Live:
 
     def __init__(self, address: str, *, sensors: Sequence[str] | None = None, keys: ClientKeys | None = None) -> None:
         self.title = address
+        self.received = 0
         self._notes: deque[str] = deque(maxlen=16)
-        self._subscriber: Subscriber[Energyscape] = Subscriber(
-            address, sensors=sensors, products=("energyscape",), keys=keys, on_note=self._notes.append
+        # The status says which sensors there are; where nobody asks for some, it would only take the room of images.
+        products: tuple[Product, ...] = ("energyscape", "status") if sensors else ("energyscape",)
+        self._subscriber: Subscriber[Item] = Subscriber(
+            address, sensors=sensors, products=products, keys=keys, on_note=self._notes.append
         )
+        self._wanted = set([sensors] if isinstance(sensors, str) else sensors or ())
+        self._begun_s = time.monotonic()
+        self._connected_s: float | None = None  # when it was first
+        self._is_told = False  # that nobody answers
         self._turn = threading.Lock()
         self._waiting: dict[str, Arrival] = {}
+        self._arrived_s: dict[str, deque[float]] = {}
         self._failure: Exception | None = None
         self._superseded = 0
         self._thread = threading.Thread(target=self._run, name="ertis-view", daemon=True)
@@ -57,11 +78,6 @@ class Live:
         self._thread.join(_STOP_S)
 
     @property
-    def received(self) -> int:
-        """How many images have come."""
-        return self._subscriber.counts.received
-
-    @property
     def dropped(self) -> int:
         """How many images the central node has dropped, as this was too slow."""
         return self._subscriber.counts.dropped
@@ -72,15 +88,36 @@ class Live:
         return self._superseded
 
     @property
+    def clock_s(self) -> float:
+        """Now, by the clock of the times of images."""
+        return time.monotonic()
+
+    @property
     def state(self) -> str:
         """What to tell of the connection."""
-        return "live" if self._subscriber.connected else "waiting for the central node"
+        return "live" if self.connected else "waiting for the central node"
+
+    @property
+    def connected(self) -> bool:
+        """Whether a central node answers."""
+        return self._subscriber.connected
 
     def notes(self) -> list[str]:
-        """Return what has happened to the connection since this was asked last."""
+        """Return what has happened to the connection since this was asked last.
+
+        What happens before anybody has answered is kept for a while: `take` raises that it was refused.
+        """
+        waited_s = time.monotonic() - self._begun_s
+        if self._connected_s is None and not self.connected and (waited_s < _SOON_S or self._failure is not None):
+            return []
         told = []
         while self._notes:
             told.append(self._notes.popleft())
+        if self._connected_s is None and self.connected:
+            self._connected_s = time.monotonic()
+        if self._connected_s is None and not told and not self._is_told:
+            told.append(f"no publisher at {self.title} yet; is 'ertis serve' running?")
+        self._is_told = True
         return told
 
     def take(self) -> list[Taken]:
@@ -93,10 +130,16 @@ class Live:
         """
         with self._turn:
             came, self._waiting = list(self._waiting.values()), {}
+            between_s = {name: usual_s(arrived_s) for name, arrived_s in self._arrived_s.items()}
         if self._failure is not None:
             raise self._failure
         return [
-            Taken(arrival.item, Pose(arrival.translation_m, arrival.rotation_xyzw), arrival.arrived_ns / 1e9)
+            Taken(
+                arrival.item,
+                Pose(arrival.translation_m, arrival.rotation_xyzw),
+                arrival.arrived_ns / 1e9,
+                between_s[arrival.item.stamp.sensor],
+            )
             for arrival in came
             if isinstance(arrival.item, Energyscape)
         ]
@@ -106,15 +149,29 @@ class Live:
         first_ns = min((each.image.stamp.timestamp_ns for each in taken), default=0)
         return (time.time_ns() - first_ns) / 1e9 if first_ns else None
 
+    def _look_for_sensors(self, status: Status) -> None:
+        """Tell, once, which of the sensors that were asked for there are not."""
+        if not self._wanted or self._connected_s is None or time.monotonic() - self._connected_s < _SOON_S:
+            return
+        missing, self._wanted = self._wanted - status.sensors.keys(), set()
+        if missing:
+            there = f"there are {', '.join(sorted(status.sensors))}" if status.sensors else "there is none"
+            self._notes.append(f"no sensor {', '.join(map(repr, sorted(missing)))} yet; {there}")
+
     def _run(self) -> None:
         try:
             while not self._subscriber.closed:
-                image = self._subscriber.receive(_LOOK_S)
+                item = self._subscriber.receive(_LOOK_S)
                 arrival = self._subscriber.latest
-                if image is None or arrival is None:
+                if isinstance(item, Status):
+                    self._look_for_sensors(item)
+                if not isinstance(item, Energyscape) or arrival is None:
                     continue
+                sensor = item.stamp.sensor
                 with self._turn:
-                    self._superseded += image.stamp.sensor in self._waiting
-                    self._waiting[image.stamp.sensor] = arrival
+                    self.received += 1
+                    self._superseded += sensor in self._waiting
+                    self._waiting[sensor] = arrival
+                    self._arrived_s.setdefault(sensor, deque(maxlen=_INTERVALS)).append(arrival.arrived_ns / 1e9)
         except Exception as error:  # noqa: BLE001  whoever looks is to know
             self._failure = error

@@ -1,23 +1,22 @@
 """The page in the browser: what is drawn and chosen there, handed to viser and taken from it."""
 
 import contextlib
-import functools
 import html
 import io
 import math
-import re
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import viser
-import websockets.asyncio.server
 
 from ertis_numba.errors import NetworkError
 from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MOST_DECAY_S, Choices
+from ertis_numba.viewer._origins import own_pages
+from ertis_numba.viewer._recordings import MOST_BYTES
 from ertis_numba.viewer._shapes import Frame
-from ertis_numba.viewer._space import Space
+from ertis_numba.viewer._space import Space, round_step
 
 if TYPE_CHECKING:
     from queue import SimpleQueue
@@ -25,8 +24,9 @@ if TYPE_CHECKING:
 __all__ = ["Order", "Page"]
 
 _PANEL_PX, _PICTURES_PX = 330, 560  # the latter such that pictures are shown pixel by pixel
-_LOOPBACK: Final = ("127.0.0.1", "localhost", "[::1]", "::1")
-_STEP_M: Final = 0.05  # of the window of ranges
+_SMALL: Final = "<div style='margin:0 0.8em 0.6em;font-size:0.85em;color:#9aa0b0'>{}</div>"
+_RANGE: Final = "Range"
+_STEPS: Final = 100  # of the window of ranges
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,11 @@ class Page:
     n_moments : int, optional
         Length of the time line; there is none by default.
 
+    Attributes
+    ----------
+    is_seen : bool
+        A browser has come.
+
     Raises
     ------
     NetworkError
@@ -67,8 +72,9 @@ class Page:
         self, host: str, port: int, *, orders: Orders, title: str, choices: Choices, n_moments: int | None = None
     ) -> None:
         _require_free(host, port)
-        self._orders, self._choices = orders, choices
-        with _silence(), _own_pages(host):
+        self._orders, self.is_seen = orders, False
+        self._chosen: dict[str, Any] = {}  # the controls of what is chosen, by its name
+        with _silence(), own_pages(host):
             self._server = _Server(host=host, port=port, label=f"ertis view: {title}", verbose=False)
         if port and self._server.get_port() != port:  # viser goes on to the next that is free
             self.close()
@@ -77,7 +83,7 @@ class Page:
         self._space = Space(self._server)
         self._shown: dict[str, viser.GuiImageHandle] = {}
         self._line: Any = None
-        self._recorder: Any = None
+        self._recorders: dict[int, tuple[viser.GuiButtonHandle, viser.GuiHtmlHandle]] = {}
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
@@ -109,11 +115,18 @@ class Page:
         with self._server.atomic():
             self._space.show(frame)
             for name, drawn in frame.sensors.items():
-                if name in self._shown:
-                    self._shown[name].image = drawn.picture
-                else:
+                label = f"{name} (overdue)" if drawn.overdue else name
+                if name not in self._shown:
                     with self._pictures:
-                        self._shown[name] = self._server.gui.add_image(drawn.picture, label=name, format="png")
+                        self._shown[name] = self._server.gui.add_image(drawn.picture, label=label, format="png")
+                    for order, (_, each) in enumerate(sorted(self._shown.items())):  # whichever came first
+                        each.order = order
+                shown = self._shown[name]
+                shown.label, shown.visible = label, True
+                if shown.image is not drawn.picture:  # it is encoded and sent to all browsers
+                    shown.image = drawn.picture
+            for name in self._shown.keys() - frame.sensors.keys():
+                self._shown[name].visible = False
             if self._line is not None and self._line.value != place:
                 self._line.value = place
 
@@ -131,26 +144,22 @@ class Page:
         if self._play.label != label:
             self._play.label = label
 
-    def begin_recording(self) -> None:
-        """Keep all that is drawn in the scene from now on."""
-        self._recorder = self._server.get_scene_serializer()
-        self._record.label = "End HTML recording"
+    def serializer(self) -> Any:
+        """Return what keeps all that is drawn in the scene from now on."""
+        return self._server.get_scene_serializer()
 
-    def pass_time(self, time_s: float) -> None:
-        """Note how long what was drawn last has been shown, where that is recorded."""
-        if self._recorder is not None:
-            self._recorder.insert_sleep(time_s)
-
-    def end_recording(self) -> str:
-        """Return what was drawn as a page that needs neither server nor network."""
-        recorder, self._recorder = self._recorder, None
-        self._record.label = "Begin HTML recording"
-        return str(recorder.as_html(dark_mode=True))
-
-    @property
-    def is_recording(self) -> bool:
-        """Whether what is drawn is kept."""
-        return self._recorder is not None
+    def tell_recordings(self, n_bytes: Mapping[Hashable, int]) -> None:
+        """Tell each browser whether it is recording, and how much of the most there can be: by the browser's number."""
+        for number, (button, told) in [*self._recorders.items()]:
+            here = n_bytes.get(number)
+            most = f"at most {MOST_BYTES / 1e6:g} MB"
+            label = "Begin HTML recording" if here is None else "End HTML recording"
+            content = _SMALL.format(most if here is None else f"{here / 1e6:.1f} MB, {most}")
+            with contextlib.suppress(RuntimeError):  # the browser has just left
+                if button.label != label:
+                    button.label = label
+                if told.content != content:
+                    told.content = content
 
     def close(self) -> None:
         """Serve no longer."""
@@ -165,15 +174,30 @@ class Page:
         self._obey(
             gui.add_slider("Dynamic range (dB)", *DYNAMIC_RANGE_DB, 1.0, choices.dynamic_range_db), "dynamic_range_db"
         )
-        self._range: Any = gui.add_multi_slider("Range (m)", 0.0, 1.0, _STEP_M, (0.0, 1.0), min_range=2 * _STEP_M)
+        self._range: Any = gui.add_multi_slider(_RANGE, 0.0, 1.0, 1 / _STEPS, (0.0, 1.0), min_range=2 / _STEPS)
         self._range.visible = False  # until it is known how far images reach
         self._obey(self._range, "range_m")
         self._obey(gui.add_slider("Decay (s)", 0.0, MOST_DECAY_S, 0.1, choices.decay_s), "decay_s")
         self._obey(gui.add_dropdown("Colours", COLOURS, initial_value=choices.colours), "colours")
-        with gui.add_folder("Save"):
+        self._saving = gui.add_folder("Save")
+        with self._saving:
             self._button("Picture (PNG)", "picture")
             self._button("Points (PLY)", "points")
-            self._record = self._button("Begin HTML recording", "record")
+        self._server.on_client_connect(self._greet)
+        self._server.on_client_disconnect(self._forget)
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        """Give a browser what is its own: nobody ends the recording of another."""
+        self.is_seen = True
+        with self._saving:
+            button = client.gui.add_button("Begin HTML recording")
+            button.on_click(lambda _: self._orders.put(Order("record", None, client)))
+            told = client.gui.add_html(_SMALL.format(f"at most {MOST_BYTES / 1e6:g} MB"))
+        self._recorders[client.client_id] = button, told
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        self._recorders.pop(client.client_id, None)
+        self._orders.put(Order("leave", None, client))
 
     def _button(self, label: str, name: str, value: Any = None) -> viser.GuiButtonHandle:
         button = self._server.gui.add_button(label)
@@ -188,19 +212,30 @@ class Page:
                 self._orders.put(Order(name, event.target.value))
 
         control.on_update(chosen)
+        self._chosen[name] = control
 
-    def limit_range(self, farthest_m: float) -> None:
-        """Say how far images reach."""
-        top_m = math.ceil(farthest_m / _STEP_M - 1e-9) * _STEP_M
-        if top_m <= self._range.max and self._range.visible:
-            return
-        whole = not self._range.visible or self._range.value[1] >= self._range.max
-        low_m, high_m = self._choices.range_m or (0.0, top_m)
-        if self._range.visible:
-            low_m, high_m = self._range.value[0], top_m if whole else self._range.value[1]
-        self._range.max = top_m
-        self._range.value = (min(low_m, top_m), min(high_m, top_m))
-        self._range.visible = True
+    def put_back(self, choices: Choices) -> None:
+        """Show in the controls what is chosen, where somebody has typed what cannot be."""
+        for name, control in self._chosen.items():
+            value = getattr(choices, name, None)
+            if value is not None and control.value != value:
+                control.value = value
+
+    def limit_range(self, farthest_m: float, window_m: tuple[float, float] | None) -> None:
+        """Say how far images reach, and which window of that is shown."""
+        far_m = max(farthest_m, 0.0 if window_m is None else window_m[1])
+        step_m = round_step(far_m, _STEPS)
+        top_m = math.ceil(far_m / step_m - 1e-9) * step_m
+        first_m, last_m = window_m or (0.0, top_m)
+        label = f"{_RANGE} {first_m:.4g}–{last_m:.4g} m"
+        if self._range.label != label:
+            self._range.label = label
+        if top_m > self._range.max or not self._range.visible:
+            self._range.step, self._range.min_range = step_m, 2 * step_m
+            self._range.precision = max(0, -math.floor(math.log10(step_m)))
+            self._range.max = top_m
+            self._range.value = (first_m, last_m)
+            self._range.visible = True
 
 
 class _Server(viser.ViserServer):
@@ -208,23 +243,6 @@ class _Server(viser.ViserServer):
 
     def request_share_url(self, verbose: bool = True) -> None:  # noqa: FBT001, FBT002  as viser has it
         """Share nothing: a page could ask for a tunnel to a host of viser's makers."""
-
-
-@contextlib.contextmanager
-def _own_pages(host: str) -> Iterator[None]:
-    """Let a server that is made in this block refuse pages of other sites, which a browser lets connect to any host.
-
-    viser takes them all, and has no option. Whoever serves to others than this machine may do so by any name.
-    """
-    serve = websockets.asyncio.server.serve
-    names = sorted({host, *_LOOPBACK})
-    own = re.compile(rf"https?://({'|'.join(map(re.escape, names))})(:\d+)?")
-    if host in _LOOPBACK:
-        setattr(websockets.asyncio.server, "serve", functools.partial(serve, origins=[own, None]))  # noqa: B010
-    try:
-        yield
-    finally:
-        setattr(websockets.asyncio.server, "serve", serve)  # noqa: B010  mypy would not have a class replaced
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:

@@ -7,17 +7,21 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import unit_vectors
-from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes
+from ertis_numba.geometry import ALONE_RAD, azimuth_columns, is_closed, reach_rad, unrolled_rad
+from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_text
 
-__all__ = ["Look", "Polar", "cropped"]
+__all__ = ["Look", "Polar", "cropped", "is_within"]
 
-_THIN_RAD: Final = math.radians(1.0)
 _SHARES: Final = 256  # in which what lies between two directions is weighed
+
+
+def is_within(image: Energyscape, range_m: tuple[float, float] | None) -> bool:
+    """Whether any range of an image lies in a window."""
+    first_m, last_m = (-math.inf, math.inf) if range_m is None else range_m
+    return bool(((image.range_m >= first_m - 1e-9) & (image.range_m <= last_m + 1e-9)).any())
 
 
 def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energyscape:
@@ -64,7 +68,8 @@ class Polar:
     """Makes pictures of images that have the axes of one.
 
     As x is forward and y left in the sensor frame, positive azimuth is on the left. Of several elevations the
-    strongest is shown. Levels between two directions are interpolated; ranges finer than a pixel are joined to their
+    strongest is shown. Levels between two directions are interpolated, but not where they lie so far apart that nobody
+    looked between them; ranges finer than a pixel are joined to their
     maximum.
 
     Parameters
@@ -86,14 +91,19 @@ class Polar:
             raise ArgumentError(f"width_px is {width_px}; give at least {4 * SIDE_PX}")
         self._floor = np.float32(10 ** (-dynamic_range_db / 20))
         self._dynamic_range_db = dynamic_range_db
-        azimuth_rad, self._order, self._starts = _columns(image)
+        azimuth_rad, self._order, self._starts = azimuth_columns(unrolled_rad(image.azimuth_rad), image.elevation_rad)
         self._range_m = float(image.range_m[0]), float(image.range_m[-1])
         if self._range_m[1] <= 0:
             raise ArgumentError("the image ends at range 0; give one with ranges")
         self._fan_rad = azimuth_rad
-        if azimuth_rad[-1] - azimuth_rad[0] < _THIN_RAD:  # too thin to be seen
+        is_thin = azimuth_rad[-1] - azimuth_rad[0] < ALONE_RAD
+        if is_thin:  # too thin to be seen
             middle = float(azimuth_rad.mean())
-            self._fan_rad = np.array([middle - _THIN_RAD, middle + _THIN_RAD])
+            self._fan_rad = np.array([middle - ALONE_RAD, middle + ALONE_RAD])
+        self._is_closed = is_closed(azimuth_rad)
+        if self._is_closed:  # what lies between the last and the first is seen, too
+            self._fan_rad = np.append(azimuth_rad, azimuth_rad[0] + 2 * math.pi)
+        self._reach_rad = np.array([math.inf]) if is_thin else reach_rad(np.diff(self._fan_rad))
         self._place = Place.of(self._fan_rad, self._range_m, width_px)
         self._bins = self._joined_ranges(image.range_m)
         ends = np.append(self._bins[1:], len(image.range_m)) - 1
@@ -148,6 +158,14 @@ class Polar:
         self._axes.onto(flat)
         return made
 
+    def empty(self, window_m: tuple[float, float] | None) -> NDArray[np.uint8]:
+        """Return a picture of nothing, which says that no range lies in a window: (row, column, 3) uint8."""
+        made = np.full((*self.shape, 3), PAGE, dtype=np.uint8)
+        (first_m, last_m), (low_m, high_m) = window_m or (0.0, 0.0), self._range_m
+        text = f"nothing from {first_m:g} to {last_m:g} m:\nthe image has {low_m:.2f} to {high_m:.2f} m"
+        draw_text(self._place, text).onto(made.reshape(-1, 3))
+        return made
+
     @functools.cached_property
     def _axes(self) -> Ink:
         return draw_axes(self._place, self._fan_rad, self._range_m, self._dynamic_range_db)
@@ -177,19 +195,27 @@ class Polar:
         """
         radius_m = np.hypot(right_m, ahead_m)
         azimuth_rad = np.arctan2(-right_m, ahead_m)
+        first_rad = self._fan_rad[0] - 1e-9
+        azimuth_rad = first_rad + (azimuth_rad - first_rad) % (2 * math.pi)
         half_m = 0.5 / self._place.scale_px_m
         inside = (radius_m >= self._range_m[0] - half_m) & (radius_m <= self._range_m[1] + half_m)
-        inside &= (azimuth_rad >= self._fan_rad[0] - 1e-9) & (azimuth_rad <= self._fan_rad[-1] + 1e-9)
+        inside &= azimuth_rad <= self._fan_rad[-1] + 1e-9
+        gap = np.clip(np.searchsorted(self._fan_rad, azimuth_rad, side="right") - 1, 0, len(self._reach_rad) - 1)
+        away_rad = np.minimum(azimuth_rad - self._fan_rad[gap], self._fan_rad[gap + 1] - azimuth_rad)
+        inside &= away_rad <= self._reach_rad[gap]
         n_azimuths, n_bins = len(self._starts), len(self._bins_m)
-        at = np.interp(azimuth_rad[inside], self._fan_rad, np.linspace(0, n_azimuths - 1, len(self._fan_rad)))
+        last = n_azimuths if self._is_closed else n_azimuths - 1
+        at = np.interp(azimuth_rad[inside], self._fan_rad, np.linspace(0, last, len(self._fan_rad)))
         before = np.floor(at).astype(np.intp)
-        after = np.minimum(before + 1, n_azimuths - 1)
+        share = np.rint((at - before) * _SHARES).astype(np.uint16)
+        after = np.minimum(before + 1, last) % n_azimuths
+        before %= n_azimuths
         bins = np.searchsorted((self._bins_m[1:] + self._bins_m[:-1]) / 2, radius_m[inside])
         return Look(
             np.flatnonzero(inside),
             before * n_bins + bins,
             after * n_bins + bins,
-            np.rint((at - before) * _SHARES).astype(np.uint16),
+            share,
         )
 
     def _look_of_picture(self) -> Look:
@@ -199,18 +225,3 @@ class Polar:
         right_m = (np.arange(columns) + 0.5 - x) / scale
         ahead_m = (y - np.arange(rows) - 0.5) / scale
         return self.look(np.tile(right_m, rows), np.repeat(ahead_m, columns))
-
-
-def _columns(image: Energyscape) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Return rising azimuths, the order of the directions, and where those of each azimuth begin in it."""
-    azimuth_rad = image.azimuth_rad
-    if image.is_planar or len(azimuth_rad) == 1:
-        order = np.argsort(azimuth_rad, kind="stable")
-        return azimuth_rad[order], order, np.arange(len(order))
-    directions = unit_vectors(azimuth_rad, image.elevation_rad)
-    distance, _ = KDTree(directions).query(directions, k=2)
-    step_rad = max(2 * math.asin(min(1.0, float(np.median(distance[:, 1])) / 2)), 1e-9)
-    bins = np.rint((azimuth_rad - azimuth_rad.min()) / step_rad).astype(np.intp)
-    order = np.argsort(bins, kind="stable")
-    filled, starts = np.unique(bins[order], return_index=True)
-    return azimuth_rad.min() + filled * step_rad, order, starts

@@ -8,18 +8,18 @@ from typing import Final
 
 from matplotlib.figure import Figure
 
-from ertis_numba.frames import Energyscape
-from ertis_numba.interop import export
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.interop._mountings import checked
+from ertis_numba.interop._point_files import write_ply
+from ertis_numba.interop._points import PointFinder, PointTable
 from ertis_numba.viewer._axes import PAGE
-from ertis_numba.viewer._choices import Choices
+from ertis_numba.viewer._moments import SET_NS
 from ertis_numba.viewer._shapes import Frame, Pose
 
 __all__ = ["picture_png", "points_ply", "time_of"]
 
 _DPI: Final = 100
 _HEAD_PX: Final = 34
-_SET_NS: Final = 946_684_800 * 10**9  # 2000: clocks that show an earlier time were never set
-_MOST_POINTS: Final = 512
 
 
 def picture_png(frame: Frame) -> bytes:
@@ -32,7 +32,8 @@ def picture_png(frame: Frame) -> bytes:
     )
     top_px = height_px
     for name, each in drawn:
-        words = " · ".join([name, f"measurement {each.sequence}", *time_of(each.timestamp_ns)])
+        late = ["overdue"] if each.overdue else []
+        words = " · ".join([name, f"measurement {each.sequence}", *time_of(each.timestamp_ns), *late])
         place = (12 / width_px, (top_px - 12) / height_px)
         figure.text(*place, words, color="#e8eaf0", fontsize=9.5, va="top", parse_math=False)
         top_px -= _HEAD_PX + each.picture.shape[0]
@@ -42,25 +43,47 @@ def picture_png(frame: Frame) -> bytes:
     return file.getvalue()
 
 
-def points_ply(images: list[tuple[Energyscape, Pose]], choices: Choices) -> bytes:
-    """Return the points of images on the platform as PLY, those above the threshold."""
-    mounting = {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, pose in images}
+class _Found(PointFinder):
+    """Has the points that were found already, so that those are saved which are drawn."""
+
+    def __init__(self, clouds: dict[str, PointCloud]) -> None:
+        super().__init__()
+        self._clouds = clouds
+
+    def __call__(self, image: Energyscape) -> PointCloud:
+        """Return the points of an image's sensor."""
+        return self._clouds[image.stamp.sensor]
+
+
+def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> bytes:
+    """Return the points of images on the platform as PLY.
+
+    Where it is not known where a sensor is, they are in its own frame.
+
+    Parameters
+    ----------
+    points : list of (Energyscape, PointCloud, Pose or None)
+        As `Scene.latest` returns them.
+
+    Raises
+    ------
+    ArgumentError
+        There are several sensors, and it is not known where each of them is.
+    """
+    mountings = checked(
+        {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
+    )
+    found = _Found({image.stamp.sensor: cloud for image, cloud, _ in points})
+    table = PointTable.of([image for image, _, _ in points], found, mountings)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "points.ply"
-        export(
-            path,
-            [image for image, _ in images],
-            file_format="ply",
-            mounting=mounting,
-            top=_MOST_POINTS,
-            min_level_db=choices.threshold_db,
-        )
+        write_ply(path, table, text=False)
         return path.read_bytes()
 
 
 def time_of(timestamp_ns: int) -> tuple[str, ...]:
     """Return a time in words, if it is known: simulated clocks begin at 0."""
-    if timestamp_ns < _SET_NS:
+    if timestamp_ns < SET_NS:
         return ()
     seconds, nanoseconds = divmod(timestamp_ns, 10**9)
     try:

@@ -2,8 +2,8 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,36 +13,52 @@ from ertis_numba.geometry import Grid, unit_vectors
 from ertis_numba.stages.points import PointExtractor
 from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, MOST_DECAY_S, Choices, colour_table
 from ertis_numba.viewer._fusion import Fusion, is_level
-from ertis_numba.viewer._polar import Polar, cropped
-from ertis_numba.viewer._shapes import Dome, Drawn, Frame, Pose, Sector, Taken
+from ertis_numba.viewer._polar import Polar, cropped, is_within
+from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, Frame, Pose, Sector, Taken
 
 __all__ = ["Scene"]
 
 _MOST_POINTS: Final = 512  # of an image
 _MOST_CLOUDS: Final = 256  # that fade, of a sensor: fifteen a second, for as long as they may stay, and some more
 _FARTHEST_DOME: Final = 0.25  # radius of the dome, by the range that is seen
+_DIM: Final = 0.35  # what is left of the colours of a sensor that is overdue
+
+Table: TypeAlias = NDArray[np.uint8]
 
 
 @dataclass(slots=True)
 class _Cloud:
-    """Points of an image on the platform, their levels below its strongest, their ranges and when they were."""
+    """Points of an image, their places on the platform, their levels, their ranges and when they were."""
 
+    points: PointCloud
     position_m: NDArray[np.float32]
     level_db: NDArray[np.float32]
     range_m: NDArray[np.float32]
     time_s: float
 
+    def seen(self, choices: Choices) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Return which are shown, and the levels of all below the strongest in the window."""
+        low_m, high_m = choices.range_m or (0.0, math.inf)
+        within = (self.range_m >= low_m) & (self.range_m <= high_m)
+        below_db = self.level_db - self.level_db[within].max(initial=-np.inf)
+        return within & (below_db >= choices.threshold_db), below_db
+
 
 @dataclass(slots=True)
 class _Sensor:
-    """What is kept of a sensor."""
+    """What is kept of a sensor; what was drawn last is kept as long as it would come out the same."""
 
     latest: Taken
     extract: PointExtractor
     clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MOST_CLOUDS))
     polar: Polar | None = None
-    drawn_for: tuple[object, ...] = ()
+    polar_for: tuple[object, ...] = ()
+    outside: bool = False  # of the window
     levels: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((1, 1), np.uint8))
+    levels_for: tuple[object, ...] = ()
+    picture: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
+    shape: Sector | Dome | None = None
+    drawn_for: tuple[object, ...] = ()
 
 
 class Scene:
@@ -61,17 +77,23 @@ class Scene:
         self._width_px = width_px
         self._sensors: dict[str, _Sensor] = {}
         self._fusion: tuple[list[tuple[Polar, Pose]], Fusion] | None = None
+        self._plan: tuple[list[object], Sector] | None = None
 
     @property
     def farthest_m(self) -> float:
         """Last range of all images; 0 as long as there is none."""
         return max((float(kept.latest.image.range_m[-1]) for kept in self._sensors.values()), default=0.0)
 
-    def latest(self, choices: Choices) -> list[tuple[Energyscape, Pose]]:
-        """Return the images that are shown, within the window, and where their sensors are."""
+    def latest(self, choices: Choices) -> list[tuple[Energyscape, PointCloud, Pose | None]]:
+        """Return the images that are shown, those of their points that are drawn, and where their sensors are."""
         return [
-            (cropped(kept.latest.image, choices.range_m), kept.latest.pose) for _, kept in sorted(self._sensors.items())
+            (kept.latest.image, _chosen(kept.clouds[-1].points, kept.clouds[-1].seen(choices)[0]), kept.latest.pose)
+            for _, kept in sorted(self._sensors.items())
         ]
+
+    def clear(self) -> None:
+        """Forget all that was taken, as where somebody goes to another time of a film."""
+        self._sensors.clear()
 
     def take(self, taken: Taken) -> None:
         """Take an image to be drawn next; points of later times are forgotten, as where a recording begins anew."""
@@ -88,28 +110,66 @@ class Scene:
             kept.clouds.popleft()
         kept.clouds.append(_cloud_of(kept.extract(taken.image), taken))
 
-    def draw(self, choices: Choices) -> Frame:
-        """Return what to draw of the images taken so far."""
+    def draw(self, choices: Choices, now_s: float | None = None) -> Frame:
+        """Return what to draw of the images taken so far.
+
+        Parameters
+        ----------
+        choices : Choices
+        now_s : float, optional
+            By the clock of their source, which says what has faded and who is overdue; the time of the latest image by
+            default.
+        """
         kept = dict(sorted(self._sensors.items()))
-        latest_s = max((each.latest.time_s for each in kept.values()), default=0.0)
-        level = all(each.latest.image.is_planar and is_level(each.latest.pose) for each in kept.values())
-        fused = level and len(kept) > 1
-        sensors = {
-            name: _drawn(each, choices, latest_s, self._width_px, alone=not fused) for name, each in kept.items()
-        }
-        farthest_m = self.farthest_m if choices.range_m is None else min(self.farthest_m, choices.range_m[1])
+        if now_s is None:
+            now_s = max((each.latest.time_s for each in kept.values()), default=0.0)
+        timely = [each for each in kept.values() if now_s < each.latest.due_s]
+        for each in kept.values():
+            self._prepare(each, choices)
+        joined = [each for each in timely if not each.outside]
+        fused = len(joined) > 1 and all(_is_level(each.latest) for each in joined)
+        sensors = {}
+        for name, each in kept.items():
+            overdue = now_s >= each.latest.due_s
+            pose = each.latest.pose or (UNTURNED if len(kept) == 1 else None)
+            alone = pose is not None and (overdue or not fused)
+            sensors[name] = _drawn(each, choices, now_s, pose, overdue=overdue, alone=alone)
+        frame = Frame(
+            sensors,
+            self.farthest_m if choices.range_m is None else min(self.farthest_m, choices.range_m[1]),
+            until_s=_until_s(timely, sensors, choices, now_s),
+        )
         if not fused:
-            return Frame(sensors, farthest_m)
-        fusion = self._fusion_of(list(kept.values()))
-        plan = fusion([each.levels for each in kept.values()], colour_table(choices.colours))
-        return Frame(sensors, farthest_m, plan, fusion.height_m)
+            return frame
+        fusion = self._fusion_of(joined)
+        return replace(frame, fused=self._plan_of(fusion, joined, choices), height_m=fusion.height_m)
+
+    def _prepare(self, kept: _Sensor, choices: Choices) -> None:
+        """Find the levels of a sensor's image, where that or what was chosen is another."""
+        image = kept.latest.image
+        kept.outside = not is_within(image, choices.range_m)
+        if not kept.outside:
+            image = cropped(image, choices.range_m)
+        polar_for = (id(kept.extract), len(image.range_m), float(image.range_m[0]), choices.dynamic_range_db)
+        if kept.polar is None or kept.polar_for != polar_for:
+            kept.polar = Polar(image, dynamic_range_db=choices.dynamic_range_db, width_px=self._width_px)
+            kept.polar_for = polar_for
+        if kept.levels_for != (kept.latest, kept.polar):
+            kept.levels, kept.levels_for = kept.polar.levels(image.energy), (kept.latest, kept.polar)
 
     def _fusion_of(self, several: list[_Sensor]) -> Fusion:
         """Return what joins the images of several sensors, made anew where one has moved or has other axes."""
-        pairs = [(kept.polar, kept.latest.pose) for kept in several if kept.polar is not None]
+        pairs = [(kept.polar, kept.latest.pose) for kept in several if kept.polar is not None and kept.latest.pose]
         if self._fusion is None or self._fusion[0] != pairs:
             self._fusion = pairs, Fusion(pairs)
         return self._fusion[1]
+
+    def _plan_of(self, fusion: Fusion, several: list[_Sensor], choices: Choices) -> Sector:
+        """Return the image of several sensors, the same one as long as theirs are."""
+        made_for = [fusion, choices.colours, *(kept.levels_for for kept in several)]
+        if self._plan is None or self._plan[0] != made_for:
+            self._plan = made_for, fusion([kept.levels for kept in several], colour_table(choices.colours))
+        return self._plan[1]
 
 
 def _same_axes(image: Energyscape, other: Energyscape) -> bool:
@@ -119,67 +179,90 @@ def _same_axes(image: Energyscape, other: Energyscape) -> bool:
     )
 
 
+def _chosen(cloud: PointCloud, some: NDArray[np.bool_]) -> PointCloud:
+    uncertainty_m = None if cloud.uncertainty_m is None else cloud.uncertainty_m[some]
+    return cloud.replace(position_m=cloud.position_m[some], energy=cloud.energy[some], uncertainty_m=uncertainty_m)
+
+
 def _cloud_of(cloud: PointCloud, taken: Taken) -> _Cloud:
     return _Cloud(
-        taken.pose.placed(cloud.position_m),
+        cloud,
+        (taken.pose or UNTURNED).placed(cloud.position_m),
         np.asarray(20 * np.log10(np.maximum(cloud.energy, np.float32(1e-30))), dtype=np.float32),
         np.asarray(np.linalg.norm(cloud.position_m, axis=1), dtype=np.float32),
         taken.time_s,
     )
 
 
-def _drawn(kept: _Sensor, choices: Choices, now_s: float, width_px: int, *, alone: bool) -> Drawn:
-    """Return what to draw of a sensor."""
-    taken = kept.latest
-    image = cropped(taken.image, choices.range_m)
-    drawn_for = (id(kept.extract), len(image.range_m), float(image.range_m[0]), choices.dynamic_range_db)
-    if kept.polar is None or kept.drawn_for != drawn_for:
-        kept.polar = Polar(image, dynamic_range_db=choices.dynamic_range_db, width_px=width_px)
+def _is_level(taken: Taken) -> bool:
+    """Whether an image lies in the level of a platform, on which the place of its sensor is known."""
+    return taken.pose is not None and taken.image.is_planar and is_level(taken.pose)
+
+
+def _until_s(timely: list[_Sensor], sensors: dict[str, Drawn], choices: Choices, now_s: float) -> float:
+    """Return when another picture is due though nothing comes: at once where points fade."""
+    if choices.decay_s and any(len(drawn.position_m) for drawn in sensors.values()):
+        return now_s
+    return min((kept.latest.due_s for kept in timely), default=math.inf)
+
+
+def _table(choices: Choices, *, dim: bool) -> Table:
+    table = colour_table(choices.colours)
+    return np.asarray(table * _DIM, dtype=np.uint8) if dim else table
+
+
+def _drawn(kept: _Sensor, choices: Choices, now_s: float, pose: Pose | None, *, overdue: bool, alone: bool) -> Drawn:
+    """Return what to draw of a sensor, whose shape is its own if it is ``alone``."""
+    taken, polar = kept.latest, kept.polar
+    assert polar is not None  # noqa: S101  it was prepared
+    table = _table(choices, dim=overdue)
+    drawn_for = (*kept.levels_for, choices.colours, overdue, alone, kept.outside and choices.range_m)
+    if kept.drawn_for != drawn_for:
         kept.drawn_for = drawn_for
-    polar, table = kept.polar, colour_table(choices.colours)
-    levels = kept.levels = polar.levels(image.energy)
-    position_m, colours, n_points = _points(kept.clouds, choices, now_s)
-    shape: Sector | Dome | None = None
-    if not image.is_planar:
-        shape = _dome(image, choices)
-    elif alone:
-        shape = Sector(polar.sector(levels, table), polar.extent_m)
+        kept.shape = None
+        kept.picture = polar.empty(choices.range_m) if kept.outside else polar.picture(kept.levels, table)
+        if alone and not kept.outside and taken.image.is_planar:
+            kept.shape = Sector(polar.sector(kept.levels, table), polar.extent_m)
+        elif alone and not kept.outside:
+            kept.shape = _dome(cropped(taken.image, choices.range_m), choices, table)
+    position_m, colours, share_left, n_points = _points(kept.clouds, choices, now_s, table)
+    if pose is None:  # points of sensors that have no frame in common have no place beside each other
+        position_m, colours, share_left = position_m[:0], colours[:0], share_left[:0]
     return Drawn(
-        pose=taken.pose,
-        sequence=image.stamp.sequence,
-        timestamp_ns=image.stamp.timestamp_ns,
-        picture=polar.picture(levels, table),
-        shape=shape,
+        pose=pose,
+        sequence=taken.image.stamp.sequence,
+        timestamp_ns=taken.image.stamp.timestamp_ns,
+        time_s=taken.time_s,
+        overdue=overdue,
+        picture=kept.picture,
+        shape=kept.shape,
         position_m=position_m,
         colours=colours,
+        share_left=share_left,
         n_points=n_points,
     )
 
 
 def _points(
-    clouds: deque[_Cloud], choices: Choices, now_s: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], int]:
-    """Return points on the platform, their colours, and how many are of the latest image."""
-    table = colour_table(choices.colours)
-    low_m, high_m = choices.range_m or (0.0, math.inf)
-    places, colours, n_points = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)], 0
+    clouds: deque[_Cloud], choices: Choices, now_s: float, table: Table
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32], int]:
+    """Return points on the platform, their colours, what is left of each, and how many are of the latest image."""
+    places, colours, left, n_points = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)], [np.empty(0)], 0
     for cloud in clouds:
-        share_left = 1.0
-        if cloud is not clouds[-1]:
-            share_left = 1 - (now_s - cloud.time_s) / choices.decay_s if choices.decay_s else 0.0
+        latest = cloud is clouds[-1]
+        share_left = 1 - max(0.0, now_s - cloud.time_s) / choices.decay_s if choices.decay_s else float(latest)
         if share_left <= 0:
             continue
-        within = (cloud.range_m >= low_m) & (cloud.range_m <= high_m)
-        below_db = cloud.level_db - cloud.level_db[within].max(initial=-np.inf)
-        seen = within & (below_db >= choices.threshold_db)
+        seen, below_db = cloud.seen(choices)
         shade = 1 + below_db[seen] / choices.dynamic_range_db
         places.append(cloud.position_m[seen])
-        colours.append((table[np.rint(255 * np.clip(shade, 0.15, 1)).astype(np.uint8)] * share_left).astype(np.uint8))
-        n_points = int(np.count_nonzero(seen))
-    return np.concatenate(places), np.concatenate(colours), n_points
+        colours.append(table[np.rint(255 * np.clip(shade, 0.15, 1)).astype(np.uint8)])
+        left.append(np.full(np.count_nonzero(seen), share_left))
+        n_points = int(np.count_nonzero(seen)) if latest else 0
+    return np.concatenate(places), np.concatenate(colours), np.concatenate(left).astype(np.float32), n_points
 
 
-def _dome(image: Energyscape, choices: Choices) -> Dome:
+def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
     highest = image.energy.max(axis=1)
     strongest = np.float32(highest.max(initial=0.0)) or np.float32(1)
     level_db = 20 * np.log10(np.maximum(highest / strongest, np.float32(1e-10)))
@@ -189,6 +272,6 @@ def _dome(image: Energyscape, choices: Choices) -> Dome:
     size_m = radius_m * math.sqrt(2 * math.pi / len(highest))
     return Dome(
         np.asarray(radius_m * unit_vectors(image.azimuth_rad, image.elevation_rad), dtype=np.float32),
-        colour_table(choices.colours)[np.rint(255 * shade).astype(np.uint8)],
+        table[np.rint(255 * shade).astype(np.uint8)],
         size_m,
     )

@@ -1,5 +1,6 @@
 """What is taken from a source, and what is drawn of it."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,6 +11,10 @@ from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
 __all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Pose", "Sector", "Taken"]
+
+_OVERDUE_S: Final = 1.0  # at least, as images come in bursts where a network or a computer is busy
+_UNKNOWN_S: Final = 10.0  # without an image, where a single one has come and nobody knows when the next is due
+_OVERDUE: Final = 3.0  # intervals without an image, after which a sensor is overdue
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +39,7 @@ class Pose:
 
 
 UNTURNED: Final = Pose()
-"""Of a sensor of which nobody said where it is."""
+"""Where a sensor is drawn of which nobody said where it is, if it is the only one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,14 +49,24 @@ class Taken:
     Attributes
     ----------
     image : Energyscape
-    pose : Pose
+    pose : Pose or None
+        None where nobody said where the sensor is.
     time_s : float
         When it was, by the clock that points fade by.
+    interval_s : float, optional
+        What usually lies between two images of the sensor, where that is known.
     """
 
     image: Energyscape
-    pose: Pose
+    pose: Pose | None
     time_s: float
+    interval_s: float | None = None
+
+    @property
+    def due_s(self) -> float:
+        """From when on the sensor is overdue, if no other image comes."""
+        silent_s = _UNKNOWN_S if self.interval_s is None else max(_OVERDUE_S, _OVERDUE * self.interval_s)
+        return self.time_s + silent_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,28 +109,38 @@ class Drawn:
 
     Attributes
     ----------
-    pose : Pose
+    pose : Pose or None
+        None where the sensor cannot be drawn on the platform: there are others, and nobody said where it is.
     sequence : int
     timestamp_ns : int
+    time_s : float
+        When it was, by the clock of its source.
+    overdue : bool
+        It is so old that the sensor may be dead: it is drawn dim, and no part of what is fused.
     picture : (row, column, 3) uint8
         Range and azimuth, with axes.
     shape : Sector or Dome, optional
-        None where the image is part of one of several sensors.
+        None where the image is part of one of several sensors, or not drawn on the platform.
     position_m : (point, axis) float32
         On the platform.
     colours : (point, 3) uint8
-        Of the points, by their levels; darker with age.
+        Of the points, by their levels.
+    share_left : (point,) float32
+        Of each, 1 where it is new and 0 where it has faded.
     n_points : int
-        How many of them are of the latest image.
+        How many of the latest image are shown.
     """
 
-    pose: Pose
+    pose: Pose | None
     sequence: int
     timestamp_ns: int
+    time_s: float
+    overdue: bool
     picture: NDArray[np.uint8]
     shape: Sector | Dome | None
     position_m: NDArray[np.float32]
     colours: NDArray[np.uint8]
+    share_left: NDArray[np.float32]
     n_points: int
 
 
@@ -130,21 +155,25 @@ class Frame:
     range_m : float
         How far is seen.
     fused : Sector, optional
-        What several sensors that are level see, on the platform; None where there are no several, or one is tilted or
-        has elevations.
+        What several sensors that are level see, on the platform, but for those that are overdue; None where there are
+        no several, or one is tilted or has elevations.
     height_m : float
         Of the fused image on the platform.
+    until_s : float
+        For how long it is right if nothing comes, by the clock of the source: until a point fades or a sensor is
+        overdue.
     """
 
     sensors: dict[str, Drawn]
     range_m: float
     fused: Sector | None = None
     height_m: float = 0.0
+    until_s: float = math.inf
 
     @property
     def centre_m(self) -> tuple[float, float, float]:
         """The middle, on the platform, of what the sensors see."""
         ahead_m = np.array([[self.range_m / 2, 0, 0]], np.float32)
-        middles_m = [drawn.pose.placed(ahead_m)[0] for drawn in self.sensors.values()]
+        middles_m = [drawn.pose.placed(ahead_m)[0] for drawn in self.sensors.values() if drawn.pose is not None]
         x, y, z = np.mean(middles_m, axis=0).tolist() if middles_m else (0.0, 0.0, 0.0)
         return x, y, z

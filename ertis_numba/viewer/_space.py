@@ -8,12 +8,18 @@ import viser
 
 from ertis_numba.viewer._shapes import Dome, Drawn, Frame, Sector
 
-__all__ = ["Space"]
+__all__ = ["Space", "round_step"]
 
+_RINGS: Final = 7  # distances on the ground at most
+_GROUND: Final = 0.001  # by the range that is seen, that the ground lies below the sensors
+_NEAR, _FAR = 0.002, 200.0  # by the range that is seen, between which the camera sees anything
+_AXES: Final = 0.024  # length of a sensor's axes, by the range that is seen
 _POINT: Final = 0.012  # size of a point, by the range that is seen
+_SIZES: Final = (0.3, 0.5, 0.75, 1.0)  # of points, as they fade: nothing of what they lie on can be seen through them
 _TURN: Final = (0.0, math.sqrt(0.5), -math.sqrt(0.5), 0.0)  # w, x, y, z: up in a picture, which is -y, is ahead
 _LABEL: Final = 0.08  # by the range that is seen, that the name of a sensor stands before it
 _BELOW: Final = 0.01  # by the range that is seen, that an image lies below its points
+_STILL: Final = 1e-3  # of its distance, by which a camera that nobody moves is elsewhere
 _NONE: Final = np.zeros((1, 3), np.float32)
 
 
@@ -29,23 +35,29 @@ class Space:
         self._server, self._scene = server, server.scene
         self._nodes: dict[str, _Nodes] = {}
         self._fused: tuple[object, viser.ImageHandle] | None = None
+        self._plan: Sector | None = None
         self._farthest_m = 0.0
+        self._names: frozenset[str] = frozenset()  # of all sensors that were seen
+        self._labels: list[viser.LabelHandle] = []
+        self._stood = False  # the camera where all can be seen, rather than where viser puts it
 
     def show(self, frame: Frame) -> None:
         """Draw a frame."""
         self._look_at(frame)
         for name, drawn in frame.sensors.items():
-            if name not in self._nodes:
+            if name not in self._nodes and drawn.pose is not None:
                 self._nodes[name] = _Nodes(self._scene, name)
-            self._nodes[name].show(drawn, frame.range_m)
+        for name, nodes in self._nodes.items():
+            nodes.show(frame.sensors.get(name), frame.range_m)
         self._show_fused(frame)
 
     def _show_fused(self, frame: Frame) -> None:
         """Draw one image of all sensors, where there is one."""
         if self._fused is not None:
             self._fused[1].visible = frame.fused is not None
-        if frame.fused is None:
+        if frame.fused is None or frame.fused is self._plan:
             return
+        self._plan = frame.fused
         made_for = (frame.fused.extent_m, frame.height_m)
         if self._fused is not None and self._fused[0] == made_for:
             self._fused[1].image = frame.fused.colours
@@ -53,45 +65,66 @@ class Space:
             self._fused = made_for, _plan(self._scene, "/fused", frame.fused, frame.height_m)
 
     def _look_at(self, frame: Frame) -> None:
-        """Draw the ground, again where more is seen, and set the camera where all of it can be seen."""
-        farthest_m = frame.range_m
-        if farthest_m <= self._farthest_m or not frame.sensors:
+        """Draw the ground, and set the camera where all of it can be seen, again where more is seen or others join."""
+        farthest_m, names = max(self._farthest_m, frame.range_m), self._names | frame.sensors.keys()
+        if (farthest_m, names) == (self._farthest_m, self._names) or not frame.sensors:
             return
-        first = not self._farthest_m
-        self._farthest_m = farthest_m
-        half_m = max(1, math.ceil(farthest_m))
-        self._scene.add_grid(
+        self._farthest_m, self._names = farthest_m, names
+        step_m = round_step(farthest_m, _RINGS)
+        half_m = math.ceil(farthest_m / step_m - 1e-9) * step_m
+        self._grid = self._scene.add_grid(
             "/grid",
-            width=2.0 * half_m,
-            height=2.0 * half_m,
-            cell_size=0.5,
-            section_size=1.0,
+            width=2 * half_m,
+            height=2 * half_m,
+            cell_size=step_m / 2,
+            section_size=step_m,
             cell_color=(38, 42, 52),
             section_color=(70, 76, 92),
             shadow_opacity=0.0,
-            position=(0.0, 0.0, -0.005),
-            fade_distance=8.0 * half_m,
+            position=(0.0, 0.0, -_GROUND * half_m),
+            fade_distance=8 * half_m,
         )
-        if not first:
-            return
-        step_m = max(1, math.ceil(half_m / 6))
-        first_m = step_m if len(frame.sensors) == 1 else 2 * step_m  # the names of several stand close to the middle
-        for place_m in range(first_m, half_m + 1, step_m):
+        self._name_distances(half_m, step_m)
+        x, y, z = frame.centre_m
+        away_m = farthest_m * (1.2 if len(names) == 1 else 1.25)
+        self._stand((x - away_m, y, z + away_m), (x, y, z))
+
+    def _name_distances(self, half_m: float, step_m: float) -> None:
+        """Write distances on the ground."""
+        for label in self._labels:
+            label.remove()
+        first = 1 if len(self._names) == 1 else 2  # the names of several stand close to the middle
+        self._labels = [
             self._scene.add_label(
-                f"/ground/{place_m}",
-                f"{place_m} m",
-                position=(float(place_m), 0.0, 0.0),
+                f"/ground/{number}",
+                f"{number * step_m:.4g} m",
+                position=(number * step_m, 0.0, 0.0),
                 font_screen_scale=0.7,
                 anchor="center-center",
             )
-        camera = self._server.initial_camera
-        x, y, z = frame.centre_m
-        away_m = farthest_m * (1.2 if len(frame.sensors) == 1 else 1.25)
-        camera.position = (x - away_m, y, z + away_m)
-        camera.look_at = (x, y, z)
+            for number in range(first, round(half_m / step_m) + 1)
+        ]
+
+    def _stand(self, position_m: tuple[float, float, float], look_at_m: tuple[float, float, float]) -> None:
+        """Set the camera, that of browsers to come and of those in which nobody has moved it."""
+        first = self._server.initial_camera
+        before_m = np.concatenate([first.position, first.look_at])
+        first.position, first.look_at = position_m, look_at_m
+        first.near, first.far = near_m, far_m = _NEAR * self._farthest_m, _FAR * self._farthest_m
         for client in self._server.get_clients().values():
-            client.camera.position = camera.position
-            client.camera.look_at = camera.look_at
+            camera = client.camera
+            camera.near, camera.far = near_m, far_m
+            there_m = np.concatenate([camera.position, camera.look_at])
+            if not self._stood or np.allclose(there_m, before_m, atol=_STILL * np.linalg.norm(before_m)):
+                camera.position, camera.look_at = position_m, look_at_m
+        self._stood = True
+
+
+def round_step(length: float, most: int) -> float:
+    """Return the smallest of 1, 2 and 5 times a power of ten of which no more than so many fit into a length."""
+    least = length / most * (1 - 1e-9)
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(each * power for each in (1, 2, 5, 10) if each * power >= least)
 
 
 class _Nodes:
@@ -99,39 +132,69 @@ class _Nodes:
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
-        self._frame = scene.add_frame(f"/sensors/{name}", axes_length=0.12, axes_radius=0.004)
+        self._frame = scene.add_frame(f"/sensors/{name}")
+        self._axes_m = 0.0
         self._label = scene.add_label(f"/sensors/{name}/name", name, font_screen_scale=0.9, anchor="center-center")
-        self._points = scene.add_point_cloud(
-            f"/points/{name}", _NONE, (0, 0, 0), point_shape="circle", precision="float32", point_shading="flat"
-        )
+        self._points = [
+            scene.add_point_cloud(
+                f"/points/{name}/{number}",
+                _NONE,
+                (0, 0, 0),
+                point_shape="circle",
+                precision="float32",
+                point_shading="flat",
+                visible=False,
+            )
+            for number in range(len(_SIZES))
+        ]
         self._shape: Any = None
         self._made_for: object = None
+        self._shown: object = None
 
-    def show(self, drawn: Drawn, farthest_m: float) -> None:
-        """Draw the sensor."""
+    def show(self, drawn: Drawn | None, farthest_m: float) -> None:
+        """Draw the sensor, or nothing of it where there is nothing or nobody knows where it is."""
+        self._frame.visible = drawn is not None and drawn.pose is not None
+        if drawn is None or drawn.pose is None:
+            for cloud in self._points:
+                cloud.visible = False
+            return
         x, y, z, w = drawn.pose.rotation_xyzw
         self._frame.wxyz = (w, x, y, z)
         self._frame.position = drawn.pose.translation_m
+        if self._axes_m != _AXES * farthest_m:
+            self._axes_m = _AXES * farthest_m
+            self._frame.axes_length, self._frame.axes_radius = self._axes_m, self._axes_m / 30
+            self._frame.origin_radius = self._axes_m / 15
         self._label.position = (_LABEL * farthest_m, 0.0, 0.0)
-        some = len(drawn.position_m) > 0
-        self._points.points = drawn.position_m if some else _NONE
-        self._points.colors = drawn.colours if some else np.zeros((1, 3), np.uint8)
-        self._points.point_size = _POINT * farthest_m
-        self._points.visible = some
+        self._show_points(drawn, _POINT * farthest_m)
         if self._shape is not None:
             self._shape.visible = drawn.shape is not None
+        if drawn.shape is self._shown:  # what changes is sent to browsers and kept in recordings
+            return
+        self._shown = drawn.shape
         if isinstance(drawn.shape, Sector):
-            self._show_sector(drawn.shape)
+            self._show_sector(drawn.shape, overdue=drawn.overdue)
         elif drawn.shape is not None:
             self._show_dome(drawn.shape)
 
-    def _show_sector(self, sector: Sector) -> None:
-        made_for = (Sector, sector.extent_m)
+    def _show_points(self, drawn: Drawn, size_m: float) -> None:
+        """Draw points, the smaller the less is left of them."""
+        sizes = np.ceil(drawn.share_left * len(_SIZES)) - 1
+        for number, (cloud, share) in enumerate(zip(self._points, _SIZES, strict=True)):
+            chosen = sizes == number
+            cloud.visible = bool(chosen.any())
+            if cloud.visible:
+                cloud.points, cloud.colors = drawn.position_m[chosen], drawn.colours[chosen]
+                cloud.point_size = share * size_m
+
+    def _show_sector(self, sector: Sector, *, overdue: bool) -> None:
+        made_for = (Sector, sector.extent_m, overdue)
         if self._made_for == made_for:
             self._shape.image = sector.colours
             return
         self._made_for = made_for
-        self._shape = _plan(self._scene, f"/sensors/{self._name}/image", sector)
+        under_m = -_BELOW * sector.extent_m[3] if overdue else 0.0  # it hides nothing of what others see
+        self._shape = _plan(self._scene, f"/sensors/{self._name}/image", sector, under_m)
 
     def _show_dome(self, dome: Dome) -> None:
         made_for = (Dome, len(dome.position_m), dome.size_m)

@@ -3,33 +3,36 @@
 import math
 import queue
 import time
-from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from ertis_numba.atomic import replacing
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.viewer._choices import Choices
+from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import Order, Page
-from ertis_numba.viewer._saving import picture_png, points_ply, time_of
+from ertis_numba.viewer._pause import Pause
+from ertis_numba.viewer._recordings import Recordings, ToBrowser, ToFile
+from ertis_numba.viewer._rows import Counts, rows_of
+from ertis_numba.viewer._saving import picture_png, points_ply
 from ertis_numba.viewer._scene import Scene
 
 if TYPE_CHECKING:  # one brings HDF5, the other ZeroMQ
     from ertis_numba.viewer._film import Film
     from ertis_numba.viewer._live import Live
-    from ertis_numba.viewer._shapes import Frame
+    from ertis_numba.viewer._shapes import Frame, Taken
 
 __all__ = ["View"]
 
 _LEAST_DRAW_S: Final = 1 / 15
 _LOOK_S: Final = 1 / 60
-_RATE_S: Final = 2.0
 _TELL_S: Final = 0.5
+_FADE_S: Final = 0.2  # between pictures of a recorded film in which nothing is new but what fades
+_TYPED_S: Final = 1.5  # after which a number that cannot be is not half of one that is being typed
 _LAST_S: Final = 1.0  # for which the last of a recorded film stays
+_OURS: Final = "ours"  # of recordings, the one that is not of a browser
 
 
 class View:
@@ -51,6 +54,8 @@ class View:
     ----------
     choices : Choices
         Those of the moment.
+    is_local : bool
+        The page cannot be reached from another machine.
 
     Raises
     ------
@@ -73,6 +78,7 @@ class View:
         self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
         self._scene = Scene()
         self._frame: Frame | None = None
+        self.is_local = is_loopback(host)
         self._page = Page(
             host,
             port,
@@ -81,11 +87,14 @@ class View:
             choices=self.choices,
             n_moments=None if self._film is None else len(self._film.moments),
         )
-        self._playing, self._steps, self._changed, self._ended = True, 0, False, False
-        self._shown = 0
-        self._drawn_s: deque[float] = deque()
-        self._told_s = -math.inf
-        self._latency_s: float | None = None
+        self._recordings = Recordings(self._page.serializer)
+        self._file: ToFile | None = None
+        self._pause = Pause()  # of a live view
+        self._changed, self._ended = False, False
+        self._refused_s = math.inf  # when a number was chosen that cannot be
+        self._drawn_s = self._told_s = -math.inf
+        self._clock_drawn_s = -math.inf  # by the clock of the source
+        self._counts = Counts()
 
     def __enter__(self) -> Self:
         return self
@@ -111,111 +120,173 @@ class View:
         ----------
         duration_s : float
         html : Path, optional
-            Recording of all that was shown, a page that needs neither server nor network.
+            Recording of all that was shown, a page that needs neither server nor network; none is written where
+            nothing was.
         overwrite : bool
             Replace a file of this name.
 
         Raises
         ------
         DataError
-            A file cannot be read.
+            A file cannot be read, or the recording not be written.
+        ArgumentError
+            No recording can be put there, or it would replace the film.
         RefusedError
             The central node has refused this viewer.
         """
         end_s = time.monotonic() + duration_s
         if html is not None:
-            self._page.begin_recording()
+            self._begin(html, overwrite=overwrite)
+        if self._film is not None:  # a short one would be over before a browser is there
+            self._film.held = html is None and not self._page.is_seen
         while not self._ended and time.monotonic() < end_s:
             self._obey()
-            for note in self._source.notes():
-                if self._on_note is not None:
-                    self._on_note(note)
+            if self._file is not None:
+                self._file.check()
+            self._note_all()
             now_s = time.monotonic()
-            if not self._drawn_s or now_s - self._drawn_s[-1] >= _LEAST_DRAW_S:
+            if self._film is not None and self._page.is_seen:
+                self._film.held = False
+            if now_s - self._refused_s >= _TYPED_S:
+                self._page.put_back(self.choices)
+                self._refused_s = math.inf
+            if now_s - self._drawn_s >= _LEAST_DRAW_S:
                 self._draw(now_s)
             if now_s - self._told_s >= _TELL_S:
                 self._tell()
-        if html is not None and self._page.is_recording:
-            self._write(html, overwrite=overwrite)
+        self._finish()
+
+    def prepare(self) -> None:
+        """Make the images of a film's first moment, which takes long where kernels are to be compiled."""
+        if self._film is not None:
+            self._film.at(0)
 
     def record(self, html: Path, *, overwrite: bool = False) -> None:
         """Write a recording of all of a film, as a page that needs neither server nor network.
 
+        Where `stop` is called meanwhile nothing is written, and `recorded` stays None.
+
         Raises
         ------
         DataError
-            The file cannot be read.
+            The file cannot be read, or the page not be written.
+        ArgumentError
+            No page can be put there, or it is the file itself.
         """
         film = self._film
         if film is None:
             raise TypeError("a live view is recorded by run")
-        self._page.begin_recording()
+        self._begin(html, overwrite=overwrite)
         for place, moment in enumerate(film.moments):
-            if self._ended or self._stopped():
+            self._note_all()
+            if self._stopped():  # part of a film is not what was asked for
+                self._recordings.drop(_OURS)
+                return
+            if _OURS not in self._recordings:
                 break
             for taken in film.at(place):
                 self._scene.take(taken)
-            self._page.show(self._scene.draw(self.choices), place)
-            self._shown += 1
+            self._counts.shown += 1
+            self._show(moment.time_s, place, new=True)
             after_s = film.moments[place + 1].time_s if place + 1 < len(film.moments) else moment.time_s + _LAST_S
-            self._page.pass_time(after_s - moment.time_s)
-        self._write(html, overwrite=overwrite)
+            self._fade(moment.time_s, after_s, place)
+        self._finish()
 
     @property
     def shown(self) -> int:
-        """How many frames were drawn."""
-        return self._shown
+        """How many frames were drawn of something new."""
+        return self._counts.shown
+
+    @property
+    def recorded(self) -> int | None:
+        """How many frames the HTML recording holds that was asked for; None where it is not written."""
+        return None if self._file is None else self._file.n_frames
 
     def _stopped(self) -> bool:
         while not self._orders.empty():
             self._ended |= self._orders.get() is None
         return self._ended
 
-    def _write(self, html: Path, *, overwrite: bool) -> None:
-        with replacing(html, overwrite=overwrite) as part:
-            part.write_text(self._page.end_recording(), encoding="utf-8")
+    def _note(self, text: str) -> None:
+        if self._on_note is not None:
+            self._on_note(text)
+
+    def _note_all(self) -> None:
+        for note in self._source.notes():
+            self._note(note)
+
+    def _begin(self, html: Path, *, overwrite: bool) -> None:
+        sources = () if self._film is None else (self._film.path,)
+        self._file = ToFile(html, overwrite=overwrite, on_note=self._note, sources=sources)
+        self._recordings.begin(_OURS, self._file)
+
+    def _finish(self) -> None:
+        """Wait for what is still written; a recording in which nothing was drawn is not."""
+        if self._frame is None:
+            self._recordings.drop(_OURS)
+        self._recordings.end(_OURS)
+        self._recordings.wait()
+        if self._file is not None:
+            self._file.check()
+
+    def _fade(self, clock_s: float, until_s: float, place: int) -> None:
+        """Record what changes until something new comes, and how long that takes."""
+        while self._frame is not None and (next_s := max(self._frame.until_s, clock_s + _FADE_S)) < until_s:
+            self._recordings.pass_time(next_s - clock_s)
+            clock_s = next_s
+            self._show(clock_s, place, new=False)
+        self._recordings.pass_time(until_s - clock_s)
 
     def _draw(self, now_s: float) -> None:
-        """Draw what is new, if anything."""
-        taken = self._source.take()
-        if self._film is None and not self._playing:
-            taken = taken if self._steps and taken else []
-            self._steps -= bool(taken)
-        if not taken and not (self._changed and self._frame is not None):
+        """Draw what is new or has changed, if anything."""
+        taken = self._taken()
+        clock_s = self._source.clock_s if self._pause.since_s is None else self._pause.since_s
+        frame = self._frame
+        outdated = frame is not None and (self._changed or self._clock_drawn_s < clock_s >= frame.until_s)
+        if not taken and not outdated:
             return
+        if taken and self._film is not None and self._film.anew:
+            self._scene.clear()
         for each in taken:
             self._scene.take(each)
         self._changed = False
-        self._frame = self._scene.draw(self.choices)
-        self._page.limit_range(self._scene.farthest_m)
-        if self._page.is_recording and self._drawn_s:
-            self._page.pass_time(now_s - self._drawn_s[-1])
-        self._page.show(self._frame, 0 if self._film is None else self._film.shown)
+        if math.isfinite(self._drawn_s):
+            self._recordings.pass_time(now_s - self._drawn_s)
+        self._drawn_s = now_s
+        self._show(clock_s, 0 if self._film is None else self._film.shown, new=bool(taken))
+        self._page.limit_range(self._scene.farthest_m, self.choices.range_m)
         if taken:
-            self._shown += 1
-            self._latency_s = self._source.latency_s(taken)
-        self._drawn_s.append(now_s)
+            self._counts.count(now_s, self._source.latency_s(taken))
         self._tell()
 
+    def _show(self, clock_s: float, place: int, *, new: bool) -> None:
+        """Draw what was taken, as it is at a time."""
+        self._frame, self._clock_drawn_s = self._scene.draw(self.choices, clock_s), clock_s
+        self._page.show(self._frame, place)
+        self._recordings.add(frames=int(new))
+
+    def _taken(self) -> "list[Taken]":
+        """Return what is to be shown; while a live view is paused that is nothing, but for what steps ask for."""
+        taken = self._source.take()
+        return taken if self._film is not None else self._pause.shown(taken, self._source.clock_s)
+
+    @property
+    def _playing(self) -> bool:
+        return self._pause.since_s is None if self._film is None else self._film.playing
+
     def _tell(self) -> None:
-        now_s = self._told_s = time.monotonic()
-        while len(self._drawn_s) > 1 and now_s - self._drawn_s[0] > _RATE_S:
-            self._drawn_s.popleft()
-        sensors = {} if self._frame is None else self._frame.sensors
-        latest = max(sensors.values(), key=lambda drawn: drawn.timestamp_ns, default=None)
-        captured = time_of(latest.timestamp_ns) if latest else ()
-        rate_hz = len([drawn_s for drawn_s in self._drawn_s if now_s - drawn_s <= _RATE_S]) / _RATE_S
-        rows = {
-            "state": ("state", self._source.state),
-            "frames": ("frames shown", str(self._shown)),
-            "sequence": ("measurement", ", ".join(str(each.sequence) for each in sensors.values()) or "–"),
-            "captured": ("captured", captured[0] if captured else "–"),
-            "rate": ("rate", f"{rate_hz:.1f} Hz"),
-            "latency": ("capture to shown", "–" if self._latency_s is None else f"{1e3 * self._latency_s:.0f} ms"),
-            "dropped": ("dropped, skipped", f"{self._source.dropped}, {self._source.skipped}"),
-            "points": ("points", str(sum(each.n_points for each in sensors.values()))),
-        }
-        self._page.tell(rows, playing=self._playing if self._film is None else self._film.playing)
+        self._told_s = time.monotonic()
+        n_bytes = self._recordings.n_bytes()
+        rows = rows_of(
+            self._source,
+            {} if self._frame is None else self._frame.sensors,
+            self._counts,
+            paused=not self._playing,
+            n_held=self._pause.n_held,
+            n_bytes=n_bytes.get(_OURS),
+        )
+        self._page.tell(rows, playing=self._playing)
+        self._page.tell_recordings(n_bytes)
 
     def _obey(self) -> None:
         """Do what was ordered; wait a moment for an order."""
@@ -233,8 +304,11 @@ class View:
     def _do(self, order: Order) -> None:
         if order.name in Choices.__dataclass_fields__:
             chosen: dict[str, Any] = {order.name: order.value}
-            with suppress(ArgumentError):  # half of a number that is being typed
+            try:
                 self.choices = replace(self.choices, **chosen)
+            except ArgumentError:  # half of a number that is being typed, or one that cannot be
+                self._refused_s = time.monotonic()
+            else:
                 self._changed = True
         elif order.name == "play":
             self._play()
@@ -249,7 +323,7 @@ class View:
         if self._film is not None:
             self._film.play(playing=not self._film.playing)
         else:
-            self._playing = not self._playing
+            self._pause.toggle(self._source.clock_s)
         self._told_s = -math.inf
 
     def _step(self, by: int) -> None:
@@ -257,27 +331,38 @@ class View:
             self._film.play(playing=False)
             self._film.seek(self._film.place + by)
         else:
-            self._playing, self._steps = False, self._steps + 1
+            self._pause.step(self._source.clock_s)
 
     def _save(self, order: Order) -> None:
         """Send a file to who asked for it, or say why there is none."""
-        if self._frame is None or order.client is None:
+        client = order.client
+        if client is None:
             return
-        if order.name == "record" and not self._page.is_recording:
-            self._page.begin_recording()
-            return
-        try:
-            content, ending = self._content(order.name, self._frame)
-        except ErtisError as error:
-            order.client.add_notification("Nothing is saved", str(error), auto_close_seconds=10.0, color="red")
-            return
-        name = "live" if self._film is None else Path(self._film.title).stem
-        order.client.send_file_download(f"{name}.{ending}", content, save_immediately=True)
+        if order.name == "leave":
+            self._recordings.drop(client.client_id)
+        elif order.name == "record":
+            self._record(client)
+        elif self._frame is not None:
+            try:
+                content, ending = self._content(order.name, self._frame)
+            except ErtisError as error:
+                client.add_notification("Nothing is saved", str(error), auto_close_seconds=10.0, color="red")
+                return
+            client.send_file_download(self._name(ending), content, save_immediately=True)
+
+    def _record(self, client: Any) -> None:
+        """Begin the recording of a browser, or end it."""
+        if client.client_id in self._recordings:
+            self._recordings.end(client.client_id)
+        else:
+            self._recordings.begin(client.client_id, ToBrowser(client, self._name("html")))
+        self._told_s = -math.inf
+
+    def _name(self, ending: str) -> str:
+        return f"{'live' if self._film is None else self._film.path.stem}.{ending}"
 
     def _content(self, name: str, frame: "Frame") -> tuple[bytes, str]:
         """Return what a file holds, and its ending."""
         if name == "picture":
             return picture_png(frame), "png"
-        if name == "points":
-            return points_ply(self._scene.latest(self.choices), self.choices), "ply"
-        return self._page.end_recording().encode(), "html"
+        return points_ply(self._scene.latest(self.choices)), "ply"

@@ -77,7 +77,7 @@ def test_threads_are_refused(tmp_path):
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER, count=1))
     done = CliRunner().invoke(cli, ["process", str(recording), "--device", "cuda", "--threads", "2"])
     assert done.exit_code == 1
-    assert done.stderr.startswith("ertis: error: threads is 2; ")
+    assert done.stderr.startswith("ertis: error: --threads is 2; ")
 
 
 def test_simulator_is_never_chosen_by_itself(tmp_path):

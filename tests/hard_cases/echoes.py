@@ -22,7 +22,7 @@ def echo_signals(settings, *, azimuth_deg, range_m, level, spherical=False):
         later_s = (np.linalg.norm(range_m * direction - positions_m, axis=1) - range_m) / speed_m_s
     else:
         later_s = -(positions_m @ direction) / speed_m_s
-    time_s = np.arange(settings.recording.n_samples) / settings.recording.pdm_rate_hz
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     return level * call_at(settings.call, time_s - (2 * range_m / speed_m_s + later_s)[:, None])
 
 

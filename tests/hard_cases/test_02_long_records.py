@@ -23,7 +23,7 @@ PAIR = Array(layout="pair", positions_m=((0.0, -0.02, 0.0), (0.0, 0.02, 0.0)), w
 LONG = Settings(
     array=PAIR, recording=Recording(n_samples=N_SAMPLES), processing=Processing(directions="2d:5", range_m=(0.4, 0.9))
 )
-RATE_HZ = LONG.recording.pdm_rate_hz
+RATE_HZ = LONG.recording.sample_rate_hz
 LATER = (N_SAMPLES - N_NOISE - 2000) // 100 * 100  # a multiple of range_decimation: ranges shift by whole steps
 
 

@@ -109,7 +109,7 @@ def test_two_echoes_60_db_and_half_a_metre_apart(image_of, azimuth_deg):
 
 def full_scale_noise(settings):
     """Full-scale noise as long as the call at the start, then an idle pattern far out of band."""
-    loud = int(settings.call.duration_s * settings.recording.pdm_rate_hz)
+    loud = int(settings.call.duration_s * settings.recording.sample_rate_hz)
     words = np.where(np.arange(settings.recording.n_samples) % 2, 0xFFFFFFFF, 0).astype(np.uint32)
     words[:loud] = noise(settings).words[:loud]
     return words
@@ -132,7 +132,7 @@ def test_circular_convolution_wraps():
     """The naive form, a transform as long as the record: what precedes its start comes out at its end, unabated."""
     settings = Settings.from_preset("short_25_50")
     signal = (full_scale_noise(settings) & 1) * 2.0 - 1.0
-    call = call_samples(settings.call, rate_hz=settings.recording.pdm_rate_hz)
+    call = call_samples(settings.call, rate_hz=settings.recording.sample_rate_hz)
     n = len(signal)
 
     def last_half_metre_db(n_fft):

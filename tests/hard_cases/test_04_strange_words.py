@@ -30,7 +30,7 @@ FAULTS = {
 
 def pulses(rate_hz):
     """What a modulator makes of an offset near its limit, a pulse per period: (sample,) uint32 of 0 and 1."""
-    phase = np.arange(N_SAMPLES + 1) * (rate_hz / SETTINGS.recording.pdm_rate_hz)
+    phase = np.arange(N_SAMPLES + 1) * (rate_hz / SETTINGS.recording.sample_rate_hz)
     return np.diff(np.floor(phase)).astype(np.uint32)
 
 
@@ -95,6 +95,6 @@ def test_idle_tone_of_all_channels_is_as_strong_as_the_filter_lets_it_be(rate_hz
     n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz
     matched = matched_filter(SETTINGS.call, n_fft=n_fft, rate_hz=signal_rate_hz)
     gain = np.abs(matched.values[round(rate_hz * n_fft / signal_rate_hz) - matched.first_bin]) / 2
-    amplitude = 4 * rate_hz / SETTINGS.recording.pdm_rate_hz  # of the first harmonic of short pulses from -1 to 1
+    amplitude = 4 * rate_hz / SETTINGS.recording.sample_rate_hz  # of the first harmonic of short pulses from -1 to 1
     ahead = image.energy[np.argmin(np.abs(image.azimuth_rad))]
     assert 20 * np.log10(ahead.max()) == pytest.approx(20 * np.log10(gain * amplitude), abs=0.3)

@@ -86,7 +86,7 @@ def test_an_echo_from_the_pole_is_found_there_once(tmp_path):
     settings = with_grid(tmp_path, rows)
     up = np.array([0.0, 0.0, 1.0])
     positions_m = microphones(settings.array).enabled_positions_m
-    later = np.rint(-(positions_m @ up) / sound_speed_m_s(settings.air) * settings.recording.pdm_rate_hz).astype(int)
+    later = np.rint(-(positions_m @ up) / sound_speed_m_s(settings.air) * settings.recording.sample_rate_hz).astype(int)
     ahead = echo_signals(settings, azimuth_deg=0.0, range_m=0.7, level=0.5)
     words = words_of(np.stack([np.roll(row, shift) for row, shift in zip(ahead, later, strict=True)]))
     peaks = find_peaks(Pipeline(settings).process(Measurement(words, settings)), min_level_db=-6)

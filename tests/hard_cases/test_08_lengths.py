@@ -18,10 +18,10 @@ from tests.hard_cases.tuned import tuned
 from tests.scenes import EAR, only, scene_of
 
 LINE = SHORT.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8))
-CALL = int(LINE.call.duration_s * LINE.recording.pdm_rate_hz)  # 11,250 samples
+CALL = int(LINE.call.duration_s * LINE.recording.sample_rate_hz)  # 11,250 samples
 N_TAPS = len(
     decimation_taps(
-        pdm_rate_hz=LINE.recording.pdm_rate_hz, decimation=LINE.decimation, pass_hz=matched_band_hz(LINE.call)[1]
+        sample_rate_hz=LINE.recording.sample_rate_hz, decimation=LINE.decimation, pass_hz=matched_band_hz(LINE.call)[1]
     )
 )
 LENGTHS = {
@@ -43,7 +43,7 @@ LENGTHS = {
 
 def of_length(n_samples, settings=LINE):
     """Settings whose image ends where the record does."""
-    end_m = sound_speed_m_s(settings.air) * n_samples / settings.recording.pdm_rate_hz / 2
+    end_m = sound_speed_m_s(settings.air) * n_samples / settings.recording.sample_rate_hz / 2
     return settings.replace(
         recording=Recording(n_samples=n_samples),
         processing=settings.processing.replace(directions="2d:3", range_m=(0.0, end_m * (1 - 1e-12))),

@@ -71,6 +71,18 @@ def test_signals_that_have_decayed_take_no_longer(name):
     assert not ((out != 0) & (out < SMALLEST)).any()
 
 
+@pytest.mark.alone
+def test_numbers_that_have_decayed_take_no_longer():
+    settings = SETTINGS.replace(recording=SETTINGS.recording.replace(encoding="float32"))
+    chain = chain_of(settings)
+    out = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+    loud = (0.1 * np.random.default_rng(1).standard_normal((N_SAMPLES, 32))).astype(np.float32)
+    faint = loud * np.float32(1e-40)
+    assert ((faint != 0) & (np.abs(faint) < SMALLEST)).any()
+    assert time_ratio(lambda: chain.process(loud, out), lambda: chain.process(faint, out)) < NO_LONGER
+    assert not out.any()
+
+
 def test_a_recursive_filter_decays_into_denormals():
     """The naive form: band-passed in float32, three quarters of a second half of silence are denormal, not 0."""
     sections = scipy.signal.butter(6, (25e3, 50e3), "bandpass", fs=450e3, output="sos").astype(np.float32)

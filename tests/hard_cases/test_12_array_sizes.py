@@ -19,7 +19,7 @@ from tests.scenes import line_array, only, scene_of
 
 # A fifth of the usual clock: the referee's spectra of 1024 microphones stay below 200 MB.
 SLOW = SHORT.replace(
-    recording=Recording(pdm_rate_hz=900_000.0, n_samples=4_000),
+    recording=Recording(sample_rate_hz=900_000.0, n_samples=4_000),
     processing=SHORT.processing.replace(directions="2d:3", range_m=(0.1, 0.4), range_decimation=20),
 )
 

@@ -107,7 +107,7 @@ def any_settings(draw):
     """Settings that their constructors take, or None where they refuse; records of 4 ms at the most."""
     rate_hz = draw(st.sampled_from([450e3, 9e5, 1.125e6, 4.5e6]) | st.floats(2.5e5, 5e6))
     recording = Recording(
-        pdm_rate_hz=rate_hz, n_samples=draw(st.integers(1, 300) | st.integers(1, max(1, int(4e-3 * rate_hz))))
+        sample_rate_hz=rate_hz, n_samples=draw(st.integers(1, 300) | st.integers(1, max(1, int(4e-3 * rate_hz))))
     )
     step, divisor = draw(st.integers(1, 30)), draw(st.integers(1, 30))
     head, count = draw(st.sampled_from(["2d", "3d"])), draw(st.integers(1, 40))

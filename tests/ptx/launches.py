@@ -54,6 +54,8 @@ def _each(kernels):
         kernels.unpack_bits(words, channels, signals)
         for taps in (np.int16, np.int32):
             kernels.demodulate_words(words, channels, np.zeros(61, taps), np.float32(1), 10, 0, 50, signals)
+    for number in (np.int16, np.float32):
+        kernels.unpack_pcm(np.zeros((500, 8), number), channels, np.float32(1), np.float32(0), -5, signals)
     kernels.decimate(signals, np.zeros(61, np.float32), 10, np.zeros((8, 50), np.float32))
     kernels.remove_group_delay(signals, 3, np.zeros((8, 400), np.float32))
     kernels.multiply_spectra(spectra, spectra[0].copy(), spectra)

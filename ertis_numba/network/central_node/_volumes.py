@@ -1,5 +1,6 @@
 """Journals of an archive: their names, and which measurements still fit into one."""
 
+import re
 import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
@@ -16,13 +17,15 @@ _SOURCE = "central node"
 
 
 def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
-    """Return a name for a journal that neither it nor its recording has in a folder."""
+    """Return a name for a journal that neither it nor its recording has in a folder.
+
+    Of those of one second, the later has the higher number, also where earlier ones are gone: names tell the order.
+    """
     stem = f"{name}_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-    number, made = 1, f"{stem}{end}.h5{SUFFIX}"
-    while made in taken or (folder / made).exists() or (folder / made.removesuffix(SUFFIX)).exists():
-        number += 1
-        made = f"{stem}_{number}{end}.h5{SUFFIX}"
-    return made
+    numbered = re.compile(rf"{re.escape(stem)}(?:_(\d+))?{end}\.h5")
+    found = [numbered.match(other) for other in [*taken, *(path.name for path in folder.glob(f"{stem}*"))]]
+    last = max((int(match[1] or 1) for match in found if match), default=0)
+    return f"{stem}{f'_{last + 1:03}' if last else ''}{end}.h5{SUFFIX}"
 
 
 def runs_of(journal: Journal) -> dict[Run, int]:

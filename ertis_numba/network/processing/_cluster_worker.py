@@ -57,7 +57,7 @@ def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
     return chain.prepared(kind, took_s, took_s)
 
 
-def process(settings: str, device: str, dtype: str, words: bytes, *, points: bool) -> "Made | str":
+def process(settings: str, device: str, dtype: str, words: "bytes | memoryview", *, points: bool) -> "Made | str":
     """Return what is made of a measurement, or why there is nothing that could be."""
     begun_s = time.perf_counter()
     try:

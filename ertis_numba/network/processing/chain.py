@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.geometry import microphones
 from ertis_numba.network.processing.notes import Prepared
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages.points import PointExtractor
+from ertis_numba.words import word_format
 
 __all__ = ["Chain"]
 
@@ -40,9 +40,7 @@ class Chain:
     def __init__(self, settings: str, device: str) -> None:
         self.pipeline = Pipeline(Settings.from_toml(settings, "settings of a sensor"), device=device)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
-        layout = microphones(self.pipeline.settings.array)
-        self._dtype = layout.word_type
-        self._words_shape = layout.words_shape(self.pipeline.settings.recording.n_samples)
+        self._format = word_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)
 
     def image(
@@ -55,9 +53,9 @@ class Chain:
         DataError
             They are not as many as the settings say.
         """
-        if len(words) != int(np.prod(self._words_shape)) * self._dtype.itemsize:
+        if len(words) != self._format.n_bytes:
             raise DataError(f"a measurement has {len(words)} bytes, which its settings do not say; say Hello again")
-        array = np.frombuffer(words, self._dtype).reshape(self._words_shape)
+        array = self._format.of_bytes(words)
         return self.pipeline.process(Measurement(array, self.pipeline.settings), out, threads=threads)
 
     def points(self, image: Energyscape, most: int) -> NDArray[np.float32]:
@@ -68,7 +66,7 @@ class Chain:
 
     def times_s(self, threads: int, at_once: int) -> tuple[float, float]:
         """Return how long one measurement takes on all threads, and as one of several at once that share them."""
-        silence = np.zeros(self._words_shape, self._dtype).tobytes()
+        silence = bytes(self._format.n_bytes)
         out = np.empty(self.shape, np.float32)
         wide_s = _median_s(lambda: self.image(silence, out, threads=threads))
         if at_once == 1:

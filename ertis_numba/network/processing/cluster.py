@@ -1,18 +1,16 @@
 """Jobs on the workers of a dask cluster that is there already, for more than one machine."""
 
-import os
-import secrets
+import asyncio
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
-from ertis_numba.cluster import Future, connect
+from ertis_numba.cluster import Lines, Raised, connect
 from ertis_numba.network.processing import _cluster_worker as there
 from ertis_numba.network.processing.notes import Prepared
 from ertis_numba.network.processing.options import Options
@@ -28,46 +26,42 @@ _LOOK_S: Final = 1.0
 
 
 @dataclass(slots=True, eq=False)
+class _Member:
+    """A worker of the cluster, and the line to it."""
+
+    address: str
+    line: Any
+    pid: int
+    threads: int
+    asked: set[int] = field(default_factory=set)
+    ready: set[int] = field(default_factory=set)
+    busy: int = 0
+    done: int = 0
+
+
+@dataclass(slots=True, eq=False)
 class _Attempt:
     """A job on its way, and where its image is to go."""
 
     job: Job
     slot: Slot
-    deadline_s: float
-    future: Future = None
-    given_up: bool = False
-
-
-@dataclass(slots=True)
-class _Member:
-    """A worker of the cluster."""
-
-    threads: int
-    pid: int = 0
-    done: int = 0
-
-
-@dataclass(slots=True, eq=False)
-class _Readying:
-    """A kind that workers get ready for."""
-
-    kind: Kind
-    futures: list[Future] = field(default_factory=list)
-    asked: set[str] = field(default_factory=set)
+    member: _Member
 
 
 class Cluster:
     """A `Runner` whose jobs run on the workers of a dask scheduler.
 
-    Pipelines stay in the processes of these workers, which need this package, of the same version. As many jobs are
-    under way as all workers together have threads. Dask starts what a lost worker had once more on another; what is
-    not done by the deadline is given up. Whoever reaches a scheduler can run code on its workers: keep it among
+    The scheduler says which workers there are; measurements and images go over a `Line` to each, of which it knows
+    nothing. Pipelines stay in the processes of these workers, which need this package, of the same version. Each has
+    as many jobs under way as it has threads: more of them, so that one is on its way while another is made, took 30 ms
+    instead of 23 and were no more in a second. A worker that does not answer by the deadline, or whose line breaks, is
+    left alone until it is reached again. Whoever reaches a scheduler can run code on its workers: keep it among
     machines that trust each other, or use dask's TLS.
 
     Parameters
     ----------
     options : Options
-        Its deadline, device and type of images count, and ``cluster``, the scheduler's address.
+        Its deadlines, device and type of images count, and ``cluster``, the scheduler's address.
     log : callable
         Called with lines about what happens.
 
@@ -75,7 +69,7 @@ class Cluster:
     ----------
     choice : str
     respawned : int
-        Workers that have left.
+        Workers that have left, or did not answer.
 
     Raises
     ------
@@ -88,16 +82,15 @@ class Cluster:
     def __init__(self, options: Options, log: Callable[[str], None]) -> None:
         self._options, self._log = options, log
         self._address = options.cluster or ""
-        self._run = secrets.token_hex(4)
         self._client = connect(self._address, timeout_s=_CONNECT_S)
         self._events: deque[tuple[Any, ...]] = deque()
         self._waker = Waker()
         self._members: dict[str, _Member] = {}
-        self._readying: dict[int, _Readying] = {}
+        self._kinds: dict[int, Kind] = {}
         self._prepared: dict[int, Prepared] = {}
-        self._attempts: dict[int, _Attempt] = {}
+        self._attempts: set[_Attempt] = set()
         self._free: list[Slot] = []
-        self._n_slots = self._n_attempts = self._n_asked = 0
+        self._n_slots = 0
         self.respawned = 0
         self._closing = threading.Event()
         self._looker = threading.Thread(target=self._look, name="cluster", daemon=True)
@@ -106,64 +99,77 @@ class Cluster:
     @property
     def choice(self) -> str:
         """How measurements share the cluster."""
-        workers, threads = len(self._members), self._n_threads
+        workers, threads = len(self._members), sum(member.threads for member in self._members.values())
         return f"up to {threads} at a time on {workers} workers of the cluster at {self._address}"
-
-    @property
-    def _n_threads(self) -> int:
-        return sum(member.threads for member in self._members.values())
 
     def prepare(self, kind: Kind) -> None:
         """See `Runner`."""
-        self._readying[kind.number] = _Readying(kind)
+        self.forget(kind)
+        self._kinds[kind.number] = kind
         self._ask_to_prepare()
 
     def _ask_to_prepare(self) -> None:
         """Let each worker that has not been asked get ready for each kind."""
-        for kind, readying in self._readying.items():
-            for address in self._members.keys() - readying.asked:
-                readying.asked.add(address)
-                self._n_asked += 1
-                future = self._client.submit(
-                    there.prepare,
-                    kind,
-                    readying.kind.settings,
-                    self._options.device,
-                    workers=[address],
-                    allow_other_workers=False,
-                    key=f"ertis-{self._run}-prepare-{kind}-{self._n_asked}",
-                    pure=False,
-                )
-                readying.futures.append(future)
-                future.add_done_callback(lambda done, kind=kind: self._tell("prepared", kind, *_result_of(done)))
+        for member in self._members.values():
+            for kind in self._kinds.values():
+                if kind.number not in member.asked:
+                    member.asked.add(kind.number)
+                    call = partial(there.prepare, kind.number, kind.settings, self._options.device)
+                    self._ask(member, call, self._options.prepare_s, "prepared", kind, member)
 
     def forget(self, kind: Kind) -> None:
         """See `Runner`."""
         self._prepared.pop(kind.number, None)
-        if (readying := self._readying.pop(kind.number, None)) is not None:
-            self._cancel(readying.futures)
+        self._kinds.pop(kind.number, None)
+        for member in self._members.values():
+            member.asked.discard(kind.number)
+            member.ready.discard(kind.number)
 
     def takes(self, kind: Kind) -> bool:
         """See `Runner`."""
-        return kind.number in self._prepared and len(self._attempts) < self._n_threads
+        return kind.number in self._prepared and self._idle(kind) is not None
+
+    def _idle(self, kind: Kind) -> _Member | None:
+        """Return the worker with the least to do of those that can take a job of a kind."""
+        able = [each for each in self._members.values() if kind.number in each.ready and each.busy < each.threads]
+        return min(able, key=lambda member: member.busy / member.threads, default=None)
 
     def submit(self, job: Job) -> None:
         """See `Runner`."""
-        self._n_attempts += 1
-        number = self._n_attempts
-        attempt = _Attempt(job, self._slot_for(job), time.monotonic() + self._options.deadline_s)
-        self._attempts[number] = attempt
-        attempt.future = self._client.submit(
-            there.process,
-            job.kind.settings,
-            self._options.device,
-            self._options.dtype,
-            bytes(bytes_of(job.words)),
-            points=job.points,
-            key=f"ertis-{self._run}-{number}",
-            pure=False,
-        )
-        attempt.future.add_done_callback(lambda done: self._tell("made", number, *_taken(done, attempt.slot)))
+        if (member := self._idle(job.kind)) is None:
+            raise AssertionError("a job is submitted that no worker takes; ask takes() first")
+        attempt = _Attempt(job, self._slot_for(job), member)
+        self._attempts.add(attempt)
+        member.busy += 1
+        call = partial(there.process, job.kind.settings, self._options.device, self._options.dtype, points=job.points)
+        deadline_s = self._options.deadline_s
+        self._ask(member, call, deadline_s, "made", attempt, words=bytes_of(job.words), slot=attempt.slot)
+
+    def _ask(
+        self,
+        member: _Member,
+        call: "partial[Any]",
+        within_s: float,
+        *event: Any,
+        words: memoryview | None = None,
+        slot: Slot | None = None,
+    ) -> None:
+        """Have a worker call something, with words if there are some, and tell of it; an image is put into a slot."""
+        sent = () if words is None else (words,)  # beside the call, as what is within it is copied
+
+        async def ask() -> None:
+            result, text = None, ""
+            try:
+                result = await asyncio.wait_for(member.line.call(call, *sent), within_s)
+                if isinstance(result, there.Made) and slot is not None:
+                    result = _kept(result, slot)
+            except TimeoutError:
+                text = "it was not done in time"
+            except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
+                text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            self._tell(*event, result, text)
+
+        self._client.loop.add_callback(ask)
 
     def _slot_for(self, job: Job) -> Slot:
         """Return a slot that is large enough, with the measurement in it, for whoever wants it raw."""
@@ -194,35 +200,21 @@ class Cluster:
             self._waker.clear()
         return self._heard()
 
-    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  the load is the cluster's matter
+    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  time is the client's matter
         """See `Runner`."""
-        found = self._heard()
-        for attempt in self._attempts.values():
-            if now_s > attempt.deadline_s and not attempt.given_up:
-                attempt.given_up = True  # it keeps its slot until nobody writes there any more
-                found.append(Lost(attempt.job, "it was not done in time", again=True))
-                if attempt.future is not None:
-                    self._cancel([attempt.future])
-        return found
-
-    def _cancel(self, futures: list[Future]) -> None:
-        """Let go of tasks, without waiting for the scheduler."""
-        self._client.loop.add_callback(lambda: self._client.cancel(futures, asynchronous=True, force=True))
+        return self._heard()
 
     def status(self) -> list[WorkerStatus]:
         """See `Runner`."""
-        busy = len(self._attempts)
-        return [
-            WorkerStatus(pid=member.pid, state="busy" if busy > place else "idle", done=member.done)
-            for place, member in enumerate(self._members.values())
-        ]
+        members = self._members.values()
+        return [WorkerStatus(pid=each.pid, state="busy" if each.busy else "idle", done=each.done) for each in members]
 
     def close(self) -> None:
         """See `Runner`."""
         self._closing.set()
         self._client.close(timeout=2)
         self._looker.join(_CONNECT_S)
-        for slot in [*self._free, *(attempt.slot for attempt in self._attempts.values())]:
+        for slot in [*self._free, *(attempt.slot for attempt in self._attempts)]:
             slot.close()
         self._free.clear()
         self._attempts.clear()
@@ -230,18 +222,17 @@ class Cluster:
 
     def _look(self) -> None:
         """Follow which workers there are; in a thread of its own, as the scheduler may take its time."""
-        known: dict[str, int] = {}
+        lines = Lines(self._client)
         while not self._closing.is_set():
             try:
                 threads = {str(address): int(count) for address, count in self._client.nthreads().items()}
-                new = [address for address in threads if address not in known]
-                pids = self._client.run(os.getpid, workers=new, on_error="return") if new else {}
+                reached = lines.reached(threads.keys() - set(self._members), timeout_s=_LOOK_S)
             except Exception as error:  # noqa: BLE001  whatever it is, it may pass
                 if not self._closing.is_set():
                     self._tell("away", f"the scheduler at {self._address} does not answer ({type(error).__name__})")
             else:
-                known = threads
-                self._tell("members", threads, {name: pid for name, pid in pids.items() if isinstance(pid, int)})
+                joined = [_Member(name, line, pid, threads[name]) for name, (line, pid) in reached.items()]
+                self._tell("members", threads, joined)
             self._closing.wait(_LOOK_S)
 
     def _tell(self, *event: Any) -> None:
@@ -253,68 +244,71 @@ class Cluster:
         found: list[Event] = []
         while self._events:
             match self._events.popleft():
-                case ("members", threads, pids):
-                    self._follow(threads, pids)
+                case ("members", threads, joined):
+                    self._follow(threads, joined)
                 case ("away", text):
                     self._log(text)
-                case ("prepared", kind, result, text):
-                    found += self._became_ready(kind, result, text)
-                case ("made", number, result, text):
-                    found += self._finished(number, result, text)
+                case ("prepared", kind, member, result, text):
+                    found += self._became_ready(kind, member, result, text)
+                case ("made", attempt, result, text):
+                    found.append(self._finished(attempt, result, text))
         return found
 
-    def _follow(self, threads: dict[str, int], pids: dict[str, int]) -> None:
-        left = self._members.keys() - threads.keys()
-        self.respawned += len(left)
-        for address in left:
-            self._log(f"worker {address} has left the cluster")
-            del self._members[address]
+    def _follow(self, threads: dict[str, int], joined: list[_Member]) -> None:
+        for member in [each for each in self._members.values() if each.address not in threads]:
+            self._leave(member, "it has left the cluster")
+        for member in joined:
+            self._members.setdefault(member.address, member)
         for address, count in threads.items():
-            member = self._members.setdefault(address, _Member(count))
-            member.threads, member.pid = count, pids.get(address, member.pid)
+            if address in self._members:
+                self._members[address].threads = count
         self._ask_to_prepare()
 
-    def _became_ready(self, kind: int, result: Any, text: str) -> list[Event]:
-        if kind not in self._readying or kind in self._prepared:
+    def _leave(self, member: _Member, text: str) -> None:
+        """Give a worker nothing more, unless it is reached again."""
+        if self._members.get(member.address) is member:
+            del self._members[member.address]
+            self.respawned += 1
+            self._log(f"worker {member.address} is given nothing more: {text}")
+
+    def _became_ready(self, kind: Kind, member: _Member, result: Any, text: str) -> list[Event]:
+        if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
             return []
+        is_first = kind.number not in self._prepared
         if isinstance(result, Prepared):
-            self._prepared[kind] = result
-            self._log(f"measurements are processed {self.choice}")
-            return [KindReady(result)]
-        if isinstance(result, str):  # a pipeline that no worker can make
-            return [KindFailed(kind, result)]
-        self._log(f"a worker of the cluster cannot get ready: {text}")
+            member.ready.add(kind.number)
+            if is_first:
+                self._prepared[kind.number] = result
+                self._log(f"measurements are processed {self.choice}")
+            return [KindReady(result)] if is_first else []
+        if isinstance(result, str) and is_first:  # a pipeline that no worker can make
+            return [KindFailed(kind.number, result)]
+        if result is None:
+            self._leave(member, text)
+        else:
+            told = result.text if isinstance(result, Raised) else result
+            self._log(f"worker {member.address} cannot get ready: {told}")
         return []
 
-    def _finished(self, number: int, result: Any, text: str) -> list[Event]:
-        attempt = self._attempts.pop(number)
-        job, slot = attempt.job, attempt.slot
-        if attempt.given_up:
-            self._free.append(slot)
-            return []
-        if not isinstance(result, there.Made):
-            self._free.append(slot)
-            again = result is None
-            return [Lost(job, text if again else str(result), again=again)]
-        job.slot, job.n_points = slot, len(result.points)
-        if (member := self._members.get(result.worker)) is not None:
+    def _finished(self, attempt: _Attempt, result: Any, text: str) -> Event:
+        job, slot, member = attempt.job, attempt.slot, attempt.member
+        self._attempts.remove(attempt)
+        member.busy -= 1
+        if isinstance(result, there.Made):
+            job.slot, job.n_points = slot, len(result.points)
             member.done += 1
-        return [Done(job, result.took_s)]
+            return Done(job, result.took_s)
+        self._free.append(slot)
+        if isinstance(result, str):  # of which nothing can be made
+            return Lost(job, result, again=False)
+        if isinstance(result, Raised):
+            return Lost(job, result.text, again=True)
+        self._leave(member, text)  # so that the other try is another's
+        return Lost(job, text, again=True)
 
 
-def _taken(future: Future, slot: Slot) -> tuple[Any, str]:
-    """Put what a task has made into a slot, or return why there is nothing; in a thread of the client."""
-    made, text = _result_of(future)
-    if isinstance(made, there.Made):
-        np.copyto(slot.view.image_as(made.image.shape, made.image.dtype), made.image)
-        slot.view.points(made.points.nbytes)[:] = made.points.tobytes()
-        made = replace(made, image=made.image[:0])  # which is large, and not needed any more
-    return made, text
-
-
-def _result_of(future: Future) -> tuple[Any, str]:
-    """Return what a task has come to, or None and why; in a thread of the client."""
-    try:
-        return future.result(timeout=_CONNECT_S), ""
-    except (Exception, CancelledError) as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
-        return None, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+def _kept(made: there.Made, slot: Slot) -> there.Made:
+    """Put what was made into a slot; in the thread of the client."""
+    np.copyto(slot.view.image_as(made.image.shape, made.image.dtype), made.image)
+    slot.view.points(made.points.nbytes)[:] = made.points.tobytes()
+    return replace(made, image=made.image[:0])  # which is large, and not needed any more

@@ -8,15 +8,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones
 from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.network.log import Log
 from ertis_numba.network.processing.runner import Job, bytes_of
 from ertis_numba.settings import Settings
+from ertis_numba.words import word_format
 
 __all__ = ["Quarantine", "entry_of"]
 
@@ -99,10 +97,9 @@ class Quarantine:
 
 def entry_of(job: Job, settings: Settings) -> Entry | None:
     """Return the measurement of a job whose sensor has such settings, None if they are not of its words."""
-    layout, data = microphones(settings.array), job.data
-    shape = layout.words_shape(settings.recording.n_samples)
-    words = np.frombuffer(bytes_of(job.words), layout.word_type)
-    if words.size != int(np.prod(shape)):
+    data, content = job.data, bytes_of(job.words)
+    words = word_format(settings)
+    if len(content) != words.n_bytes:
         return None
-    measurement = Measurement(words.reshape(shape).copy(), settings.replace(air=data.air), data.stamp)
-    return Entry(measurement, data.monotonic_ns, zlib.crc32(bytes_of(job.words)))
+    measurement = Measurement(words.of_bytes(content).copy(), settings.replace(air=data.air), data.stamp)
+    return Entry(measurement, data.monotonic_ns, zlib.crc32(content))

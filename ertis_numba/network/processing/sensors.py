@@ -7,13 +7,14 @@ from typing import Final, Protocol
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import PAPER_GRIDS, microphones, self_contained
+from ertis_numba.geometry import PAPER_GRIDS, self_contained
 from ertis_numba.network.log import Log
 from ertis_numba.network.messages import Data, Description, Hello
 from ertis_numba.network.processing.notes import Prepared
 from ertis_numba.network.processing.options import Options
 from ertis_numba.network.processing.runner import Kind
 from ertis_numba.settings import Air, Settings
+from ertis_numba.words import word_format
 
 __all__ = ["Known", "Sensors"]
 
@@ -159,14 +160,13 @@ class Sensors:
     def _kind_of(self, sensor: str, settings: Settings) -> Kind | None:
         try:
             applied = self_contained(self._options.applied(settings)).to_toml()
-            layout = microphones(settings.array)
+            n_bytes = word_format(settings).n_bytes
             _require_size(self._options.applied(settings))
         except ArgumentError as error:
             self._log.warning("unusable", sensor=sensor, text=str(error))
             return None
         if applied not in self._kinds:
             self._n_kinds += 1
-            n_bytes = settings.recording.n_samples * layout.n_words * layout.word_bits // 8
             self._kinds[applied] = Kind(self._n_kinds, applied, n_bytes)
             self._prepare(self._kinds[applied])
         return self._kinds[applied]

@@ -19,7 +19,7 @@ def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> Fr
     coefficients in reverberant sound fields, JASA 27, 1955). Independent noises are mixed by the root of
     that matrix, frequency by frequency.
     """
-    rate_hz = shot.sensor.recording.pdm_rate_hz
+    rate_hz = shot.sensor.recording.sample_rate_hz
     bins = band_bins(ambient.band_hz, rate_hz)
     frequency_hz = bins * rate_hz / FRAME
     places, nodes = np.unique(np.rint(frequency_hz / _NODE_HZ), return_inverse=True)

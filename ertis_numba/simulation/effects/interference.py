@@ -26,7 +26,7 @@ def way_from(shot: Snapshot, source: Placed) -> Paths:
 
 def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: int) -> None:
     """Add ``a / r · sin(2π f (t - r / c))``, t being the time of the scene: (mic, sample) float64, in place."""
-    way, rate_hz = way_from(shot, tone), shot.sensor.recording.pdm_rate_hz
+    way, rate_hz = way_from(shot, tone), shot.sensor.recording.sample_rate_hz
     amplitude = 10 ** (tone.level_db / 20) * spreading(way)[0]
     # The whole turns of a long time are taken out before they cost digits.
     turns = (tone.frequency_hz * (shot.time_s - way.length_m[0] / shot.speed_m_s)) % 1.0
@@ -41,7 +41,7 @@ def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> Frames:
 
     The frame is delayed window and all, so that microphones far apart hear the same.
     """
-    way, rate_hz = way_from(shot, noise), shot.sensor.recording.pdm_rate_hz
+    way, rate_hz = way_from(shot, noise), shot.sensor.recording.sample_rate_hz
     apart_m = way.length_m[0] - np.linalg.norm(way.mouth.position_m - shot.ear.centre_m)
     late_samples = apart_m / shot.speed_m_s * rate_hz
     amplitude = 10 ** (noise.level_db / 20) * spreading(way)[0]

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from ertis_numba.simulation.sensors import Electronics
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["microphone_faults", "stick"]
+__all__ = ["microphone_faults", "stick", "stick_numbers"]
 
 
 def microphone_faults(shot: Snapshot) -> NDArray[np.float64]:
@@ -20,3 +20,12 @@ def stick(octets: NDArray[np.uint8], electronics: Electronics) -> None:
         octets[:, channel // 8] &= np.uint8(0xFF ^ 1 << channel % 8)
     for channel in electronics.stuck_high:
         octets[:, channel // 8] |= np.uint8(1 << channel % 8)
+
+
+def stick_numbers(
+    numbers: NDArray[np.int16] | NDArray[np.float32], electronics: Electronics, full_scale: float
+) -> None:
+    """Set stuck channels of PCM to either end of the scale, in place: (sample, channel)."""
+    most = full_scale - 1 if numbers.dtype.kind == "i" else full_scale
+    numbers[:, list(electronics.stuck_low)] = -full_scale
+    numbers[:, list(electronics.stuck_high)] = most

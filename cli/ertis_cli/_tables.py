@@ -1,0 +1,92 @@
+"""Tables: drawn on a terminal, plain text elsewhere."""
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from ertis_cli import _progress
+
+if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions
+    from rich.table import Table as Drawn
+
+__all__ = ["Side", "Table"]
+
+Side = Literal["left", "right"]
+
+_GAP = 2  # spaces between columns
+_FOLDED = 16  # characters that a column of text has at least, where there is no room for all
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells under headings; rich can draw it.
+
+    Parameters
+    ----------
+    columns : mapping of str
+        Each heading, and the side at which its cells are aligned: numbers at the right.
+    rows : sequence of sequences of str
+    styles : mapping of str, optional
+        How cells of these texts look where they are drawn, as in ``{"failed": "red"}``.
+    """
+
+    columns: Mapping[str, Side]
+    rows: Sequence[Sequence[str]]
+    styles: Mapping[str, str] = field(default_factory=dict)
+
+    def print(self, *, err: bool = False) -> None:
+        """Print it, drawn only where that is a terminal."""
+        stream = sys.stderr if err else sys.stdout
+        if not _progress.is_drawn_on(stream):
+            for line in self.lines():
+                click.echo(line, err=err)
+            return
+        from rich.console import Console
+
+        console = Console(file=stream)
+        # Where even numbers are too wide, the terminal breaks lines, rather than cells.
+        places = range(len(self.columns))
+        console.width = max(console.width, sum(map(self._least, places)) + _GAP * (len(places) - 1))
+        console.print(self)
+
+    def lines(self) -> Iterator[str]:
+        """Yield it as aligned text, however wide: programs read it, too."""
+        widths = [max(map(len, cells)) for cells in self._cells()]
+        for row in (tuple(self.columns), *self.rows):
+            cells = zip(row, widths, self.columns.values(), strict=True)
+            aligned = (cell.rjust(width) if side == "right" else cell.ljust(width) for cell, width, side in cells)
+            yield (" " * _GAP).join(aligned).rstrip()
+
+    def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> "Iterator[Drawn]":
+        from rich.table import Table as Drawn
+        from rich.text import Text
+
+        widths = [max(map(len, cells)) for cells in self._cells()]
+        is_tight = sum(widths) + _GAP * (len(widths) - 1) > options.max_width
+        drawn = Drawn(box=None, pad_edge=False, header_style="bold")
+        for place, (heading, side) in enumerate(self.columns.items()):
+            # Text is folded and headings are broken at their words, but numbers are left in one piece.
+            width = self._least(place) if is_tight and side == "right" else None
+            name = " ".join(_words(heading)) if is_tight else heading
+            drawn.add_column(name, justify=side, overflow="fold", width=width)
+        for row in self.rows:
+            drawn.add_row(*(Text(cell, self.styles.get(cell, "")) for cell in row))
+        yield drawn
+
+    def _cells(self) -> list[tuple[str, ...]]:
+        """Return the cells of each column, its heading first."""
+        return list(zip(tuple(self.columns), *self.rows, strict=True))
+
+    def _least(self, place: int) -> int:
+        """Return the width that a column needs."""
+        heading, *cells = self._cells()[place]
+        widest = max(map(len, (*_words(heading), *cells)), default=0)
+        return widest if list(self.columns.values())[place] == "right" else min(widest, _FOLDED)
+
+
+def _words(heading: str) -> list[str]:
+    return heading.replace("_", " ").split()

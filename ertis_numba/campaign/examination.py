@@ -1,0 +1,143 @@
+"""What the plan of a sensor is expected to err by and to take, and what it does err by."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any, Final
+
+from ertis_numba import kernels, verification
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.kernels import KernelSet
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
+from ertis_numba.stages.beam_nodes import Aperture
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.texture import texture_of
+
+__all__ = ["examine"]
+
+_NEAREST_M: Final = 1e-3  # where range 0 is meant
+
+
+def examine(
+    pipeline: Pipeline, first: Measurement, *, threads: int | None, explain: bool, verify: bool
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield what there is to say of a sensor's plan, as JSON can hold it: ``plan``, then ``verified``.
+
+    Parameters
+    ----------
+    pipeline : Pipeline
+    first : Measurement
+        What the plan is tried on.
+    threads : int, optional
+    explain : bool
+        Yield the plan, its predicted error and its predicted time.
+    verify : bool
+        Yield the true error of the image of ``first`` beside those that were predicted.
+
+    Raises
+    ------
+    ArgumentError
+        The settings have no plan, or one whose true error cannot be measured.
+    DataError
+        That error exceeds the budget; it is yielded before.
+    """
+    settings = pipeline.settings
+    if settings.processing.method == "paper":
+        raise ArgumentError("a plan is asked for, and method 'paper' has none; give 'fast', or leave it out")
+    if verify and settings.processing.beamformer != "delay_and_sum":
+        raise ArgumentError(
+            f"the true error of beamformer {settings.processing.beamformer!r} is asked for, and only the exact image "
+            "of 'delay_and_sum' is known; leave it out"
+        )
+    kernel_set = kernels.load(pipeline.device)
+    n_threads = kernel_set.max_threads if threads is None else threads
+    texture = texture_of(first, settings, kernel_set, threads=n_threads)
+    planners = {
+        "safe": Planner(settings, kernel_set, threads=n_threads),
+        "texture": Planner(settings, kernel_set, threads=n_threads, texture=texture),
+    }
+    if explain:
+        yield "plan", _plan(planners, settings)
+    if verify:
+        verified = _verified(pipeline, first, planners, kernel_set, n_threads)
+        yield "verified", verified
+        _require_budget(first.stamp.sensor, verified["error_db"], settings)
+
+
+def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
+    """Return a plan and what is expected of it."""
+    chosen = {name: planner.chosen(settings.accuracy) for name, planner in planners.items()}
+    safe, texture = chosen["safe"], chosen["texture"]
+    return {
+        "accuracy": {name: getattr(settings.accuracy, name) for name in settings.accuracy.__struct_fields__},
+        "parts": [
+            {
+                "name": name,
+                "due_to": due_to,
+                "safe_db": round(decibels(safe.parts[name]), 1),
+                "predicted_db": round(decibels(texture.parts[name]), 1),
+            }
+            for name, due_to in PARTS.items()
+            if safe.parts[name]
+        ],
+        "safe_db": round(safe.error_db, 1),
+        "predicted_db": round(texture.error_db, 1),
+        "stages_ms": {name: round(time_ms, 3) for name, time_ms in safe.stages_ms.items()},
+        "time_ms": round(safe.time_ms, 3),
+        "costs": str(planners["safe"].costs_file),
+        "decimated": settings.recording.is_pdm or settings.decimation != 1,
+        "plane_waves": _plane_waves(planners["texture"].model, settings),
+    }
+
+
+def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]] | None:
+    """Return what plane wavefronts are wrong by at both ends of the range axis; None where they are not plane."""
+    if settings.processing.wavefront != "plane":
+        return None
+    grid = direction_grid(settings.processing)
+    positions_m = microphones(settings.array).enabled_positions_m
+    aperture = Aperture.of(positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+    speed_m_s = sound_speed_m_s(settings.air)
+    return [
+        {
+            "range_m": range_m,
+            "error_db": round(
+                decibels(model.plane_waves(aperture, max(range_m, _NEAREST_M), sound_speed_m_s=speed_m_s)), 1
+            ),
+        }
+        for range_m in settings.processing.range_m
+    ]
+
+
+def _verified(
+    pipeline: Pipeline, first: Measurement, planners: dict[str, Planner], kernel_set: KernelSet, threads: int
+) -> dict[str, Any]:
+    """Return the true error of a measurement beside the predicted ones."""
+    accuracy = pipeline.settings.accuracy
+    measured = verification.measure(pipeline.process(first), first, kernels=kernel_set, threads=threads)
+    return {
+        "sequence": first.stamp.sequence,
+        "directions": measured.n_directions,
+        "error_db": round(measured.error_db, 2),
+        "predicted_db": round(planners["texture"].chosen(accuracy).error_db, 2),
+        "safe_db": round(planners["safe"].chosen(accuracy).error_db, 2),
+        "max_error_db": accuracy.max_error_db,
+        "peaks": measured.peaks and {name: _rounded(value) for name, value in asdict(measured.peaks).items()},
+    }
+
+
+def _require_budget(sensor: str, error_db: float, settings: Settings) -> None:
+    allowed_db = settings.accuracy.max_error_db
+    if not error_db <= allowed_db:
+        raise DataError(
+            f"image of sensor {sensor} errs by {error_db:.1f} dB, allowed are {allowed_db:g} dB; give a lower "
+            "--max-error, or leave more of [accuracy] open"
+        )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)

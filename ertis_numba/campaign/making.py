@@ -1,0 +1,164 @@
+"""One recording to its energyscape file, in whatever process: the same for one and for many."""
+
+import statistics
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from ertis_numba.campaign.orders import Options
+from ertis_numba.campaign.sensor_run import SensorRun, faults_of
+from ertis_numba.errors import DataError
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
+
+__all__ = ["Making", "checked", "making"]
+
+_Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
+_Show = Callable[[str, dict[str, Any]], None]
+
+
+class Making:
+    """A recording that is ready to be made into energyscapes: nothing is written yet."""
+
+    def __init__(
+        self, recordings: Sequence[RecordingReader], runs: Sequence[SensorRun], writer: EnergyscapeWriter
+    ) -> None:
+        self._recordings, self._runs, self._writer = recordings, runs, writer
+        self.measurements = sum(map(len, recordings))
+        """How many there are."""
+
+    def run(self) -> Generator[int]:
+        """Make the file; yield how many measurements are done. Closed before its end, it leaves no file."""
+        done = 0
+        with self._writer:
+            for run, recording in zip(self._runs, self._recordings, strict=True):
+                for _ in run.write(recording, self._writer):
+                    done += 1
+                    yield done
+
+    def report(self) -> dict[str, Any]:
+        """Return what was made, as ``--json`` has it; what there is to say of a single sensor stands outside, too."""
+        rows = [
+            {"sensor": recording.sensor, **run.report()}
+            for recording, run in zip(self._recordings, self._runs, strict=True)
+        ]
+        times_ms = [time_ms for run in self._runs for time_ms in run.times_ms]
+        outside = ("directions", "ranges", *self._runs[0].told) if len(rows) == 1 else ()
+        return {
+            "measurements": len(times_ms),
+            **{name: rows[0][name] for name in outside},
+            "device": self._runs[0].pipeline.device,
+            "median_ms": round(statistics.median(times_ms), 3),
+            "sensors": rows,
+        }
+
+
+@contextmanager
+def making(
+    path: Path,
+    target: Path,
+    options: Options,
+    *,
+    sensors: Sequence[str],
+    settings: Mapping[str, Settings] | None = None,
+    pipelines: _Pipelines,
+    most_bytes: float | None = None,
+    warn: Callable[[str], None] = lambda _: None,
+    show: _Show = lambda *_: None,
+) -> Iterator[Making]:
+    """Open a recording, and look at every sensor of it, so that what cannot be done is refused before anything is.
+
+    Parameters
+    ----------
+    path, target : Path
+        Recording, and energyscape file to make.
+    options : Options
+    sensors : sequence of str
+    settings : mapping of str to Settings, optional
+        To process by; those that ``options`` makes of the recorded ones by default.
+    pipelines : callable
+        Returns a context with a pipeline for each of some settings.
+    most_bytes : float, optional
+        See `SensorRun`.
+    warn : callable
+        Called with a line for each sensor that has faulty microphones.
+    show : callable
+        Called with the name of a sensor and what was found out of its plan, as soon as it was.
+
+    Raises
+    ------
+    DataError
+        Microphones are faulty and ``options.strict``; or an image errs by more than its budget and ``options.verify``.
+    ErtisError
+        What else is wrong with the recording, its settings or the target.
+    """
+    with ExitStack() as stack:
+        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
+        chosen = [
+            options.settings(recording.settings) if settings is None else settings[recording.sensor]
+            for recording in recordings
+        ]
+        writer = EnergyscapeWriter(target, recording=recordings, dtype=options.dtype, overwrite=options.overwrite)
+        runs = [
+            SensorRun(pipeline, batch=options.batch, most_bytes=most_bytes)
+            for pipeline in stack.enter_context(pipelines(chosen))
+        ]
+        for run, recording in zip(runs, recordings, strict=True):
+            _look_over(run, recording, options, warn, show)
+        yield Making(recordings, runs, writer)
+
+
+def checked(
+    path: Path,
+    options: Options,
+    *,
+    settings: Mapping[str, Settings],
+    pipelines: _Pipelines,
+    warn: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Look at every sensor of a recording as `making` does, and make nothing; return what was found out of the plans.
+
+    Parameters
+    ----------
+    path : Path
+    options : Options
+    settings : mapping of str to Settings
+        By which its energyscapes were made.
+    pipelines, warn : callable
+        As for `making`.
+
+    Raises
+    ------
+    DataError
+        As `making`.
+    ErtisError
+        What else is wrong with the recording.
+    """
+    with ExitStack() as stack:
+        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
+        runs = [SensorRun(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))]
+        for run, recording in zip(runs, recordings, strict=True):
+            _look_over(run, recording, options, warn, lambda *_: None)
+        rows = [{"sensor": recording.sensor, **run.told} for recording, run in zip(recordings, runs, strict=True)]
+        return {**(runs[0].told if len(runs) == 1 else {}), "sensors": rows}
+
+
+def _look_over(
+    run: SensorRun, recording: RecordingReader, options: Options, warn: Callable[[str], None], show: _Show
+) -> None:
+    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", run.known(recording[0]))
+    if faults and options.strict:
+        raise DataError(faults)
+    if faults:
+        warn(faults)
+    if not (options.explain or options.verify):
+        return
+    from ertis_numba.campaign.examination import examine  # noqa: PLC0415  it takes time to load, and few want it
+
+    first = run.known(recording[0])
+    parts = examine(run.pipeline, first, threads=options.threads, explain=options.explain, verify=options.verify)
+    for name, part in parts:
+        run.told[name] = part
+        show(recording.sensor, {name: part})

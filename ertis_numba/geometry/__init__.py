@@ -1,0 +1,34 @@
+"""Microphone layouts, direction grids and the delays between them.
+
+The sensor frame: x forward (boresight), y to azimuth +90°, z up (elevation +90°). Positions are
+taken from the centroid of the enabled microphones.
+"""
+
+from ertis_numba.geometry.azimuths import ALONE_RAD, is_closed, reach_rad, unrolled_rad
+from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
+from ertis_numba.geometry.grids import PAPER_GRIDS, Grid, direction_grid
+from ertis_numba.geometry.layouts import Layout, layout_names, load_layout, microphones, self_contained, storable
+from ertis_numba.geometry.mountings import mounting
+from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
+
+__all__ = [
+    "ALONE_RAD",
+    "PAPER_GRIDS",
+    "Grid",
+    "Layout",
+    "azimuth_columns",
+    "direction_grid",
+    "far_field_delays",
+    "is_closed",
+    "layout_names",
+    "load_layout",
+    "microphones",
+    "mounting",
+    "reach_rad",
+    "self_contained",
+    "spacing_rad",
+    "spherical_delays",
+    "storable",
+    "unit_vectors",
+    "unrolled_rad",
+]

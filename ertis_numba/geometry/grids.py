@@ -1,0 +1,128 @@
+"""Direction grids."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry._csv import csv_rows
+from ertis_numba.settings import Processing
+
+__all__ = ["PAPER_GRIDS", "Grid", "direction_grid"]
+
+PAPER_GRIDS = {
+    "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
+    "1850": ("3d:1850", (-45.0, 45.0), (-45.0, 45.0)),
+    "3000": ("3d:3000", (-90.0, 90.0), (-90.0, 90.0)),
+}
+"""The three grids of the paper: kind, azimuth limits and elevation limits in degrees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """The directions of an image.
+
+    Attributes
+    ----------
+    azimuth_rad, elevation_rad : (direction,) float64
+    """
+
+    azimuth_rad: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.azimuth_rad)
+
+
+def direction_grid(processing: Processing) -> Grid:
+    """Return the directions that ``processing.directions`` names.
+
+    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal
+    plane, both limits included. ``3d:N`` is N cells of equal area between the limits, in rows of
+    equal elevation. Anything else is the path of a CSV file of azimuth, elevation in degrees.
+
+    Parameters
+    ----------
+    processing : Processing
+
+    Returns
+    -------
+    Grid
+
+    Raises
+    ------
+    ArgumentError
+        The name is no grid and no readable file, or the grid is empty.
+    """
+    name = processing.directions
+    kind, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
+        name, (name, processing.azimuth_limits_deg, processing.elevation_limits_deg)
+    )
+    head, colon, count = kind.partition(":")
+    if head in {"2d", "3d"} and colon:
+        if not count.isdecimal():
+            raise ArgumentError(f"directions {name!r} has no count; give for instance {head}:181")
+        n_directions = checks.whole(f"count of directions {name!r}", int(count), 1, 1_000_000)
+        if head == "2d":
+            return _planar_grid(n_directions, azimuth_deg)
+        return _equal_area_grid(n_directions, azimuth_deg, elevation_deg)
+    return _csv_grid(name)
+
+
+def _planar_grid(n_directions: int, limits_deg: tuple[float, float]) -> Grid:
+    if n_directions == 1:
+        limits_deg = (sum(limits_deg) / 2,) * 2
+    return Grid(np.radians(np.linspace(*limits_deg, n_directions)), np.zeros(n_directions))
+
+
+def _equal_area_grid(
+    n_directions: int, azimuth_limits_deg: tuple[float, float], elevation_limits_deg: tuple[float, float]
+) -> Grid:
+    """Rows of equal elevation, each cut into cells of equal area, after Leopardi's zonal partition.
+
+    P. Leopardi, A partition of the unit sphere into regions of equal area and small diameter,
+    ETNA 25 (2006). Here the zones end at the limits, so that the count is met exactly.
+    """
+    west, east = np.radians(azimuth_limits_deg)
+    low, high = np.sin(np.radians(elevation_limits_deg))
+    side_rad = math.sqrt((east - west) * (high - low) / n_directions) or 1.0
+    span_rad = math.radians(elevation_limits_deg[1] - elevation_limits_deg[0])
+    n_rows = min(n_directions, max(1, round(span_rad / side_rad))) if east > west else n_directions
+    ideal = np.sin(np.radians(np.linspace(*elevation_limits_deg, n_rows + 1)))
+    share = (ideal - low) / (high - low) if high > low else np.linspace(0.0, 1.0, n_rows + 1)
+    edges = np.rint(share * n_directions).astype(int)  # whole cells below each row's edge
+    azimuth_rad, elevation_rad = [], []
+    for below, above in itertools.pairwise(edges):
+        in_row = above - below
+        if not in_row:
+            continue
+        middle = low + (high - low) * (below + above) / 2 / n_directions
+        azimuth_rad.append(west + (east - west) * (np.arange(in_row) + 0.5) / in_row)
+        elevation_rad.append(np.full(in_row, math.asin(min(1.0, max(-1.0, middle)))))
+    return Grid(np.concatenate(azimuth_rad), np.concatenate(elevation_rad))
+
+
+def _csv_grid(path: str) -> Grid:
+    if Path(path).suffix.lower() != ".csv":
+        raise ArgumentError(f"directions {path!r} is no grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file")
+    try:
+        text = Path(path).read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ArgumentError(
+            f"directions {path}: {reason}; give a readable CSV of azimuth, elevation in degrees"
+        ) from error
+    rows = csv_rows(f"directions {path}", text)
+    if not rows or any(len(row) != 2 for row in rows):
+        raise ArgumentError(f"directions {path} has not two numbers in every row; give azimuth, elevation in degrees")
+    angles_rad = np.radians(np.asarray(rows))
+    checks.finite_array(f"directions {path}", angles_rad)
+    for row, (azimuth_deg, elevation_deg) in enumerate(rows):
+        checks.between(f"directions {path}: azimuth in row {row}", azimuth_deg, -360.0, 360.0)
+        checks.between(f"directions {path}: elevation in row {row}", elevation_deg, -90.0, 90.0)
+    return Grid(angles_rad[:, 0].copy(), angles_rad[:, 1].copy())

@@ -1,0 +1,233 @@
+"""Arrays: where the microphones are, from settings, shipped layouts and files."""
+
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.documents import Document
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry._csv import csv_rows
+from ertis_numba.settings import Array, Settings
+
+__all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable"]
+
+_SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are below it
+_CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
+
+
+class _LayoutFile(Document, frozen=True, kw_only=True):
+    """What a layout file may hold; gains and delays are those of `settings.Array`."""
+
+    positions_mm: list[list[float]]
+    name: str = ""
+    source: str = ""
+    word_bits: int = 32
+    disabled: tuple[int, ...] = ()
+    gain: tuple[float, ...] | None = None
+    delay_s: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """The microphones of an array.
+
+    Attributes
+    ----------
+    name : str
+    positions_m : (channel, axis) float64
+        From the centroid of the enabled microphones.
+    enabled : (channel,) bool
+    gain : (channel,) float64
+        Calibrated sensitivity.
+    delay_s : (channel,) float64
+        Calibrated lateness.
+    word_bits : int
+    """
+
+    name: str
+    positions_m: NDArray[np.float64]
+    enabled: NDArray[np.bool_]
+    gain: NDArray[np.float64]
+    delay_s: NDArray[np.float64]
+    word_bits: int
+
+    @property
+    def n_words(self) -> int:
+        """Words per PDM sample."""
+        return -(-len(self.enabled) // self.word_bits)
+
+    @property
+    def word_type(self) -> np.dtype[np.unsignedinteger[Any]]:
+        """Type of a word, little-endian as it is stored and sent."""
+        return np.dtype(f"<u{self.word_bits // 8}")
+
+    @property
+    def enabled_positions_m(self) -> NDArray[np.float64]:
+        """Positions of the enabled microphones: (mic, axis) float64."""
+        return self.positions_m[self.enabled]
+
+    def to_array(self) -> Array:
+        """Return settings that hold the positions themselves and so depend on no file."""
+        return Array(
+            layout=self.name,
+            positions_m=tuple((float(x), float(y), float(z)) for x, y, z in self.positions_m),
+            enabled=tuple(self.enabled.tolist()),
+            gain=tuple(self.gain.tolist()),
+            delay_s=tuple(self.delay_s.tolist()),
+            word_bits=self.word_bits,
+        )
+
+
+def layout_names() -> tuple[str, ...]:
+    """Return the names of the shipped layouts."""
+    return tuple(sorted(item.name.removesuffix(".toml") for item in _shipped() if item.name.endswith(".toml")))
+
+
+def _shipped() -> list[Traversable]:
+    return list(resources.files("ertis_numba").joinpath("layouts").iterdir())
+
+
+def load_layout(name: str | Path) -> Layout:
+    """Return a shipped layout, or one from a ``.toml`` or ``.csv`` file.
+
+    A CSV has one row per channel, ``y, z`` or ``x, y, z`` in millimetres, in the order of the bits.
+
+    Parameters
+    ----------
+    name : str or Path
+        One of `layout_names`, or a path.
+
+    Returns
+    -------
+    Layout
+
+    Raises
+    ------
+    ArgumentError
+        The name is unknown, or the file cannot be read or used.
+    """
+    path = Path(name)
+    if path.suffix.lower() not in {".toml", ".csv"}:
+        checks.choice("layout", name, layout_names())
+        text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
+        return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+    try:
+        text = path.read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ArgumentError(
+            f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
+        ) from error
+    if path.suffix.lower() == ".csv":
+        return _placed(str(name), _LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
+    return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+
+
+def _placed(source: str, file: _LayoutFile) -> Layout:
+    rows = file.positions_mm
+    if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
+        raise ArgumentError(
+            f"layout {source}: positions_mm is not rows of 2 or 3 numbers; give y, z or x, y, z of each channel"
+        )
+    positions_m = np.zeros((len(rows), 3))
+    positions_m[:, 3 - len(rows[0]) :] = np.asarray(rows, dtype=np.float64) / 1000
+    enabled = np.ones(len(rows), dtype=np.bool_)
+    for channel in file.disabled:
+        enabled[checks.whole(f"layout {source}: a disabled channel", channel, 0, len(rows) - 1)] = False
+    checks.finite_array(f"layout {source}: positions_mm", np.where(enabled[:, None], positions_m, 0.0))
+    try:
+        made = Array(
+            layout=file.name or source,
+            positions_m=tuple(tuple(row) for row in np.where(enabled[:, None], positions_m, 0.0).tolist()),
+            enabled=tuple(enabled.tolist()),
+            gain=file.gain,
+            delay_s=file.delay_s,
+            word_bits=file.word_bits,
+        )
+    except ArgumentError as error:
+        raise ArgumentError(f"layout {source}: {error}") from error
+    across_m = float(np.ptp(positions_m[enabled], axis=0).max(initial=0.0)) if enabled.any() else 0.0
+    if enabled.sum() > 1 and across_m < _SMALLEST_M:
+        raise ArgumentError(
+            f"layout {source}: its microphones lie within {1e3 * across_m:.3g} mm, too close to tell directions; give "
+            "millimetres"
+        )
+    _require_apart(source, positions_m, np.flatnonzero(enabled))
+    return microphones(made)
+
+
+def _require_apart(source: str, positions_m: NDArray[np.float64], channels: NDArray[np.intp]) -> None:
+    """Refuse a file that has two microphones in one place, which is a row that was copied and not changed."""
+    first: dict[tuple[float, ...], int] = {}
+    for channel in channels.tolist():
+        place = tuple(positions_m[channel].tolist())
+        if first.setdefault(place, channel) != channel:
+            raise ArgumentError(
+                f"layout {source}: channels {first[place]} and {channel} are in one place; correct one, or name it "
+                "under 'disabled' in a .toml"
+            )
+
+
+def microphones(array: Array) -> Layout:
+    """Return the microphones that array settings describe, by position or by name.
+
+    Parameters
+    ----------
+    array : Array
+
+    Returns
+    -------
+    Layout
+        Positions from the centroid of the enabled microphones.
+
+    Raises
+    ------
+    ArgumentError
+        The named layout is unknown or cannot be used.
+    """
+    if array.positions_m is None:
+        return load_layout(array.layout)
+    positions_m = np.asarray(array.positions_m, dtype=np.float64)
+    enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
+    centre_m = positions_m[enabled].mean(axis=0)
+    # Positions that are centred already stay as they are to the last bit, so that a layout read from
+    # a recording gives the image that the named one gave.
+    centre_m[np.abs(centre_m) < _CENTRED_M] = 0.0
+    centred_m = np.where(enabled[:, None], positions_m - centre_m, 0.0)
+    return Layout(
+        name=array.layout,
+        positions_m=centred_m,
+        enabled=enabled,
+        gain=np.ones(len(enabled)) if array.gain is None else np.asarray(array.gain, dtype=np.float64),
+        delay_s=np.zeros(len(enabled)) if array.delay_s is None else np.asarray(array.delay_s, dtype=np.float64),
+        word_bits=array.word_bits,
+    )
+
+
+def self_contained(settings: Settings) -> Settings:
+    """Return settings whose microphones are written out, so that they depend on no layout file."""
+    if settings.array.positions_m is not None:
+        return settings
+    return settings.replace(array=microphones(settings.array).to_array())
+
+
+def storable(settings: Settings) -> Settings:
+    """Return settings as a recording holds them, which depend on no file.
+
+    Raises
+    ------
+    ArgumentError
+        The directions are those of a file, or the layout cannot be used.
+    """
+    if settings.processing.directions.lower().endswith(".csv"):
+        raise ArgumentError(
+            f"processing.directions is the file {settings.processing.directions}, which a recording cannot hold; "
+            "name a grid, and give the file when processing"
+        )
+    return self_contained(settings)

@@ -1,0 +1,291 @@
+"""Multichannel PCM of arrays whose microphones give numbers: WAV, and the HDF5 files of Acoular."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import microphones
+from ertis_numba.interop._acoular import read_acoular
+from ertis_numba.interop._wav import read_wav
+from ertis_numba.settings import Call, Processing, Recording, Settings
+
+__all__ = ["PcmReader", "open_pcm"]
+
+_SLOWEST_AIR_M_S = 300.0  # as for the presets: the whole echo fits into the record in any air
+_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth, as the presets have it
+_ACOULAR = {".h5", ".hdf5", ".hdf"}
+_MIDDLE_OF_BYTES = 128
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    """What a file says of itself."""
+
+    path: Path
+    rate_hz: float
+    n_samples: int
+    n_channels: int
+    encoding: Literal["int16", "float32"]
+    settings: Settings | None = None
+
+
+class PcmReader:
+    """The measurements of files of PCM, one after the other; one file is read at a time.
+
+    The SYNC count, which is not in such files, is the number of the measurement. Numbers of 8 and 16 bits become int16,
+    all others float32, of which 24 bits and single precision are all.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Of one rate and number of channels. Each holds one measurement, or several of ``length_s``.
+    settings, sensor, skip_s, length_s, start_ns
+        See `open_pcm`.
+
+    Attributes
+    ----------
+    settings : Settings
+        With the recording that the files hold.
+    rest_s : float
+        What is left over at the ends of files.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        settings: Settings | None,
+        *,
+        sensor: str,
+        skip_s: float,
+        length_s: float | None,
+        start_ns: int,
+    ) -> None:
+        if not paths:
+            raise ArgumentError("no file of PCM is given; give at least one")
+        self._files = [_look(path) for path in paths]
+        first = self._files[0]
+        self._require_alike()
+        self._skipped = round(checks.between("skip_s", skip_s, 0.0, math.inf) * first.rate_hz)
+        shortest = min(file.n_samples for file in self._files) - self._skipped
+        # From one emission to the next there may be a part of a sample, which would add up.
+        self._period = float(shortest) if length_s is None else checks.positive("length_s", length_s) * first.rate_hz
+        self._n_samples = math.floor(self._period * (1 + 1e-12))
+        self._counts = [1 if length_s is None else self._whole(file) for file in self._files]
+        self._require_measurements(first)
+        ends = [self._start(count - 1) + self._n_samples for count in self._counts]
+        left = sum(file.n_samples - end for file, end in zip(self._files, ends, strict=True))
+        self.rest_s = left / first.rate_hz
+        recording = Recording(sample_rate_hz=first.rate_hz, n_samples=self._n_samples, encoding=first.encoding)
+        self.settings = _fitted(_known(settings, first), recording, first)
+        self._require_channels(first)
+        self._enabled = microphones(self.settings.array).enabled
+        self._sensor = checks.sensor_name(sensor)
+        self._start_ns = checks.whole("start_ns", start_ns, 0)
+
+    def __len__(self) -> int:
+        return sum(self._counts)
+
+    def __iter__(self) -> Iterator[Measurement]:
+        sequence, period_ns = 0, 1e9 * self._period / self._files[0].rate_hz
+        for file, count in zip(self._files, self._counts, strict=True):
+            _, numbers, _ = _read(file.path)
+            for number in range(count):
+                start = self._start(number)
+                stamp = Stamp(
+                    sensor=self._sensor,
+                    sequence=sequence,
+                    sync_count=sequence,
+                    timestamp_ns=self._start_ns + round(sequence * period_ns),
+                )
+                words = _words(file, numbers, slice(start, start + self._n_samples), self._enabled)
+                yield Measurement(words, self.settings, stamp)
+                sequence += 1
+
+    def _start(self, number: int) -> int:
+        """Return where a measurement begins in its file."""
+        return self._skipped + round(number * self._period)
+
+    def _whole(self, file: _File) -> int:
+        """Return how many measurements a file holds."""
+        if self._n_samples < 1:
+            return 0
+        count = int((file.n_samples - self._skipped) / self._period) + 1
+        while count and self._start(count - 1) + self._n_samples > file.n_samples:
+            count -= 1
+        return count
+
+    def _require_measurements(self, first: _File) -> None:
+        for file, count in zip(self._files, self._counts, strict=True):
+            if count < 1 or self._n_samples < 1:
+                rate_hz = first.rate_hz
+                raise DataError(
+                    f"{file.path} lasts {file.n_samples / rate_hz:.4g} s, wanted {self._skipped / rate_hz:.4g} s to "
+                    f"be skipped and a measurement of {max(self._n_samples, 1) / rate_hz:.4g} s; skip less (--skip) "
+                    "or give a shorter --length"
+                )
+
+    def _require_alike(self) -> None:
+        first = self._files[0]
+        for file in self._files[1:]:
+            for name, came, wanted in (
+                ("Hz", file.rate_hz, first.rate_hz),
+                ("channels", file.n_channels, first.n_channels),
+                ("numbers", file.encoding, first.encoding),
+            ):
+                if came != wanted:
+                    raise DataError(
+                        f"{file.path} has {_plain(came)} {name}, {first.path.name} {_plain(wanted)}; import each by "
+                        "itself"
+                    )
+
+    def _require_channels(self, first: _File) -> None:
+        layout = microphones(self.settings.array)
+        wanted = len(layout.enabled)
+        if first.n_channels == wanted:
+            return
+        if first.n_samples == wanted:
+            raise DataError(f"{first.path} has {first.n_channels} channels of {wanted} samples; transpose it")
+        raise DataError(
+            f"{first.path} has {first.n_channels} channels, array {layout.name!r} has {wanted}; give the layout of its "
+            "array, a row for each channel (--layout)"
+        )
+
+
+def open_pcm(
+    paths: Sequence[str | Path] | str | Path,
+    settings: Settings | None = None,
+    *,
+    sensor: str = "sensor",
+    skip_s: float = 0.0,
+    length_s: float | None = None,
+    start_ns: int = 0,
+) -> PcmReader:
+    """Open files of multichannel PCM: WAV, or Acoular's HDF5 (``time_data`` and its ``sample_freq``).
+
+    Such numbers need no demodulation, and the chain begins after it.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        All of one rate and number of channels; channel m is row m of the layout.
+    settings : Settings, optional
+        Array, call, air, processing and accuracy; not needed for a file that `export` made, which holds them. The
+        recording is that of the files. A ``processing.range_decimation`` that leaves less than 1.8 ranges per second
+        and hertz of the call's bandwidth, as the default may, gives way to one that suits both, and the default
+        ``processing.range_m`` ends where the record does.
+    sensor : str
+        Name to give to the sensor.
+    skip_s : float
+        When in each file the first emission begins.
+    length_s : float, optional
+        From one emission to the next, where files hold several; by default each holds one, as long as the shortest.
+    start_ns : int
+        When the first emission was, in nanoseconds since 1970-01-01 UTC; 0 where it is not known. The others follow by
+        their lengths.
+
+    Raises
+    ------
+    DataError
+        A file is missing, is of another kind, is shorter than a measurement, or differs from the first in rate or
+        channels; or it has another number of channels than the array.
+    ArgumentError
+        The rate is too low for the call, or no settings are given nor in the file.
+    """
+    several = [paths] if isinstance(paths, str | Path) else paths
+    return PcmReader(
+        [Path(path) for path in several],
+        settings,
+        sensor=sensor,
+        skip_s=skip_s,
+        length_s=length_s,
+        start_ns=start_ns,
+    )
+
+
+def _known(settings: Settings | None, first: _File) -> Settings:
+    known = settings or first.settings
+    if known is None:
+        raise ArgumentError(f"{first.path} says nothing of its array and call; give settings")
+    return known
+
+
+def _fitted(settings: Settings, recording: Recording, first: _File) -> Settings:
+    """Return settings for another recording, with ranges that suit it."""
+    processing, call = settings.processing, settings.call
+    if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
+        raise DataError(
+            f"{first.path} has {recording.sample_rate_hz:g} Hz, too few for a call that reaches "
+            f"{call.high_frequency_hz:g} Hz; give the call that was emitted, or record faster than twice its frequency"
+        )
+    if recording.duration_s <= call.duration_s:
+        raise DataError(
+            f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, the call alone lasts "
+            f"{1e3 * call.duration_s:.4g} ms; give a longer --length, or skip less (--skip)"
+        )
+    changes: dict[str, Any] = {}
+    if processing.range_m == Processing().range_m:
+        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
+        last_m = max(0.0, min(processing.range_m[1], math.floor(10 * echo_m) / 10))
+        changes["range_m"] = (min(processing.range_m[0], last_m), last_m)
+    band_hz = call.high_frequency_hz - call.low_frequency_hz
+    if recording.sample_rate_hz / processing.range_decimation < _RATE_BY_BAND * band_hz * (1 - 1e-9):
+        changes |= {"range_decimation": _range_step(recording.sample_rate_hz, call), "decimation": None}
+    return settings.replace(recording=recording, processing=processing.replace(**changes))
+
+
+def _range_step(rate_hz: float, call: Call) -> int:
+    """Return how many samples apart ranges may be: a multiple of the decimation that suits the call, where there is."""
+    step = max(1, int(rate_hz / (_RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz))))
+    suits = max(1, int(rate_hz / (4.4 * call.high_frequency_hz)))
+    return min(10_000, step - step % suits if step > suits else step)
+
+
+def _look(path: Path) -> _File:
+    rate_hz, numbers, settings = _read(path)
+    is_short = numbers.dtype.kind in "iu" and numbers.dtype.itemsize <= 2
+    n_samples, n_channels = numbers.shape
+    return _File(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings)
+
+
+def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; give a file of PCM") from error
+    if path.suffix.lower() in _ACOULAR:
+        return read_acoular(path)
+    return *read_wav(path), None
+
+
+def _words(file: _File, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return some of the numbers as a recording holds them; in disabled channels, what is no number becomes 0."""
+    numbers = numbers[samples]
+    if numbers.dtype == np.uint8:  # the one kind of WAV that has no sign
+        return ((numbers.astype(np.int16) - _MIDDLE_OF_BYTES) * 256).astype("<i2")
+    if file.encoding == "int16":
+        return numbers.astype("<i2")
+    if numbers.dtype.kind == "i":
+        return (numbers / 2.0 ** (8 * numbers.dtype.itemsize - 1)).astype("<f4")
+    words = numbers.astype("<f4")
+    broken = ~np.isfinite(words)
+    words[broken & ~enabled] = 0
+    if broken[:, enabled].any():
+        sample, channel = np.argwhere(broken & enabled)[0].tolist()
+        raise DataError(
+            f"{file.path} holds {numbers[sample, channel]} at sample {samples.start + sample} of channel {channel}; "
+            "give finite numbers"
+        )
+    return words
+
+
+def _plain(value: object) -> object:
+    return f"{value:g}" if isinstance(value, float) else value

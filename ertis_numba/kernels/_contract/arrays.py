@@ -1,0 +1,16 @@
+"""The arrays that kernels take."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Complex", "Index", "Pcm", "Real", "Short", "Taps", "Words"]
+
+Words = NDArray[np.unsignedinteger[Any]]
+Pcm = NDArray[np.int16] | NDArray[np.float32]
+Real = NDArray[np.float32]
+Complex = NDArray[np.complex64]
+Index = NDArray[np.int32]
+Short = NDArray[np.int16]
+Taps = NDArray[np.int16] | NDArray[np.int32]

@@ -1,0 +1,148 @@
+"""From words to analytic signals."""
+
+from typing import Protocol
+
+import numpy as np
+
+from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Taps, Words
+
+__all__ = [
+    "Decimate",
+    "DemodulateWords",
+    "MultiplyAndFold",
+    "MultiplySpectra",
+    "RemoveGroupDelay",
+    "UnpackBits",
+    "UnpackPcm",
+]
+
+
+class UnpackBits(Protocol):
+    """Turn the bits of PDM words into signals of +1 and −1.
+
+    Parameters
+    ----------
+    words : (sample, word) uint8, uint16, uint32 or uint64
+        Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
+    channels : (mic,) int32
+        Channel of each microphone.
+    out : (mic, sample) float32
+    """
+
+    def __call__(self, words: Words, channels: Index, out: Real) -> None: ...
+
+
+class UnpackPcm(Protocol):
+    """Turn PCM numbers into signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 outside the record.
+
+    Words that are smaller than ``silence`` become 0, before anything is reckoned with them: denormal numbers are slow.
+
+    Parameters
+    ----------
+    words : (sample, channel) int16 or float32
+    channels : (mic,) int32
+        Channel of each microphone.
+    scale, silence : float32
+    first : int
+        Sample of the record, possibly before its begin.
+    out : (mic, sample) float32
+    """
+
+    def __call__(
+        self, words: Pcm, channels: Index, scale: np.float32, silence: np.float32, first: int, out: Real
+    ) -> None: ...
+
+
+class Decimate(Protocol):
+    """Filter signals and keep every ``factor``-th sample.
+
+    ``out[mic, n] = Σ_t taps[t] · signals[mic, n · factor + t − (n_taps − 1)]``; samples before the
+    first are 0. The result is late by the group delay of the taps, ``(n_taps − 1) / 2`` input samples.
+
+    Parameters
+    ----------
+    signals : (mic, sample) float32
+    taps : (tap,) float32
+        Symmetric.
+    factor : int
+    out : (mic, n) float32
+    """
+
+    def __call__(self, signals: Real, taps: Real, factor: int, out: Real) -> None: ...
+
+
+class RemoveGroupDelay(Protocol):
+    """Move signals ahead in time: ``out[mic, n] = signals[mic, n + delay]``, 0 past the end.
+
+    Parameters
+    ----------
+    signals : (mic, sample) float32
+    delay : int
+        In samples, at least 0.
+    out : (mic, n) float32
+    """
+
+    def __call__(self, signals: Real, delay: int, out: Real) -> None: ...
+
+
+class DemodulateWords(Protocol):
+    """Unpack, decimate and remove the group delay in one pass over the words.
+
+    ``out[mic, n] = scale · Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]`` with x = ±1
+    from the bits, 0 outside the record. Samples of ``out`` past ``n_outputs`` are set to 0. The sum is one of
+    integers, so every device gives the same bits.
+
+    Parameters
+    ----------
+    words, channels
+        As in `UnpackBits`.
+    taps : (tap,) int16 or int32
+        Symmetric, an odd number; their magnitudes add up to the largest number of their type at most.
+    scale : float32
+    factor, first, n_outputs : int
+    out : (mic, sample) float32
+    """
+
+    def __call__(
+        self,
+        words: Words,
+        channels: Index,
+        taps: Taps,
+        scale: np.float32,
+        factor: int,
+        first: int,
+        n_outputs: int,
+        out: Real,
+    ) -> None: ...
+
+
+class MultiplySpectra(Protocol):
+    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``.
+
+    Parameters
+    ----------
+    spectra : (mic, bin) complex64
+    response : (bin,) complex64
+    out : (mic, bin) complex64
+    """
+
+    def __call__(self, spectra: Complex, response: Complex, out: Complex) -> None: ...
+
+
+class MultiplyAndFold(Protocol):
+    """Multiply spectra by one filter per phase and fold each product to the length of ``out``.
+
+    ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[mic, phase, b]`` over all b with
+    ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the
+    filtered signal at the output rate, once per phase: the polyphase form of one long transform.
+
+    Parameters
+    ----------
+    spectra : (mic, bin) complex64
+    responses : (mic, phase, b) or (1, phase, b) complex64
+        Each microphone's own, or one for all.
+    first_bin : int
+    out : (mic, phase, k) complex64
+    """
+
+    def __call__(self, spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None: ...

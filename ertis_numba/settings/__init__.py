@@ -1,0 +1,28 @@
+"""Everything that can be chosen, as frozen structures with TOML in and out.
+
+A structure checks itself once, when it is made; whoever holds one may rely on it. Unknown keys are
+refused. ``Settings()`` is the default eRTIS measurement; ``Settings.from_preset`` knows the RTIS
+recording presets.
+"""
+
+from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MOST_ZONES, Accuracy
+from ertis_numba.settings.array import Array
+from ertis_numba.settings.call import Call
+from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.recording import ENCODINGS, Air, Recording
+from ertis_numba.settings.settings import PRESETS, Settings
+
+__all__ = [
+    "ENCODINGS",
+    "ERROR_PRESETS_DB",
+    "INTERPOLATIONS",
+    "MOST_ZONES",
+    "PRESETS",
+    "Accuracy",
+    "Air",
+    "Array",
+    "Call",
+    "Processing",
+    "Recording",
+    "Settings",
+]

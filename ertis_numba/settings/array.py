@@ -1,0 +1,69 @@
+"""The array: where the microphones are, and how their bits lie in a word."""
+
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.constants import MAX_MICROPHONES, WORD_BITS
+from ertis_numba.documents import Table
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["Array"]
+
+_FARTHEST_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
+
+
+class Array(Table, frozen=True, kw_only=True):
+    """Where the microphones are and how their bits lie in a word.
+
+    Attributes
+    ----------
+    layout : str
+        Name of a shipped layout, or the path of a layout file (.toml, .csv). When
+        ``positions_m`` is given it is only a label.
+    positions_m : tuple of (x, y, z), optional
+        Positions in the sensor frame, one per channel, in the order of the bits.
+    enabled : tuple of bool, optional
+        Channels that carry a microphone; all of them by default.
+    gain : tuple of float, optional
+        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
+    delay_s : tuple of float, optional
+        Calibrated lateness of each channel, 0 by default; it is taken out.
+    word_bits : {8, 16, 32, 64}
+        Size of one PDM word. An array with more channels uses several words per sample.
+    """
+
+    layout: str = "eRTIS_v3D1"
+    positions_m: tuple[tuple[float, float, float], ...] | None = None
+    enabled: tuple[bool, ...] | None = None
+    gain: tuple[float, ...] | None = None
+    delay_s: tuple[float, ...] | None = None
+    word_bits: int = 32
+
+    def __post_init__(self) -> None:
+        checks.choice("array.word_bits", checks.whole("array.word_bits", self.word_bits, 1), WORD_BITS)
+        if self.positions_m is None:
+            for name in ("enabled", "gain", "delay_s"):
+                if getattr(self, name) is not None:
+                    raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
+            return
+        n_channels = checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
+        for channel, position_m in enumerate(self.positions_m):
+            checks.shape(f"array.positions_m[{channel}]", np.shape(position_m), (3,))
+        checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
+        for channel, position in enumerate(self.positions_m):
+            for coordinate_m in position:
+                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_FARTHEST_M, _FARTHEST_M)
+        if self.enabled is not None:
+            checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
+            if not any(self.enabled):
+                raise ArgumentError("array.enabled is false for every channel; enable at least one")
+        self._check_each("gain", 1e-3, 1e3)
+        self._check_each("delay_s", -1e-3, 1e-3)
+
+    def _check_each(self, name: str, low: float, high: float) -> None:
+        """Refuse a list that has not one number in ``[low, high]`` for each channel."""
+        values = getattr(self, name)
+        if values is not None:
+            checks.shape(f"array.{name}", (len(values),), (len(self.positions_m or ()),))
+            for channel, value in enumerate(values):
+                checks.between(f"array.{name}[{channel}]", value, low, high)

@@ -1,0 +1,92 @@
+"""How a measurement becomes an energyscape."""
+
+from typing import Literal
+
+from ertis_numba import checks
+from ertis_numba.documents import Table
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["Processing"]
+
+
+class Processing(Table, frozen=True, kw_only=True):
+    """How a measurement becomes an energyscape.
+
+    Attributes
+    ----------
+    method : {"fast", "paper"}
+        ``fast``: analytic signals, beams at the output ranges only. ``paper``: the algorithm of the
+        2019 paper, for comparison.
+    directions : str
+        A grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file.
+    azimuth_limits_deg, elevation_limits_deg : (low, high)
+        Limits of the grids that are named by a count (``2d:N`` and ``3d:N``).
+    range_m : (first, last)
+        Window of the range axis.
+    range_decimation : int
+        Samples of the record per range of the energyscape.
+    decimation : int, optional
+        Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest that
+        suits the method and the call's band; see `Settings.decimation`.
+    wavefront : {"plane", "spherical"}
+        What an echo looks like to the array: ``plane`` as the paper has it, ``spherical`` focuses on each
+        range, which matters nearer than some ten apertures.
+    beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}
+        How microphones are combined; ``docs/beamformers.md`` tells what each is good for. All but the first need
+        the fast method and plane wavefronts.
+    dmas_order : int
+        How many microphones ``dmas`` multiplies at a time, 2 to 8.
+    snapshots : int
+        Ranges from which ``capon`` learns what else is heard, 1 to 32.
+    loading : float
+        White noise that ``capon`` reckons with, by the mean power of a microphone; the more, the more it is
+        like delay-and-sum.
+    """
+
+    method: Literal["fast", "paper"] = "fast"
+    directions: str = "90"
+    azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
+    elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
+    range_m: tuple[float, float] = (0.5, 5.0)
+    range_decimation: int = 100
+    decimation: int | None = None
+    wavefront: Literal["plane", "spherical"] = "plane"
+    beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
+    dmas_order: int = 2
+    snapshots: int = 5
+    loading: float = 1.0
+
+    def __post_init__(self) -> None:
+        checks.choice("processing.method", self.method, ("fast", "paper"))
+        checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
+        checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
+        checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
+        checks.whole("processing.range_decimation", self.range_decimation, 1, 10_000)
+        if self.decimation is not None:
+            checks.whole("processing.decimation", self.decimation, 1, 1000)
+            if self.range_decimation % self.decimation:
+                raise ArgumentError(
+                    f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
+                    f"({self.range_decimation})"
+                )
+        checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical"))
+        if self.wavefront == "spherical" and self.method == "paper":
+            raise ArgumentError(
+                "processing.wavefront is 'spherical', which the paper's method knows nothing of; give 'plane'"
+            )
+        self._check_beamformer()
+
+    def _check_beamformer(self) -> None:
+        """Refuse what no beamformer can do, and what delay-and-sum alone can."""
+        checks.choice("processing.beamformer", self.beamformer, ("delay_and_sum", "coherence_factor", "dmas", "capon"))
+        checks.whole("processing.dmas_order", self.dmas_order, 2, 8)
+        checks.whole("processing.snapshots", self.snapshots, 1, 32)
+        checks.between("processing.loading", self.loading, 1e-6, 1e6)
+        if self.beamformer == "delay_and_sum":
+            return
+        for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):
+            if getattr(self, name) == value:
+                raise ArgumentError(
+                    f"processing.{name} is {value!r}, which can delay_and_sum only; give {remedy} with "
+                    f"processing.beamformer {self.beamformer!r}"
+                )

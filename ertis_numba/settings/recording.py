@@ -1,0 +1,72 @@
+"""What is recorded, and in which air."""
+
+from typing import Literal
+
+from ertis_numba import checks
+from ertis_numba.constants import (
+    ERTIS_PDM_RATE_HZ,
+    STANDARD_HUMIDITY_PERCENT,
+    STANDARD_PRESSURE_PA,
+    STANDARD_TEMPERATURE_C,
+)
+from ertis_numba.documents import Table
+
+__all__ = ["DEFAULT_SAMPLES", "ENCODINGS", "Air", "Recording"]
+
+_MOST_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
+DEFAULT_SAMPLES = 163_840
+"""Of one measurement, as RTIS has it."""
+
+ENCODINGS = ("pdm", "int16", "float32")
+"""Forms of what microphones give: bits, or numbers of PCM."""
+
+
+class Recording(Table, frozen=True, kw_only=True):
+    """What is recorded of one measurement: how fast, how much, and in which form.
+
+    Attributes
+    ----------
+    sample_rate_hz : float
+        The PDM clock, or the rate of PCM.
+    n_samples : int
+    encoding : {"pdm", "int16", "float32"}
+        ``pdm``: a bit per microphone, packed into words. ``int16`` and ``float32``: PCM, a number per microphone;
+        full scale is 32768, or 1.
+    """
+
+    sample_rate_hz: float = ERTIS_PDM_RATE_HZ
+    n_samples: int = DEFAULT_SAMPLES
+    encoding: Literal["pdm", "int16", "float32"] = "pdm"
+
+    def __post_init__(self) -> None:
+        checks.choice("recording.encoding", self.encoding, ENCODINGS)
+        checks.between("recording.sample_rate_hz", self.sample_rate_hz, 1e3, 1e9)
+        checks.whole("recording.n_samples", self.n_samples, 1, _MOST_SAMPLES)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of one measurement."""
+        return self.n_samples / self.sample_rate_hz
+
+    @property
+    def full_scale(self) -> float:
+        """The number of PCM, or what bits are taken as, that is 1 in signals."""
+        return 32_768.0 if self.encoding == "int16" else 1.0
+
+    @property
+    def is_pdm(self) -> bool:
+        """Whether microphones give bits, which are to be demodulated first."""
+        return self.encoding == "pdm"
+
+
+class Air(Table, frozen=True, kw_only=True):
+    """The medium, which sets the speed of sound."""
+
+    temperature_c: float = STANDARD_TEMPERATURE_C
+    humidity_percent: float = STANDARD_HUMIDITY_PERCENT
+    pressure_pa: float = STANDARD_PRESSURE_PA
+
+    def __post_init__(self) -> None:
+        checks.between("air.temperature_c", self.temperature_c, -40.0, 60.0)
+        checks.between("air.humidity_percent", self.humidity_percent, 0.0, 100.0)
+        checks.between("air.pressure_pa", self.pressure_pa, 10_000.0, 200_000.0)

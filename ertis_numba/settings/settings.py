@@ -1,0 +1,157 @@
+"""All settings of one sensor."""
+
+import math
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from ertis_numba import checks
+from ertis_numba.documents import Document
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings.accuracy import INTERPOLATIONS, Accuracy
+from ertis_numba.settings.array import Array
+from ertis_numba.settings.call import Call
+from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.recording import DEFAULT_SAMPLES, Air, Recording
+
+__all__ = ["PRESETS", "Settings"]
+
+_WORDS = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
+_SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
+_BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
+_MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
+_WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
+_NARROWEST_HZ = 100.0  # a narrower band pass would ring for seconds
+_LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+
+PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
+"""Names of the RTIS recording presets: length of the record and band of the call."""
+
+
+class Settings(Document, frozen=True, kw_only=True):
+    """All settings of one sensor: the whole content of a settings file."""
+
+    array: Array = Array()
+    call: Call = Call()
+    recording: Recording = Recording()
+    air: Air = Air()
+    processing: Processing = Processing()
+    accuracy: Accuracy = Accuracy()
+
+    former_keys: ClassVar[dict[str, str]] = {"pdm_rate_hz": "sample_rate_hz"}
+
+    def __post_init__(self) -> None:
+        if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
+            raise ArgumentError(
+                f"processing.decimation {self.decimation} leaves signals at "
+                f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
+                f"{self.call.high_frequency_hz:g} Hz"
+            )
+        swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
+        if self.processing.method == "paper" and swept_hz < _NARROWEST_HZ:
+            raise ArgumentError(
+                f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
+                f"give {_NARROWEST_HZ:g} Hz or more, or method 'fast'"
+            )
+        self._check_adaptive()
+        step = self.processing.range_decimation
+        if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
+            raise ArgumentError(
+                f"processing.range_decimation {step} has no divisor near "
+                f"{self._largest_decimation}, the decimation that suits the call; give one that has, such as a "
+                f"multiple of {self._largest_decimation}, or give processing.decimation"
+            )
+
+    def _check_adaptive(self) -> None:
+        """Refuse plans that only sums have."""
+        if self.processing.beamformer == "delay_and_sum":
+            return
+        accuracy = self.accuracy
+        taps = accuracy.delay_taps or INTERPOLATIONS[accuracy.interpolation] or 1
+        for name, value, wanted in (
+            ("beam_taps", accuracy.beam_taps or 0, 0),
+            ("delay_taps", taps, 1),
+            ("precision", "float32" if accuracy.precision == "auto" else accuracy.precision, "float32"),
+        ):
+            if value != wanted:
+                raise ArgumentError(
+                    f"accuracy.{name} is {value!r}, which processing.beamformer {self.processing.beamformer!r} cannot "
+                    f"use; leave it out or give {wanted!r}"
+                )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file; files that it names, of a layout or of directions, are looked for beside it.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read or used.
+        """
+        return super().load(path).beside(Path(path).parent)
+
+    def beside(self, folder: Path) -> Self:
+        """Return settings whose files, of a layout and of directions, are looked for in a folder."""
+        array, processing = self.array, self.processing
+        if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
+            array = array.replace(layout=str(folder / array.layout))
+        if Path(processing.directions).suffix.lower() == ".csv":
+            processing = processing.replace(directions=str(folder / processing.directions))
+        return self.replace(array=array, processing=processing)
+
+    @classmethod
+    def from_preset(cls, name: str, **sections: Any) -> Self:
+        """Return the settings of a recording preset, such as ``default_25_50``.
+
+        ``sections`` replace whole sections. If ``processing`` is not among them, its range window ends
+        where the whole echo still fits into the record, at most at 5 m, and its range spacing suits the
+        bandwidth: with the paper's 3.8 mm, a pulse of 60 kHz can lie between two ranges and lose 2 dB.
+
+        Raises
+        ------
+        ArgumentError
+            The preset is unknown.
+        """
+        checks.choice("preset", name, PRESETS)
+        length, _, band = name.partition("_")
+        low_hz, high_hz = _BANDS_HZ[band]
+        call = Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz)
+        recording = Recording(n_samples=_WORDS[length])
+        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
+        processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)))
+        if band == "20_80":
+            processing = processing.replace(range_decimation=40)
+        return cls(call=call, recording=recording, processing=processing).replace(**sections)
+
+    @property
+    def decimation(self) -> int:
+        """Samples of the record per signal sample.
+
+        Where ``processing.decimation`` leaves it open, the largest divisor of ``range_decimation`` that
+        keeps the signal rate at 4.4 times the call's highest frequency or more, so that the low pass needs
+        few taps; for the paper's integer delays at 5.5 times, which is its 450 kHz for its calls.
+        """
+        given = self.processing.decimation
+        if given is not None:
+            return given
+        step = self.processing.range_decimation
+        return max(divisor for divisor in range(1, min(self._largest_decimation, step) + 1) if step % divisor == 0)
+
+    @property
+    def _largest_decimation(self) -> int:
+        least_hz = _LEAST_RATE[self.processing.method] * self.call.high_frequency_hz
+        return min(max(1, math.floor(self.recording.sample_rate_hz / least_hz)), _MOST_DECIMATION)
+
+    @property
+    def output_decimation(self) -> int:
+        """Signal samples per range of the energyscape."""
+        return self.processing.range_decimation // self.decimation
+
+    @property
+    def signal_rate_hz(self) -> float:
+        """Rate of the demodulated signals."""
+        return self.recording.sample_rate_hz / self.decimation
+
+    @property
+    def output_rate_hz(self) -> float:
+        """Rate at which the energyscape samples its range axis."""
+        return self.recording.sample_rate_hz / self.processing.range_decimation

@@ -1,0 +1,69 @@
+"""Whom a page is served to: browsers that have it from here, not pages of other sites in the same browser."""
+
+import contextlib
+import http
+import urllib.parse
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import websockets.asyncio.server
+
+from ertis_numba.network import addresses
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+__all__ = ["is_loopback", "own_pages"]
+
+_PORTS = {"http": 80, "https": 443}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, however it is spelled, cannot be reached from another machine."""
+    bare = host.lower().strip("[]")
+    return addresses.is_loopback(f"tcp://[{bare}]:0" if ":" in bare else f"tcp://{bare}:0")
+
+
+@contextlib.contextmanager
+def own_pages(host: str) -> Iterator[None]:
+    """Let a server that is made in this block refuse pages of other sites, which a browser lets connect to any host.
+
+    A browser says of what site a page is (Origin, RFC 6454) and where it connects to (Host). Of a page from here, both
+    are the same. On loopback it is the name of a loopback host, too: another site may let its own name lead there.
+    viser takes all of them, and has no option.
+    """
+    serve = websockets.asyncio.server.serve
+    local = is_loopback(host)
+
+    def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def refuse_others(connection: "ServerConnection", request: "Request") -> "Response | None":
+            origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
+            if not _is_own(origins, hosts, local=local):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is for those who have it from here.\n")
+            answer: Response | None = process_request(connection, request)
+            return answer
+
+        return serve(*arguments, process_request=refuse_others, **options)
+
+    setattr(websockets.asyncio.server, "serve", guarded)  # noqa: B010  mypy would not have a class replaced
+    try:
+        yield
+    finally:
+        setattr(websockets.asyncio.server, "serve", serve)  # noqa: B010  as above
+
+
+def _is_own(origins: list[str], hosts: list[str], *, local: bool) -> bool:
+    """Whether a request comes of a page from here, or of a program, which has no origin."""
+    if not origins:
+        return True
+    if len(origins) > 1 or len(hosts) != 1:
+        return False
+    try:
+        origin = urllib.parse.urlsplit(origins[0])
+        here = urllib.parse.urlsplit(f"{origin.scheme}://{hosts[0]}")
+        default = _PORTS.get(origin.scheme)
+        same = (origin.hostname, origin.port or default) == (here.hostname, here.port or default)
+    except ValueError:  # no port, or no address
+        return False
+    return default is not None and origin.hostname is not None and same and (not local or is_loopback(origin.hostname))

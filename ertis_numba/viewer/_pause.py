@@ -1,0 +1,75 @@
+"""A live view that is held: what comes meanwhile, and which of it a step shows."""
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ertis_numba.viewer._shapes import Taken
+
+__all__ = ["Pause"]
+
+_STEP_S: Final = 1.0  # at most, from the first image of a step until it is shown
+_TOGETHER: Final = 0.5  # of the shortest interval, in which all images of one moment are emitted
+
+
+class Pause:
+    """Keeps the latest image of each sensor while a live view is held, such that a step shows all sensors at once.
+
+    Attributes
+    ----------
+    since_s : float or None
+        When what is shown was held, by the clock of the source; None while nothing is.
+    n_held : int
+        How many images came meanwhile and were not shown.
+    """
+
+    def __init__(self) -> None:
+        self.since_s: float | None = None
+        self.n_held = 0
+        self._steps = 0
+        self._first_s: float | None = None  # when the first image of a step came
+        self._due_s: dict[str, float] = {}  # from when on each sensor is overdue
+        self._latest: dict[str, Taken] = {}  # of each, which is not shown
+        self._new: dict[str, Taken] = {}  # of them, those since the step
+
+    def toggle(self, now_s: float) -> None:
+        """Hold what is shown, or go on."""
+        self.since_s = now_s if self.since_s is None else None
+        self._steps, self._first_s = 0, None
+        self._latest, self._new = {}, {}
+
+    def step(self, now_s: float) -> None:
+        """Show the next measurement of all sensors, and hold that."""
+        if self.since_s is None:
+            self.toggle(now_s)
+        self._steps += 1
+
+    def shown(self, taken: "Sequence[Taken]", now_s: float) -> "list[Taken]":
+        """Return what is to be shown of what came: all of it, or while this is held the images of a step."""
+        came = {each.image.stamp.sensor: each for each in taken}
+        self._due_s |= {name: each.due_s for name, each in came.items()}
+        if self.since_s is None:
+            return [*taken]
+        self.n_held += len(taken)
+        self._latest |= came
+        if not self._steps:
+            return []
+        self._new |= came
+        if self._first_s is None and self._new:
+            self._first_s = now_s
+        if self._first_s is None or not (self._is_whole(now_s) or now_s - self._first_s >= _STEP_S):
+            return []
+        shown = [*self._latest.values()]  # also of a sensor that measures less often than the others
+        self.n_held -= len(shown)
+        self.since_s, self._steps, self._first_s = now_s, self._steps - 1, None
+        self._latest, self._new = {}, {}
+        return shown
+
+    def _is_whole(self, now_s: float) -> bool:
+        """Whether there is an image of each sensor that sends, all of one moment."""
+        newest_ns = max(each.image.stamp.timestamp_ns for each in self._new.values())
+        between_s = min((each.interval_s for each in self._new.values() if each.interval_s is not None), default=1.0)
+        first_ns = newest_ns - _TOGETHER * 1e9 * between_s
+        together = {name for name, each in self._new.items() if each.image.stamp.timestamp_ns >= first_ns}
+        return together >= {name for name, due_s in self._due_s.items() if due_s > now_s}

@@ -1,0 +1,210 @@
+"""HTML recordings of what is drawn: one for whoever began the view, and one for each browser that asks."""
+
+import threading
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from ertis_numba.atomic import check_target, replacing
+
+__all__ = ["MOST_BYTES", "Recordings", "ToBrowser", "ToFile"]
+
+MOST_BYTES: Final = 256_000_000
+"""Of a recording. Its page holds them as text, a third longer, and Chromium takes no text of more than 512 MB."""
+_PLAIN_BYTES: Final = 8
+_NOTICE_S: Final = 10.0
+
+
+class Receiver(Protocol):
+    """Who gets a recording."""
+
+    def full(self) -> None:
+        """Say that it has ended, as it holds all that it can."""
+
+    def deliver(self, page: str, n_frames: int) -> None:
+        """Take the page; a thread of its own calls this."""
+
+    def failed(self, error: Exception) -> None:
+        """Take what went wrong with that."""
+
+
+class ToFile:
+    """Writes a recording.
+
+    Parameters
+    ----------
+    path : Path
+    overwrite : bool
+    on_note : callable
+    sources : sequence of Path
+        Files that are shown, which are not overwritten whatever is asked for.
+
+    Attributes
+    ----------
+    n_frames : int or None
+        How many the file holds; None as long as it is not written.
+
+    Raises
+    ------
+    ArgumentError
+        No file can be put there.
+    """
+
+    def __init__(
+        self, path: Path, *, overwrite: bool, on_note: Callable[[str], None], sources: tuple[Path, ...] = ()
+    ) -> None:
+        check_target(path, overwrite=overwrite, sources=sources)
+        self.n_frames: int | None = None
+        self._path, self._overwrite, self._on_note = path, overwrite, on_note
+        self._failure: Exception | None = None
+
+    def full(self) -> None:
+        """Note it."""
+        self._on_note(f"{self._path} is full at {MOST_BYTES / 1e6:g} MB: what came until now is written")
+
+    def deliver(self, page: str, n_frames: int) -> None:
+        """Write the file."""
+        with replacing(self._path, overwrite=self._overwrite) as part:
+            part.write_text(page, encoding="utf-8")
+        self.n_frames = n_frames
+
+    def failed(self, error: Exception) -> None:
+        """Keep it for `check`."""
+        self._failure = error
+
+    def check(self) -> None:
+        """Raise what went wrong, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+
+class ToBrowser:
+    """Sends a recording to the browser that asked for it.
+
+    Parameters
+    ----------
+    client : viser.ClientHandle
+    name : str
+        Of the file.
+    """
+
+    def __init__(self, client: Any, name: str) -> None:
+        self._client, self._name = client, name
+
+    def full(self) -> None:
+        """Show it."""
+        self._tell("The HTML recording is full", f"at {MOST_BYTES / 1e6:g} MB; what came until now is saved")
+
+    def deliver(self, page: str, _: int) -> None:
+        """Send the file."""
+        self._client.send_file_download(self._name, page.encode(), save_immediately=True)
+
+    def failed(self, error: Exception) -> None:
+        """Show it: what a browser cannot have is no reason to end a view."""
+        self._tell("Nothing is saved", str(error))
+
+    def _tell(self, title: str, text: str) -> None:
+        with suppress(Exception):  # who has left meanwhile
+            self._client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color="red")
+
+
+@dataclass(slots=True)
+class _Recording:
+    """What is being recorded, and how much of it has been counted."""
+
+    serializer: Any
+    receiver: Receiver
+    n_frames: int = 0
+    n_bytes: int = 0
+    n_messages: int = 0
+    n_buffers: int = 0
+
+    def count(self) -> None:
+        """Add what was drawn since this was called last; viser has no other way to tell it."""
+        messages, buffers = self.serializer._messages, self.serializer._binary_buffers  # noqa: SLF001
+        self.n_bytes += sum(_size(message) for _, message in messages[self.n_messages :])
+        self.n_bytes += sum(buffer.nbytes for buffer in buffers[self.n_buffers :])
+        self.n_messages, self.n_buffers = len(messages), len(buffers)
+
+    def finish(self) -> None:
+        """Make the page and deliver it."""
+        try:
+            self.receiver.deliver(str(self.serializer.as_html(dark_mode=True)), self.n_frames)
+        except Exception as error:  # noqa: BLE001  the receiver is to know
+            self.receiver.failed(error)
+
+
+class Recordings:
+    """Recordings that are being made, each of all that is drawn from its beginning to its end.
+
+    A page is made, and delivered, in a thread of its own: of a long recording that takes seconds, for which a live view
+    would stand still.
+
+    Parameters
+    ----------
+    serializer : callable
+        Returns what viser keeps from now on.
+    """
+
+    def __init__(self, serializer: Callable[[], Any]) -> None:
+        self._serializer = serializer
+        self._made: dict[Hashable, _Recording] = {}
+        self._threads: list[threading.Thread] = []
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._made
+
+    def n_bytes(self) -> dict[Hashable, int]:
+        """Return how much each holds."""
+        return {key: recording.n_bytes for key, recording in self._made.items()}
+
+    def begin(self, key: Hashable, receiver: Receiver) -> None:
+        """Begin a recording."""
+        self._made[key] = _Recording(self._serializer(), receiver)
+
+    def end(self, key: Hashable) -> None:
+        """End a recording and deliver it, where there is one."""
+        recording = self._made.pop(key, None)
+        if recording is not None:
+            thread = threading.Thread(target=recording.finish, name="ertis-html", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def drop(self, key: Hashable) -> None:
+        """End a recording that nobody wants any longer."""
+        recording = self._made.pop(key, None)
+        if recording is not None:
+            handler = recording.serializer._handler  # noqa: SLF001  viser would first make all of a page
+            with handler._record_lock:  # noqa: SLF001
+                handler._record_handles.remove(recording.serializer)  # noqa: SLF001
+
+    def add(self, *, frames: int) -> None:
+        """Count what was drawn, and how many new frames that was; end recordings that are full with it."""
+        for key, recording in [*self._made.items()]:
+            recording.n_frames += frames
+            recording.count()
+            if recording.n_bytes >= MOST_BYTES:
+                recording.receiver.full()
+                self.end(key)
+
+    def pass_time(self, time_s: float) -> None:
+        """Note how long what was drawn last has been shown."""
+        for recording in self._made.values():
+            recording.serializer.insert_sleep(time_s)
+
+    def wait(self) -> None:
+        """Wait until all that has ended is delivered."""
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+
+
+def _size(value: object) -> int:
+    """Return about how many bytes a message takes, but for arrays, which are kept apart."""
+    if isinstance(value, dict):
+        return sum(len(name) + _size(each) for name, each in value.items())
+    if isinstance(value, list | tuple):
+        return sum(_size(each) for each in value)
+    return len(value) if isinstance(value, bytes | str) else _PLAIN_BYTES

@@ -1,0 +1,110 @@
+"""Numbers that the page tells beside what is drawn."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final
+
+from ertis_numba.viewer._recordings import MOST_BYTES
+from ertis_numba.viewer._saving import time_of
+from ertis_numba.viewer._shapes import Drawn
+
+if TYPE_CHECKING:
+    from ertis_numba.viewer._film import Film
+    from ertis_numba.viewer._live import Live
+
+__all__ = ["Counts", "rows_of"]
+
+_RATE_S: Final = 2.0
+_COARSE_S: Final = 10.0
+_NONE: Final = "–"
+
+
+class Counts:
+    """What was drawn.
+
+    Attributes
+    ----------
+    shown : int
+        Frames with something new.
+    latency_s : float or None
+        From the emission to its being drawn.
+    """
+
+    def __init__(self) -> None:
+        self.shown = 0
+        self.latency_s: float | None = None
+        self._at_s: deque[float] = deque()
+
+    def count(self, now_s: float, latency_s: float | None) -> None:
+        """Note that something new was drawn."""
+        self.shown += 1
+        self.latency_s = latency_s
+        self._at_s.append(now_s)
+
+    @property
+    def rate_hz(self) -> float:
+        """Of late."""
+        now_s = time.monotonic()
+        while self._at_s and now_s - self._at_s[0] > _RATE_S:
+            self._at_s.popleft()
+        return len(self._at_s) / _RATE_S
+
+
+def rows_of(
+    source: "Live | Film",
+    sensors: Mapping[str, Drawn],
+    counts: Counts,
+    *,
+    paused: bool,
+    n_held: int,
+    n_bytes: int | None,
+) -> dict[str, tuple[str, str]]:
+    """Return what there is to tell, by name: what it is, and its value."""
+    latest = max(sensors.values(), key=lambda drawn: drawn.timestamp_ns, default=None)
+    captured = time_of(latest.timestamp_ns) if latest else ()
+    live = source.is_film is False
+    silent = live and bool(sensors) and all(each.overdue for each in sensors.values())
+    latency_s = None if silent else counts.latency_s  # which is of an image of long ago then
+    rows = {
+        "state": ("state", _state(source, sensors, paused=paused and live)),
+        "frames": ("frames shown", str(counts.shown)),
+        "sequence": ("measurement", _of_each(sensors, lambda drawn: str(drawn.sequence))),
+        "captured": ("captured", captured[0] if captured else _NONE),
+        "age": ("age", _of_each(sensors, lambda drawn: _age(drawn, source.clock_s))),
+        "rate": ("rate", f"{counts.rate_hz:.1f} Hz"),
+        "latency": ("capture to shown", _NONE if latency_s is None else f"{1e3 * latency_s:.0f} ms"),
+        "dropped": ("dropped, skipped", f"{source.dropped}, {source.skipped}"),
+        "points": ("points", str(sum(each.n_points for each in sensors.values()))),
+    }
+    if live:
+        rows["held"] = ("not shown, paused", str(n_held))
+    unplaced = [name for name, each in sensors.items() if each.pose is None]
+    if unplaced:
+        rows["unplaced"] = ("place not known", f"{', '.join(unplaced)}: not on the platform")
+    if n_bytes is not None:
+        rows["recording"] = ("HTML recording", f"{n_bytes / 1e6:.1f} MB, at most {MOST_BYTES / 1e6:g} MB")
+    return rows
+
+
+def _state(source: "Live | Film", sensors: Mapping[str, Drawn], *, paused: bool) -> str:
+    """Return the state of the source and, where a live one is connected, whether its sensors send."""
+    if paused:
+        return f"{source.state}, paused"
+    if source.is_film is True or not source.connected:
+        return source.state
+    if not sensors:
+        return "connected, no sensor sends"
+    return "all sensors overdue" if all(each.overdue for each in sensors.values()) else source.state
+
+
+def _age(drawn: Drawn, clock_s: float) -> str:
+    """Return how old what is shown of a sensor is."""
+    age_s = max(0.0, clock_s - drawn.time_s)
+    return (f"{age_s:.1f} s" if age_s < _COARSE_S else f"{age_s:.0f} s") + (" (overdue)" if drawn.overdue else "")
+
+
+def _of_each(sensors: Mapping[str, Drawn], told: Callable[[Drawn], str]) -> str:
+    """Return what is told of each sensor, with its name where there are several."""
+    several = len(sensors) > 1
+    return ", ".join(f"{name} {told(each)}" if several else told(each) for name, each in sensors.items()) or _NONE

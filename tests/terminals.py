@@ -1,0 +1,113 @@
+"""Commands in a pseudo terminal, and what somebody sees there."""
+
+import fcntl
+import os
+import re
+import struct
+import subprocess
+import sys
+import termios
+import time
+from contextlib import suppress
+
+from tests.pages import environment
+
+__all__ = ["Terminal", "seen"]
+
+PATIENCE_S = 60.0
+# What Ctrl-C is to reach has the terminal as its own.
+BEGIN = "import fcntl, termios; fcntl.ioctl(2, termios.TIOCSCTTY, 0)\n"
+
+
+class Terminal:
+    """Python code whose stderr is a terminal; its stdin is a pipe, and its stdout is the same terminal or a pipe."""
+
+    def __init__(self, code, place, *arguments, columns=100, piped=False, **variables):
+        self._columns, self._read_so_far = columns, b""
+        self._end, inner = os.openpty()
+        fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        kept = {name: value for name, value in environment(place).items() if name not in {"NO_COLOR", "COLUMNS"}}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", BEGIN + code, *map(str, arguments)],
+            cwd=place,
+            env=kept | {"TERM": "xterm"} | variables,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if piped else inner,
+            stderr=inner,
+            start_new_session=True,
+            text=True,
+        )
+        os.close(inner)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._process.kill()
+        self._process.communicate()
+        os.close(self._end)
+
+    def until(self, pattern):
+        """Read until this is shown."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not re.search(pattern, self.shown):
+            assert self._read(), self.shown
+            assert time.monotonic() < end_s, self.shown
+
+    def go_on(self):
+        """Let code that waits for a line read one."""
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+
+    def press(self, key):
+        os.write(self._end, key)
+
+    def end(self):
+        self._process.terminate()
+
+    def finish(self):
+        """Wait for its end; return the exit code, and stdout if that is a pipe."""
+        while self._read():
+            pass
+        told, _ = self._process.communicate(timeout=PATIENCE_S)
+        return self._process.returncode, told
+
+    @property
+    def shown(self):
+        return self._read_so_far.decode(errors="replace")
+
+    @property
+    def lines(self):
+        return seen(self.shown, self._columns)
+
+    def _read(self):
+        with suppress(OSError):  # which is how a terminal ends
+            octets = os.read(self._end, 65_536)
+            self._read_so_far += octets
+            return bool(octets)
+        return False
+
+
+def seen(shown, columns):
+    """Return the lines down to the last that is on the screen after all that was written to it, colours apart."""
+    lines, row, column = [""], 0, 0
+    for match in re.finditer(r"\x1b\[([?\d;]*)([A-Za-z])|.", shown, re.DOTALL):
+        character, (number, order) = match[0], match.groups()
+        if order == "A":
+            row -= int(number or 1)
+        elif order == "K":
+            lines[row] = "" if number == "2" else lines[row][:column]
+        elif order:
+            assert order in {"m", "h", "l"}, character
+        elif character == "\r":
+            column = 0
+        elif character == "\n":
+            row += 1
+        else:
+            if column == columns:
+                row, column = row + 1, 0
+            lines += [""] * (row + 1 - len(lines))
+            lines[row] = lines[row][:column].ljust(column) + character + lines[row][column + 1 :]
+            column += 1
+        lines += [""] * (row + 1 - len(lines))
+    return "\n".join(line.rstrip() for line in lines).rstrip("\n").split("\n")

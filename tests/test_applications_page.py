@@ -1,0 +1,40 @@
+"""What docs/applications.md says runs, word by word but for ports; the emulated sensor hears two measurements only."""
+
+import re
+import subprocess
+import sys
+
+from tests import test_network_page as network
+from tests.pages import environment, page, python_in, run
+from tests.publishing import Publisher, cloud
+
+PAGE = page("applications")
+place, platform, ports = network.place, network.platform, network.ports
+
+
+def test_loop(tmp_path):
+    (code,) = python_in(PAGE)
+    clouds = [cloud(number, position_m=[[0.3, 0.4, 0], [3, 0, 0]]) for number in range(6)]
+    with Publisher() as publisher, publisher.playing(clouds):
+        code = code.replace("tcp://127.0.0.1:5602", publisher.address)
+        told = run(tmp_path, sys.executable, "-W", "error", "-c", code).stdout.splitlines()
+    numbers = [int(re.fullmatch(r"#(\d): nearest at 0\.50 m, 2 points", line)[1]) for line in told]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] >= 3
+    assert max(numbers[:-1], default=0) < 3
+
+
+def test_commands(place, ports, platform):
+    """Nothing is near: the vehicle may go."""
+    lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
+    assert [line.split()[1] for line in lines] == ["emulate", "serve", "capture", "examples/2_safety_stop.py"]
+    *commands, example = lines
+    with network.Shell(ports, platform) as shell:
+        for command in commands:
+            shell.run(command.removeprefix("ertis "))
+        words = [sys.executable, "-u", *example.replace("5602", ports["5602"]).split()[1:]]
+        with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
+            spoken = iter(process.stdout.readline, "")
+            assert next(spoken) == "stop\n"  # until there is an image
+            assert "go\n" in spoken  # reads up to it
+            process.terminate()

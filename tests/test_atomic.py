@@ -1,0 +1,32 @@
+"""Files appear complete or not at all, and what went wrong is told by the name that they were to have."""
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from ertis_numba.atomic import replacing
+
+
+def test_nothing_is_left_of_what_fails(tmp_path):
+    def half(part):
+        part.write_text("half")
+        raise OSError(errno.EIO, "wanted", str(part))
+
+    with pytest.raises(OSError, match="wanted") as caught, replacing(tmp_path / "a.txt") as part:
+        half(part)
+    assert caught.value.filename == str(tmp_path / "a.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_came_first_is_told_where_nothing_can_be_removed(tmp_path, monkeypatch):
+    """As in a file system that has become read-only."""
+
+    def refuse(path, *, missing_ok=False):
+        assert missing_ok
+        raise OSError(errno.EROFS, "cannot be removed", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(OSError, match="cannot be written") as caught, replacing(tmp_path / "a.txt") as part:
+        raise OSError(errno.EROFS, "cannot be written", str(part))
+    assert caught.value.filename == str(tmp_path / "a.txt")

@@ -1,0 +1,43 @@
+"""``ertis bench network --only cluster`` runs, in its short form, and says what its table needs."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from ertis_bench.network import figures
+from ertis_cli.main import cli
+
+processing = figures.processing
+
+
+def only_on_the_cluster(folder, duration_s, seed, *, rate_hz, scheduler, **options):
+    """Make images on the cluster at the lower rate; of all else, which takes long, other tests know."""
+    if scheduler is not None and rate_hz == 10.0:
+        return processing(folder, duration_s, seed, rate_hz=rate_hz, scheduler=scheduler, **options)
+    published = round(duration_s * (rate_hz if scheduler is None else rate_hz / 2))
+    return {"p50_ms": 1.0, "p99_ms": 2.0, "sent": round(duration_s * rate_hz), "published": published}
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    monkeypatch.setattr(figures, "_WARM_UP_S", 0.4)
+    monkeypatch.setattr(figures, "processing", only_on_the_cluster)
+
+
+def test_images_of_a_cluster_are_measured_and_written(tmp_path):
+    target = tmp_path / "page.md"
+    target.write_text("<!-- ertis bench network -->\nold\n<!-- /ertis bench network -->\n", "utf-8")
+    options = ["--duration", "1", "--json", "--quiet", "--folder", str(tmp_path), "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "network", "--only", "cluster", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    (row,) = json.loads(done.stdout)["rows"]
+    assert 0 < row["received"] == row["published"] + sum(row["dropped"].values())
+    assert row["wrong"] == row["twice"] == row["unbalanced"] == row["uncounted"] == row["untold"] == 0
+    assert "workers of the cluster at tcp://" in row["choice"]
+    assert row["added_p50_ms"] == row["p50_ms"] - 1.0
+    assert row["added_p99_ms"] == row["p99_ms"] - 2.0
+    assert (row["offered_hz"], row["most_hz"], row["most_here_hz"]) == (40.0, 20.0, 40.0)
+    text = target.read_text("utf-8")
+    assert "| a dask cluster on this machine, 2 workers, 90 directions, 4 × 10 Hz for 1 s |" in text
+    assert "; 20 images/s of 40 that were offered, 40 by workers of its own. Of a core: central node " in text
+    assert "; the cluster's scheduler and workers are not counted |" in text

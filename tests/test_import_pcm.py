@@ -1,0 +1,315 @@
+"""WAV and Acoular's files to recordings: every kind of number, emissions in a row, and what is refused."""
+
+import json
+import tracemalloc
+import wave
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+from scipy.io import wavfile
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.geometry import microphones
+from ertis_numba.interop import PcmReader
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Array, Call, Processing, Recording, Settings
+from ertis_numba.storage import open_recording, write_recording
+from ertis_numba.verification import error_db
+from tests.rings import PCM, RATE_HZ, RING, heard
+
+
+@pytest.fixture(scope="module")
+def measurement():
+    return heard(PCM)
+
+
+# ---- WAV ------------------------------------------------------------------------------------------
+
+
+def write_wav(path, numbers, rate_hz=RATE_HZ):
+    wavfile.write(path, rate_hz, numbers)
+    return path
+
+
+def numbers(n_samples=3_000, n_channels=8, seed=1):
+    return np.clip(0.3 * np.random.default_rng(seed).standard_normal((n_samples, n_channels)), -1, 1 - 2.0**-15)
+
+
+KINDS = {
+    # what is in the file, what the recording has, by how much they may differ
+    "8 bits": (lambda x: np.rint(x * 128 + 128).clip(0, 255).astype(np.uint8), "int16", 2.0**-7),
+    "16 bits": (lambda x: np.rint(x * 2**15).astype(np.int16), "int16", 2.0**-16),
+    "32 bits": (lambda x: np.rint(x * 2.0**31).astype(np.int32), "float32", 2.0**-24),
+    "float": (lambda x: x.astype(np.float32), "float32", 2.0**-24),
+    "64 bits": (lambda x: (x * 2.0**63 * (1 - 2.0**-30)).astype(np.int64), "float32", 2.0**-24),
+    "double": (lambda x: x, "float32", 2.0**-24),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wav_of_every_kind(tmp_path, kind):
+    made, encoding, error = KINDS[kind]
+    given = numbers()
+    reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", made(given)), PCM)
+    (measurement,) = reader
+    assert reader.settings.recording == Recording(sample_rate_hz=RATE_HZ, n_samples=3_000, encoding=encoding)
+    assert np.abs(measurement.words / reader.settings.recording.full_scale - given).max() <= error
+
+
+def test_wav_of_24_bits_keeps_them_all(tmp_path):
+    given = np.random.default_rng(1).integers(-(2**23), 2**23, (500, 8))
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setnchannels(8)
+        file.setsampwidth(3)
+        file.setframerate(RATE_HZ)
+        file.writeframes(b"".join(int(x).to_bytes(3, "little", signed=True) for x in given.ravel()))
+    (measurement,) = ertis.open_pcm(tmp_path / "a.wav", PCM.replace(processing=Processing(range_m=(0.1, 0.2))))
+    assert (measurement.words * 2.0**23 == given).all()
+
+
+def test_one_channel(tmp_path):
+    one = PCM.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
+    (measurement,) = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()[:, 0].astype(np.float32)), one)
+    assert measurement.words.shape == (3_000, 1)
+    Pipeline(measurement.settings).process(measurement)
+
+
+def test_emissions_in_a_row(tmp_path):
+    given = (numbers(10_000) * 2**15).astype(np.int16)
+    paths = [write_wav(tmp_path / f"{name}.wav", given[: 10_000 - cut]) for name, cut in (("a", 0), ("b", 4_000))]
+    reader = ertis.open_pcm(paths, PCM, skip_s=1_000 / RATE_HZ, length_s=2_500 / RATE_HZ)
+    measurements = list(reader)
+    assert len(reader) == len(measurements) == 5
+    assert [item.stamp.sequence for item in measurements] == [0, 1, 2, 3, 4]
+    starts = [1_000, 3_500, 6_000, 1_000, 3_500]
+    assert all((m.words == given[s : s + 2_500]).all() for m, s in zip(measurements, starts, strict=True))
+    assert reader.rest_s == pytest.approx(1_500 / RATE_HZ)
+
+
+def test_periods_of_no_whole_number_of_samples_do_not_drift(tmp_path):
+    """100 emissions, each a seventieth of a second after the other: a click marks them."""
+    given = np.zeros((RATE_HZ * 100 // 70, 8), np.int16)
+    given[np.rint(np.arange(100) * RATE_HZ / 70).astype(int)] = 1_000
+    reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", given), PCM, length_s=1 / 70, start_ns=5 * 10**18)
+    measurements = list(reader)
+    assert len(measurements) == len(reader) >= 99
+    assert all(item.words[0, 0] == 1_000 for item in measurements)
+    assert measurements[70].stamp.timestamp_ns == 5 * 10**18 + 10**9
+
+
+def test_a_disabled_channel_may_hold_no_numbers(tmp_path):
+    given = numbers().astype(np.float32)
+    given[100:, 3] = np.nan
+    settings = PCM.replace(array=RING.replace(enabled=tuple(channel != 3 for channel in range(8))))
+    (measurement,) = ertis.open_pcm(write_wav(tmp_path / "a.wav", given), settings)
+    assert np.array_equal(measurement.words, np.where(np.isnan(given), 0, given))
+
+
+def test_files_of_other_lengths_are_one_measurement_each(tmp_path):
+    paths = [write_wav(tmp_path / f"{n}.wav", numbers(n)) for n in (6_000, 2_800)]
+    reader = ertis.open_pcm(paths, PCM)
+    assert [len(item.words) for item in reader] == [2_800, 2_800]
+    assert reader.rest_s == pytest.approx(3_200 / RATE_HZ)
+
+
+def test_large_files_stay_on_the_disk(tmp_path):
+    path = write_wav(tmp_path / "a.wav", (numbers(500_000) * 2**15).astype(np.int16))
+    next(iter(ertis.open_pcm(path, PCM)))  # loads what reads WAV
+    tracemalloc.start()
+    try:
+        n_samples = sum(len(item.words) for item in ertis.open_pcm(path, PCM, length_s=0.02))
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert n_samples == 499_200
+    assert most < path.stat().st_size / 4
+
+
+@pytest.mark.parametrize("rate_hz", [110_000, 192_000, 500_000, 1_000_000])
+@pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=8_000.0, stop_frequency_hz=3_000.0)])
+def test_ranges_suit_rate_and_call(tmp_path, rate_hz, call):
+    """What the default, made for 4.5 MHz, would lose between two ranges."""
+    settings = Settings(array=RING, call=call)
+    reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers(rate_hz // 50), rate_hz), settings)
+    made = reader.settings
+    band_hz = call.high_frequency_hz - call.low_frequency_hz
+    assert 1.79 * band_hz < made.output_rate_hz < 4 * band_hz
+    assert made.processing.range_m == (0.5, 2.6)
+    Pipeline(made).process(next(iter(reader)))
+
+
+def test_what_was_asked_for_stays(tmp_path):
+    path = write_wav(tmp_path / "a.wav", numbers())
+    asked = PCM.processing.replace(range_decimation=2, range_m=(0.2, 1.0))
+    assert ertis.open_pcm(path, PCM.replace(processing=asked)).settings.processing == asked
+
+
+REFUSED = {
+    "no file": (lambda folder: folder / "none.wav", {}, "No such file"),
+    "other kind": (lambda folder: _text(folder / "a.wav"), {}, r"is no WAV file, it begins with b'noth'; give WAV"),
+    "cut short": (lambda folder: _cut(folder / "a.wav"), {}, r"has no samples; save it again as WAV"),
+    "channels": (
+        lambda folder: write_wav(folder / "a.wav", numbers(n_channels=7)),
+        {},
+        r"has 7 channels, array 'ring' has 8; give the layout of its array",
+    ),
+    "slow": (
+        lambda folder: write_wav(folder / "a.wav", numbers(), 44_100),
+        {},
+        r"has 44100 Hz, too few for a call that reaches 50000 Hz; give the call that was emitted",
+    ),
+    "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"skip less \(--skip\)"),
+    "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"give a shorter --length"),
+    "nan": (
+        lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, np.nan, numbers()).astype("f4")),
+        {},
+        r"holds nan at sample 0 of channel 3; give finite numbers",
+    ),
+    "two rates": (
+        lambda folder: [write_wav(folder / "a.wav", numbers()), write_wav(folder / "b.wav", numbers(), 96_000)],
+        {},
+        r"b.wav has 96000 Hz, a.wav 192000; import each by itself",
+    ),
+    "none": (lambda _: [], {}, "no file of PCM is given"),
+    "half of it": (
+        lambda folder: _changed(folder / "a.wav", lambda content: content[: len(content) // 2]),
+        {},
+        r"is cut short: it has \d+ bytes of samples, its header says 192000; copy it again",
+    ),
+    "never finished": (
+        lambda folder: _changed(folder / "a.wav", lambda content: _with_data_size(content, 0)),
+        {},
+        r"has a header that was never finished",
+    ),
+    "no channels": (
+        lambda folder: _changed(folder / "a.wav", lambda content: content[:22] + b"\0\0" + content[24:]),
+        {},
+        r"cannot be read .*; save it again as WAV",
+    ),
+    "shorter than the call": (
+        lambda folder: write_wav(folder / "a.wav", numbers()),
+        {"length_s": 1e-3},
+        r"has 1 ms, the call alone lasts 2.5 ms; give a longer --length",
+    ),
+}
+
+
+def _text(path):
+    path.write_text("nothing of the kind")
+    return path
+
+
+def _changed(path, change):
+    write_wav(path, numbers().astype(np.float64))
+    path.write_bytes(change(path.read_bytes()))
+    return path
+
+
+def _with_data_size(content, size):
+    place = content.index(b"data") + 4
+    return content[:place] + size.to_bytes(4, "little") + content[place + 4 :]
+
+
+def _cut(path):
+    write_wav(path, numbers())
+    path.write_bytes(path.read_bytes()[:30])
+    return path
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused(tmp_path, name):
+    given, options, message = REFUSED[name]
+    with pytest.raises((DataError, ArgumentError), match=message):
+        list(ertis.open_pcm(given(tmp_path), PCM, **options))
+
+
+def test_wav_alone_says_too_little(tmp_path):
+    with pytest.raises(ArgumentError, match=r"says nothing of its array and call; give settings"):
+        ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
+
+
+# ---- Acoular --------------------------------------------------------------------------------------
+
+
+def test_what_was_exported_comes_back(tmp_path):
+    """The image of exported signals is that of the recording, but for the low pass's ripple."""
+    settings = PCM.replace(
+        array=RING.replace(gain=(1.0, 2.0) * 4, enabled=(True, True, True, False) * 2),
+        recording=Recording(n_samples=70_000),
+        processing=PCM.processing.replace(range_decimation=100),
+    )
+    given = heard(settings)
+    ertis.export(tmp_path / "signals.h5", [given], file_format="acoular")
+    reader = ertis.open_pcm(tmp_path / "signals.h5")
+    (measurement,) = reader
+    assert isinstance(reader, PcmReader)
+    assert len(microphones(reader.settings.array).enabled) == 6
+    assert reader.settings.call == settings.call
+    image = Pipeline(reader.settings, max_error_db="fine").process(measurement)
+    wanted = Pipeline(settings, max_error_db="fine").process(given)
+    assert image.range_m == pytest.approx(wanted.range_m)
+    assert error_db(image.energy, wanted.energy) < -40
+
+
+def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
+    given = numbers().astype(np.float32)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_data"] = given
+        file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
+    (measurement,) = ertis.open_pcm(tmp_path / "a.h5", PCM)
+    assert np.array_equal(measurement.words, given)
+    with pytest.raises(ArgumentError, match="give settings"):
+        ertis.open_pcm(tmp_path / "a.h5")
+
+
+def test_other_hdf5_is_refused(tmp_path, measurement):
+    path = write_recording(tmp_path / "rec.h5", [measurement])
+    with pytest.raises(DataError, match=r"holds no time_data with a sample_freq; give a file of Acoular"):
+        ertis.open_pcm(path, PCM)
+
+
+# ---- commands -------------------------------------------------------------------------------------
+
+
+def command(*arguments):
+    done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def test_from_wav_to_reflectors(tmp_path, measurement):
+    write_wav(tmp_path / "echoes.wav", measurement.words)
+    (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
+    command("import", tmp_path / "echoes.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
+    command("process", tmp_path / "rec.h5", "-o", tmp_path / "img.h5")
+    first, second = json.loads(command("peaks", tmp_path / "img.h5", "--top", "2", "--json"))["peaks"]
+    assert first["azimuth_deg"] == pytest.approx(24.0, abs=0.2)
+    assert second["range_m"] == pytest.approx(1.6, abs=1e-3)
+
+
+def test_times_and_what_hinders_are_told(tmp_path):
+    write_wav(tmp_path / "a.wav", numbers(6_100).astype(np.float32))
+    (tmp_path / "ring.toml").write_text(
+        PCM.replace(recording=Recording(), processing=PCM.processing.replace(range_m=(0.5, 50.0))).to_toml()
+    )
+    arguments = ("import", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
+    more = ("--length", 0.015625, "--start", "2026-05-04T14:30:00.5+0200")
+    done = CliRunner().invoke(cli, [str(argument) for argument in (*arguments, *more)])
+    assert done.exit_code == 0, done.output
+    assert "note: 0.0005208 s at the ends of files are left out" in done.stderr
+    assert "note: it cannot be processed as it is: processing.range_m ends at 50 m, but the record" in done.stderr
+    with open_recording(tmp_path / "rec.h5") as recording:
+        times_s = [stamp.timestamp_ns / 1e9 for stamp in recording.stamps()]
+    assert times_s == pytest.approx([1_777_897_800.5, 1_777_897_800.515625])
+
+
+def test_options_of_pcm_are_refused_for_words(tmp_path):
+    (tmp_path / "a.bin").write_bytes(bytes(4 * 65_536))
+    for option, value in (("--skip", "1"), ("--length", "1"), ("--start", "2026-05-04T12:30:00")):
+        done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), option, value])
+        assert done.exit_code == 2
+        assert f"{option} is for PCM (.wav, .h5); leave it out" in done.stderr

@@ -1,0 +1,186 @@
+"""``ertis view``: what it refuses, what it writes and what its page of the guide says."""
+
+import json
+import os
+import re
+import signal
+import socket
+import sys
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli import view
+from ertis_cli.main import cli
+
+from ertis_numba.storage import write_energyscapes
+from ertis_numba.viewer import Scene, View
+from ertis_numba.viewer._recordings import MOST_BYTES
+from tests.pages import ROOT, commands_in, run, run_here
+from tests.publishing import Publisher
+from tests.publishing import image as published
+from tests.views import stamped
+
+BIND = socket.socket.bind
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("missing.h5",), "missing.h5"),
+        (("127.0.0.1:5602",), "'127.0.0.1:5602' is no file; give tcp://127.0.0.1:5602, if that is where"),
+        (("tcp:127.0.0.1:5602",), "'tcp:127.0.0.1:5602' is no file; give tcp://127.0.0.1:5602, if that is where"),
+        (("IMG", "--save-html", "p.png"), "page format '.png' is unknown; known are .html, .htm"),
+        (("IMG", "--sensor", "back"), "back"),
+        (("IMG", "--decay", "99"), "--decay is 99; give"),
+        (("IMG", "--range", "5:1"), "--range runs from 5 to 1"),
+        (("IMG", "--key", "viewer"), "--key is for an address; leave it out with a file that is shown"),
+        (("IMG", "--server-key", "key"), "--server-key is for an address"),
+        (("IMG", "--threshold", "5"), "--threshold is 5; give a number from -60 to 0"),
+        (("IMG", "--save-html", "OTHER"), "other.html exists; give another name, or ask to overwrite it (--force)"),
+        (("IMG", "--save-html", "IMG", "--force"), "img.h5 is the input itself; give another name"),
+        (("IMG", "--save-html", "p.html", "--duration", "1"), "--duration is for an address or a file that is shown"),
+        (("IMG", "--save-html", "p.html", "--loop"), "--loop is for a file that is shown; leave it out with a file"),
+        (("IMG", "--save-html", "p.html", "--host", "0.0.0.0"), "--host is for an address or a file that is shown"),
+        (("IMG", "--save-html", "p.html", "--port", "1"), "--port is for"),
+        (("IMG", "--save-html", "p.html", "--no-open"), "--open is for"),
+        (("IMG", "--force"), "--force is for --save-html; leave it out"),
+        (("IMG", "--duration", "0"), "--duration is 0; give a number above 0"),
+        (("tcp://0.0.0.0:5602",), "keys"),
+        (("tcp://127.0.0.1:5602", "--loop"), "--loop is for a file that is shown; leave it out with an address"),
+        (
+            ("tcp://127.0.0.1:5602", "--device", "cpu"),
+            "--device is for a file that is shown or a file that --save-html",
+        ),
+    ],
+)
+def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, told):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    (tmp_path / "other.html").touch()
+    named = {"IMG": path, "OTHER": tmp_path / "other.html", "p.html": tmp_path / "p.html", "p.png": tmp_path / "p.png"}
+    before = {each: each.read_bytes() for each in tmp_path.iterdir()}
+    done = CliRunner().invoke(cli, ["view", *(str(named.get(word, word)) for word in arguments)])
+    assert done.exit_code != 0
+    assert told in f"{done.stderr} {done.exception}"
+    assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
+
+
+def test_defaults_of_a_settings_file_are_for_those_who_have_use_for_them(tmp_path, monkeypatch):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    config = tmp_path / "config.toml"
+    config.write_text('[view]\nhost = "0.0.0.0"\nloop = true\n')
+    listened = []
+    monkeypatch.setattr(socket.socket, "bind", lambda self, address: listened.append(address) or BIND(self, address))
+    done = CliRunner().invoke(
+        cli, ["--config", str(config), "view", str(path), "--save-html", str(tmp_path / "p.html")]
+    )
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    assert {host for host, *_ in listened} == {"127.0.0.1"}
+
+
+def test_without_viser_there_is_a_line_that_says_what_to_install(tmp_path, monkeypatch):
+    for name in ("_view", "_page", "_space"):
+        monkeypatch.delitem(sys.modules, f"ertis_numba.viewer.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    done = CliRunner().invoke(cli, ["view", str(path)])
+    assert done.exit_code == 1
+    assert done.stderr.splitlines() == ["ertis: error: viser is not installed; pip install 'ertis-numba[view]'"]
+
+
+def test_a_recording_as_a_page_of_its_own(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(3))
+    page = tmp_path / "page.html"
+    done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page), "--json"])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    assert done.stderr.splitlines() == [f"{page}: 3 frames of {path}"]
+    assert json.loads(done.stdout) == {"event": "recorded", "source": str(path), "output": str(page), "frames": 3}
+    text = page.read_text()
+    assert "__VISER_EMBED_DATA__" in text
+    assert len(text) > 500_000
+
+
+def test_a_live_view_as_a_page_of_its_own(tmp_path):
+    page = tmp_path / "page.html"
+    with Publisher() as publisher, publisher.playing([published(number) for number in range(3)]):
+        command = f"view {publisher.address} --save-html {page} --duration 1.5 --port 0 --no-open --json"
+        done = CliRunner().invoke(cli, command.split())
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    viewing, recorded = map(json.loads, done.stdout.splitlines())
+    assert (viewing["event"], viewing["source"]) == ("viewing", publisher.address)
+    assert (recorded["event"], recorded["output"]) == ("recorded", str(page))
+    assert 1 <= recorded["frames"] <= 3
+    assert page.stat().st_size > 500_000
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_page_that_is_interrupted_is_not_written(tmp_path, monkeypatch, number):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(3))
+    page = tmp_path / "page.html"
+    draw = Scene.draw
+
+    def interrupted(*arguments):
+        os.kill(os.getpid(), number)
+        return draw(*arguments)
+
+    monkeypatch.setattr(Scene, "draw", interrupted)
+    done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page)])
+    assert done.exit_code == 128 + number, (done.stderr, done.exception)
+    assert "frames of" not in done.stderr
+    assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
+
+
+def test_who_interrupts_the_compiler_is_told_that_it_ends_first(tmp_path, monkeypatch):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(3))
+    ended = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+
+    def compiling(_):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)  # an echo of the first
+        assert ended == []
+        monkeypatch.setattr(view, "_TWICE_S", -1.0)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert ended == [128 + signal.SIGINT]  # at once: an exception would break in the compiler
+
+    monkeypatch.setattr(View, "prepare", compiling)
+    done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(tmp_path / "page.html")])
+    assert done.exit_code == 128 + signal.SIGINT, (done.stderr, done.exception)
+    assert done.stderr.splitlines()[0] == "ending when that is done; Ctrl-C again ends at once"
+    assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
+
+
+def test_a_live_view_without_images_is_no_success(tmp_path):
+    page = tmp_path / "page.html"
+    with Publisher() as publisher, publisher.playing([]):
+        command = f"view {publisher.address} --save-html {page} --duration 0.5 --port 0 --no-open"
+        done = CliRunner().invoke(cli, command.split())
+    assert done.exit_code == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith(f"no image of {publisher.address} was shown, and {page} is not written; see that sensors send")
+    assert not page.exists()
+
+
+def test_the_page_on_the_view(tmp_path):
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    write_energyscapes(tmp_path / "IMG.h5", stamped(3))
+    text = (ROOT / "docs" / "view.md").read_text()
+    commands = [command for command in commands_in(text) if command.startswith("view ")]
+    assert len(commands) == 4
+    with Publisher() as publisher, publisher.playing([]):
+        for command in commands:
+            words = command.replace("tcp://127.0.0.1:5602", publisher.address)
+            if "--save-html" in words:
+                run_here(tmp_path, words)
+            else:
+                told = json.loads(run_here(tmp_path, f"{words} --port 0 --no-open --json --duration 0.2"))
+                assert told["source"] == words.split()[1]
+    assert (tmp_path / "PAGE.html").stat().st_size > 500_000
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    done = run(tmp_path, sys.executable, "-W", "error", "-c", code)
+    assert done.stdout.startswith("http://127.0.0.1:")
+
+
+def test_the_limit_of_recordings_is_the_one_that_is_told():
+    told = f"at most {MOST_BYTES / 1e6:g} MB"
+    assert told in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
+    assert told in " ".join((ROOT / "docs" / "view.md").read_text().split())

@@ -1,0 +1,233 @@
+"""Images as they come of a central node: which are shown, for how long, and how old they are said to be."""
+
+import itertools
+import time
+
+import pytest
+
+from ertis_numba.errors import RefusedError
+from ertis_numba.network.messages import Refused
+from ertis_numba.network.status import SensorStatus
+from ertis_numba.viewer import Choices, Live, Pose, View, _live
+from ertis_numba.viewer._page import Order
+from tests.publishing import Publisher, status
+from tests.publishing import image as published
+from tests.views import TABLE, Source, settled, spot, taken, wait_for
+
+
+def test_the_latest_of_each_sensor_is_shown_and_others_are_counted():
+    sent = [published(number, sensor=name) for number in range(5) for name in ("front", "left")]
+    with Publisher() as publisher, publisher.playing(sent), Live(publisher.address) as live:
+        wait_for(lambda: live.skipped == len(sent) - 2)  # all have come
+        shown = wait_for(live.take)
+        assert sorted((each.image.stamp.sensor, each.image.stamp.sequence) for each in shown) == [
+            ("front", 4),
+            ("left", 4),
+        ]
+        assert (live.skipped, live.dropped, live.take()) == (8, 0, [])
+        assert shown[0].pose.translation_m == Publisher.translation_m
+        assert live.latency_s(shown) == pytest.approx(time.time() - 1_700_000_000.4, abs=5)
+
+
+def view_of(source, **choices):
+    return View(source, port=0, choices=Choices(**choices))
+
+
+def test_what_fades_is_drawn_again_though_nothing_comes():
+    source = Source()
+    source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
+    with view_of(source, decay_s=0.5) as view:
+        points = []
+        for clock_s in (100.0, 100.3, 100.6):
+            source.clock_s = clock_s
+            settled(view)
+            points.append(view._frame.sensors["front"])  # noqa: SLF001  what the page was given
+        assert [len(each.position_m) for each in points] == [1, 1, 0]
+        assert [each.share_left.tolist() for each in points[:2]] == [[1.0], pytest.approx([0.4])]
+        assert view.shown == 1
+
+
+def test_a_sensor_that_is_silent_is_seen_to_be():
+    source = Source()
+    poses = {"a": Pose((0.0, 0.3, 0.0)), "b": Pose((0.0, -0.3, 0.0))}
+    source.waiting = [taken(spot(0, 2.0, sensor=name), pose, 100.0, 0.1) for name, pose in poses.items()]
+    with view_of(source) as view:
+        assert settled(view)["age"] == "a 0.0 s, b 0.0 s"
+        assert view._frame.fused is not None  # noqa: SLF001
+        source.clock_s = 3700.0
+        source.waiting = [taken(spot(0, 2.0, sensor="a"), poses["a"], 3699.8, 0.1)]
+        assert settled(view)["age"] == "a 0.2 s, b 3600 s (overdue)"
+        frame = view._frame  # noqa: SLF001
+        assert frame.fused is None
+        assert frame.sensors["b"].picture.sum() < frame.sensors["a"].picture.sum()
+        assert (frame.sensors["b"].colours < TABLE.max()).all()
+        labels = {name: shown.label for name, shown in view._page._shown.items()}  # noqa: SLF001
+        assert labels == {"a": "a", "b": "b (overdue)"}
+        source.clock_s = 3702.0  # now both are silent
+        assert settled(view)["age"] == "a 2.2 s (overdue), b 3602 s (overdue)"
+        source.waiting = [taken(spot(0, 2.0, sensor="b"), poses["b"], 3702.0, 0.1)]
+        assert settled(view)["age"] == "a 2.2 s (overdue), b 0.0 s"
+
+
+def test_what_a_paused_view_does_not_show_is_counted():
+    source = Source()
+
+    def send(number):
+        source.clock_s = 100 + number / 10
+        source.waiting = [taken(spot(0, 2.0, sequence=number), time_s=source.clock_s, interval_s=0.1)]
+
+    with view_of(source) as view:
+        send(0)
+        assert settled(view)["held"] == "0"
+        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
+        settled(view)
+        for number in range(1, 25):
+            send(number)
+            wait_for(lambda: view.run(duration_s=0.02) or not source.waiting)
+        told = settled(view)
+        assert (told["held"], told["frames"], told["sequence"]) == ("24", "1", "0")
+        assert (told["state"], told["age"]) == ("live, paused", "2.4 s")
+        assert not view._frame.sensors["front"].overdue  # noqa: SLF001  a picture that is held stays as it is
+        view._orders.put(Order("step", 1))  # noqa: SLF001
+        settled(view)
+        send(25)
+        told = settled(view)
+        assert (told["held"], told["frames"], told["sequence"]) == ("24", "2", "25")
+        view._orders.put(Order("play"))  # noqa: SLF001
+        settled(view)
+        send(26)
+        told = settled(view)
+        assert (told["held"], told["sequence"], told["state"]) == ("24", "26", "live")
+        assert source.received == view.shown + 24
+
+
+def test_the_usual_interval_of_a_sensor_is_that_of_its_arrivals():
+    sent = [published(number) for number in range(5)]
+    with Publisher() as publisher, publisher.playing(sent), Live(publisher.address) as live:
+        wait_for(lambda: live.received == len(sent))
+        (shown,) = wait_for(live.take)
+        assert 0 < shown.interval_s < live.clock_s - shown.time_s + 60
+        assert shown.time_s <= live.clock_s
+
+
+def test_measurements_have_the_names_of_their_sensors_in_the_order_of_the_pictures():
+    source = Source()
+    with view_of(source) as view:
+        for number, name in enumerate(("right", "front", "left")):  # as they come
+            source.waiting = [taken(spot(0, 2.0, sensor=name, sequence=7 + number), time_s=100.0)]
+            told = settled(view)
+        assert told["sequence"] == "front 8, left 9, right 7"
+        shown = view._page._shown  # noqa: SLF001
+        assert sorted(shown, key=lambda name: shown[name].order) == ["front", "left", "right"]
+
+
+def test_the_state_says_whether_sensors_send():
+    source = Source()
+    source.latency_s = lambda _: 0.025
+    with view_of(source) as view:
+        assert settled(view)["state"] == "connected, no sensor sends"
+        source.waiting = [taken(spot(0, 2.0, sensor=name), time_s=100.0, interval_s=0.1) for name in "ab"]
+        told = settled(view)
+        assert (told["state"], told["latency"]) == ("live", "25 ms")
+        source.clock_s = 105.0
+        source.waiting = [taken(spot(0, 2.0, sensor="a"), time_s=105.0, interval_s=0.1)]
+        assert settled(view)["state"] == "live"
+        source.clock_s = 110.0
+        told = settled(view)
+        assert (told["state"], told["latency"]) == ("all sensors overdue", "–")
+        source.connected, source.state = False, "waiting for the central node"
+        assert settled(view)["state"] == "waiting for the central node"
+
+
+def notes_of(live):
+    """What is told next, if anything."""
+    return wait_for(live.notes)
+
+
+def test_that_nobody_answers_is_told_once(monkeypatch):
+    monkeypatch.setattr(_live, "_SOON_S", 0.2)
+    with Publisher() as publisher:
+        address = publisher.address
+    with Live(address) as live:
+        assert live.notes() == []
+        assert notes_of(live) == [f"no publisher at {address} yet; is 'ertis serve' running?"]
+        assert live.notes() == []
+        with Publisher(address=address) as publisher, publisher.playing([published(0)]):
+            wait_for(live.take)
+            assert notes_of(live) == ["connected"]
+
+
+def test_sensors_that_there_are_not_are_told(monkeypatch):
+    told = status(sensors={name: SensorStatus() for name in ("left", "front")})
+    notes = []
+    statuses = itertools.takewhile(lambda _: len(notes) < 2, itertools.repeat(told, 20_000))
+    with Publisher() as publisher, Live(publisher.address, sensors=["front", "nope"]) as live:
+        with publisher.playing(statuses):
+            wait_for(lambda: notes.extend(live.notes()) or notes)
+            monkeypatch.setattr(_live, "_SOON_S", 0.0)
+            wait_for(lambda: notes.extend(live.notes()) or len(notes) > 1)
+        assert notes == ["connected", "no sensor 'nope' yet; there are front, left"]
+        assert live.received == 0
+
+
+def test_a_refusal_is_told_once():
+    """As an error, where this looks for applications at the port of sensors."""
+    with Publisher(answers=False) as publisher, Live(publisher.address) as live:
+        notes, failed = [], []
+
+        def refuse():
+            publisher.tell_all(Refused(code="role", reason="this is where sensors send to"))
+            notes.extend(live.notes())
+            try:
+                live.take()
+            except RefusedError as error:
+                failed.append(str(error))
+            return failed
+
+        publisher.pump(refuse)
+        assert failed == [f"{publisher.address}: this is where sensors send to"]
+        assert notes + live.notes() == []
+
+
+def come(view, source, number, *names, clock_s, moment=None):
+    """Let images of some sensors, of one moment, come."""
+    source.clock_s = clock_s
+    emitted_ns = round(1e18 + 0.2e9 * (number if moment is None else moment))
+    source.waiting += [
+        taken(spot(0, 2.0, sensor=name, sequence=number, timestamp_ns=emitted_ns), time_s=clock_s, interval_s=0.2)
+        for name in names
+    ]
+    return settled(view, within_s=0.1)
+
+
+def test_a_step_shows_all_sensors_that_send():
+    source = Source()
+    with view_of(source) as view:
+        come(view, source, 0, "a", "b", "dead", clock_s=100.0)
+        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
+        come(view, source, 20, "a", "b", clock_s=104.0)
+        view._orders.put(Order("step", 1))  # noqa: SLF001
+        told = come(view, source, 21, "b", clock_s=104.2)  # of the moment before the one that follows
+        assert (told["sequence"], told["held"]) == ("a 0, b 0, dead 0", "3")
+        assert come(view, source, 22, "a", clock_s=104.3)["sequence"] == "a 0, b 0, dead 0"
+        told = come(view, source, 22, "b", clock_s=104.4)
+        assert (told["sequence"], told["held"]) == ("a 22, b 22, dead 0", "3")
+        assert told["age"] == "a 0.1 s, b 0.0 s, dead 4.4 s (overdue)"
+        come(view, source, 23, "a", "b", clock_s=104.6)
+        assert settled(view)["sequence"] == "a 22, b 22, dead 0"
+
+
+def test_a_step_does_not_wait_for_a_sensor_that_measures_rarely():
+    source = Source()
+    rare = [taken(spot(0, 2.0, sensor="rare", sequence=n), time_s=90.0 + 10 * n, interval_s=10.0) for n in range(3)]
+    with view_of(source) as view:
+        source.waiting = [rare[1]]
+        come(view, source, 0, "a", clock_s=100.0)
+        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
+        source.waiting = [rare[2]]
+        come(view, source, 50, "a", clock_s=110.0)
+        source.clock_s = 140.0
+        view._orders.put(Order("step", 1))  # noqa: SLF001
+        come(view, source, 200, "a", clock_s=139.0)
+        told = come(view, source, 205, "a", clock_s=140.1)
+        assert told["sequence"] == "a 205, rare 2"  # the latest that has come of each

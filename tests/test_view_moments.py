@@ -1,0 +1,90 @@
+"""When measurements of a file are shown: clocks that were set late or never, and pauses that nobody would wait for."""
+
+import pytest
+
+from ertis_numba.frames import Stamp
+from ertis_numba.storage import write_energyscapes
+from ertis_numba.viewer import Film
+from ertis_numba.viewer._moments import moments_of
+from tests.views import spot
+
+BOOT_NS, NOW_NS, YEAR_S = 5 * 10**9, 1_763_817_458 * 10**9, 31_557_600
+
+
+def moments(**times_ns):
+    stamps = {name: [Stamp(sensor=name, timestamp_ns=at_ns) for at_ns in each] for name, each in times_ns.items()}
+    return moments_of(stamps)
+
+
+def steps(begin_ns, count, step_s=0.1):
+    return [begin_ns + round(number * step_s * 1e9) for number in range(count)]
+
+
+def times_s(found):
+    return [moment.time_s for moment in found]
+
+
+def test_a_clock_that_is_set_halfway_plays_on():
+    found, notes = moments(a=steps(BOOT_NS, 3) + steps(NOW_NS, 5))
+    assert times_s(found) == pytest.approx([number / 10 for number in range(8)])
+    assert [dict(moment.measurements)["a"] for moment in found] == list(range(8))
+    (note,) = notes
+    assert note == (
+        "sensor 'a': 3 of 8 measurements have no time, as its clock was not set; they are shown as far apart as is "
+        "usual"
+    )
+
+
+def test_a_clock_that_is_lost_halfway_plays_on():
+    found, _ = moments(a=steps(NOW_NS, 3) + steps(BOOT_NS, 2) + steps(NOW_NS + 10**9, 2))
+    assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1])
+
+
+@pytest.mark.parametrize("unset_ns", [[0] * 5, steps(BOOT_NS, 5)])
+def test_a_sensor_without_times_begins_with_those_that_have_some(unset_ns):
+    found, notes = moments(timed=steps(NOW_NS, 5), untimed=unset_ns)
+    assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert found[3].measurements == (("timed", 3), ("untimed", 3))
+    assert [note[:34] for note in notes] == ["sensor 'untimed': 5 of 5 measureme"]
+
+
+def test_simulated_times_and_none_are_as_they_were():
+    assert moments(a=steps(0, 3, 0.25), b=steps(0, 3, 0.25))[1] == []
+    assert times_s(moments(a=steps(0, 3, 0.25))[0]) == [0.0, 0.25, 0.5]
+    found, notes = moments(a=[0, 0, 0], b=[0, 0])
+    assert (times_s(found), notes) == (pytest.approx([0.0, 0.1, 0.2]), [])
+    assert found[1].measurements == (("a", 1), ("b", 1))
+    assert moments(a=[0])[0][0].measurements == (("a", 0),)
+    assert moments() == ((), [])
+
+
+@pytest.mark.parametrize(
+    ("times_ns", "wanted_s", "told"),
+    [
+        (
+            [*steps(NOW_NS, 3), NOW_NS + 3600 * 10**9],
+            [0, 0.1, 0.2, 10.2],
+            "a pause of more than 10 s (up to 3600 s) is",
+        ),
+        (steps(NOW_NS, 4, 60.0), [0, 60, 120, 180], None),  # that is how it measures
+        (
+            steps(NOW_NS, 3, YEAR_S),
+            [0, 600, 1200],
+            "2 pauses of more than 600 s (up to 31557600 s) are played as 600 s",
+        ),
+    ],
+)
+def test_long_pauses_are_short(times_ns, wanted_s, told):
+    found, notes = moments(a=times_ns)
+    assert times_s(found) == pytest.approx(wanted_s)
+    assert len(notes) == (told is not None)
+    assert not notes or notes[0].startswith(told)
+
+
+def test_a_film_says_what_its_times_are(tmp_path):
+    images = [spot(0, 1.0, sequence=number, timestamp_ns=at_ns) for number, at_ns in enumerate((BOOT_NS, NOW_NS))]
+    with Film(write_energyscapes(tmp_path / "img.h5", images)) as film:
+        assert times_s(film.moments) == pytest.approx([0, 0.1])
+        (note,) = film.notes()
+        assert note.startswith("sensor 'front': 1 of 2 measurements have no time")
+        assert film.notes() == []

@@ -1,0 +1,265 @@
+"""The page: who is served, and what is saved of it."""
+
+import base64
+import http.client
+import re
+import socket
+from contextlib import closing
+
+import pytest
+import viser
+import zstandard
+
+from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.storage import write_energyscapes
+from ertis_numba.viewer import Choices, Film, View
+from ertis_numba.viewer import _recordings as recordings
+from ertis_numba.viewer import _view as viewing
+from ertis_numba.viewer._origins import is_loopback
+from ertis_numba.viewer._page import Order
+from tests.views import PATIENCE_S, Client, Source, spot, stamped, taken, wait_for
+
+
+def test_a_port_that_is_taken_is_refused(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    with socket.socket() as other, Film(path) as film:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(NetworkError, match=r"nothing can be served at 127.0.0.1:\d+ .*; give another host or port"):
+            View(film, port=other.getsockname()[1])
+    with Film(path) as film, pytest.raises(NetworkError, match=r"nothing can be served at 203\.0\.113\.1"):
+        View(film, host="203.0.113.1", port=0)
+
+
+def answer(port, origin, host):
+    """What the server says to a browser that connects: 101 lets it in."""
+    key = base64.b64encode(bytes(16)).decode()
+    headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key}
+    headers |= {"Host": host, "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)) as connection:
+        connection.request("GET", "/", headers=headers | ({} if origin is None else {"Origin": origin}))
+        return connection.getresponse().status
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST", "0.0.0.0"])
+def test_pages_of_other_sites_are_refused(host):
+    with View(Source(), host=host, port=0) as view:
+        port = int(view.url.rstrip("/").rpartition(":")[2])
+        assert view.is_local == (host != "0.0.0.0")
+        here = f"127.0.0.1:{port}"
+        for origin in (None, f"http://{here}"):
+            assert answer(port, origin, here) == 101
+        # Through ssh -L, a browser knows the page by another port.
+        assert answer(port, "http://LocalHost:9999", "localhost:9999") == 101
+        assert answer(port, "http://[::1]", "[::1]:80") == 101
+        for origin in ("http://example.org", f"http://{here}.example.org", "http://127.0.0.1", "http://127.0.0.1:9"):
+            assert answer(port, origin, here) == 403, origin
+        for origin in ("null", "file://", f"ftp://{here}", "http://[", f"http://{here}x", ""):
+            assert answer(port, origin, here) == 403, origin
+        # The name of another site may lead to this machine; nobody opens a page on loopback by it.
+        alias = f"example.org:{port}"
+        assert answer(port, f"http://{alias}", alias) == (403 if view.is_local else 101)
+
+
+def test_other_addresses_of_this_machine_are_loopback():
+    spelled = ("127.0.0.2", "LocalHost", "::1", "[::1]")
+    assert all(is_loopback(host) for host in spelled)
+    assert not any(is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.2", "example.org", "127.example.org"))
+
+
+def test_what_cannot_be_saved_or_chosen_is_told_and_the_view_goes_on(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", [spot(0, 2.0, timestamp_ns=3 * 10**18)])
+    client = Client()
+    with Film(path) as film, View(film, port=0) as view:
+        orders = [Order("threshold_db", 7.0), Order("points", client=client), Order("picture", client=client)]
+        wait_for(lambda: view.run(duration_s=0.05) or view.shown)
+        for order in orders:
+            view._orders.put(order)  # noqa: SLF001  as a browser does
+        view.run(duration_s=0.2)
+        assert view.choices == Choices()
+    ((title, body),) = client.notices
+    assert title == "Nothing is saved"
+    assert "wanted one from 1970 to 2038" in body
+    ((name, content),) = client.files
+    assert (name, content[:4]) == ("img.png", b"\x89PNG")
+
+
+def embedded(page):
+    """What a page holds, as viser keeps it."""
+    packed = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
+    return zstandard.ZstdDecompressor().decompressobj().decompress(packed[8:])
+
+
+def moving(count):
+    """Images of a reflector that is elsewhere in each, each of which takes 1.4 kB of a recording."""
+    return [spot(2 * number, 2.0, sequence=number, timestamp_ns=round(1e18 + number * 5e7)) for number in range(count)]
+
+
+def test_a_browser_does_not_end_the_recording_of_another(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(3, step_s=0.01))
+    one, other = Client(1), Client(2)
+    with Film(path) as film, View(film, port=0) as view:
+
+        def press(client, name="record"):
+            view._orders.put(Order(name, client=client))  # noqa: SLF001  as a browser does
+
+        press(one)
+        view.run(duration_s=0.1)
+        press(other)
+        press(one)
+        wait_for(lambda: view.run(duration_s=0.05, html=tmp_path / "ours.html", overwrite=True) or one.files)
+        assert view.recorded is not None
+        press(other, "leave")  # with its recording
+        press(other)
+        press(other)
+        view.run(duration_s=0.3)
+        assert not view._page._server._websock_server._record_handles  # noqa: SLF001  nothing is kept for nobody
+    assert embedded((tmp_path / "ours.html").read_text())
+    ((name, content),) = one.files
+    assert name == "img.html"
+    assert embedded(content.decode())
+    assert len(other.files) == 1
+
+
+def test_a_recording_is_made_by_who_began_it_though_a_browser_records(tmp_path):
+    source, client = Source(), Client()
+    source.waiting = [taken(spot(0, 2.0), time_s=source.clock_s)]
+    with View(source, port=0) as view:
+        view._orders.put(Order("record", client=client))  # noqa: SLF001  which once ended that of the command
+        view.run(duration_s=0.2, html=tmp_path / "live.html")
+        assert view.recorded == 1
+    assert (tmp_path / "live.html").stat().st_size > 500_000
+
+
+def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
+    monkeypatch.setattr(recordings, "MOST_BYTES", 20_000)
+    path = write_energyscapes(tmp_path / "img.h5", moving(30))
+    notes = []
+    with Film(path) as film, View(film, port=0, on_note=notes.append) as view:
+        view.record(tmp_path / "page.html")
+        assert 2 < view.recorded < 29
+        assert view.shown == view.recorded
+    assert notes == [f"{tmp_path / 'page.html'} is full at 0.02 MB: what came until now is written"]
+    assert 15_000 < len(embedded((tmp_path / "page.html").read_text())) < 25_000
+
+
+def test_a_film_that_is_stopped_leaves_no_page(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", moving(5))
+    page = tmp_path / "page.html"
+    with Film(path) as film, View(film, port=0) as view:
+        show = view._page.show  # noqa: SLF001
+
+        def shown(frame, place):
+            show(frame, place)
+            if place == 2:
+                view.stop()
+
+        view._page.show = shown  # noqa: SLF001
+        view.record(page)
+        assert view.recorded is None
+        assert view.shown == 3
+        assert not view._page._server._websock_server._record_handles  # noqa: SLF001  nothing is kept for nobody
+    assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
+
+
+def test_a_live_view_without_images_leaves_no_page(tmp_path):
+    with View(Source(), port=0) as view:
+        view.run(duration_s=0.1, html=tmp_path / "page.html")
+        assert view.recorded is None
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
+    monkeypatch.setattr(recordings, "MOST_BYTES", 20_000)
+    source, client, notes = Source(), Client(), []
+    page = tmp_path / "live.html"
+    with View(source, port=0, on_note=notes.append) as view:
+        view._orders.put(Order("record", client=client))  # noqa: SLF001  as a browser does
+        sent = []
+
+        def send():
+            """Send an image in each turn, until some have come after all was full."""
+            sent.append(bool(notes and client.notices))
+            if sum(sent) > 5:
+                view.stop()
+            source.clock_s += 0.1
+            source.waiting = [taken(spot(len(sent) % 60, 2.0, sequence=len(sent)), time_s=source.clock_s)]
+            return []
+
+        source.notes = send
+        view.run(duration_s=PATIENCE_S, html=page)
+        assert 0 < view.recorded < view.shown
+    assert notes == [f"{page} is full at 0.02 MB: what came until now is written"]
+    assert [title for title, _ in client.notices] == ["The HTML recording is full"]
+    assert [name for name, _ in client.files] == ["live.html"]
+
+
+def test_what_is_recorded_is_counted_as_it_takes_room(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", moving(8))
+    counted = []
+    with Film(path) as film, View(film, port=0) as view:
+        recorded = view._recordings  # noqa: SLF001
+        add = recorded.add
+        recorded.add = lambda *, frames: add(frames=frames) or counted.extend(recorded.n_bytes().values())
+        view.record(tmp_path / "page.html")
+    assert counted == sorted(counted)
+    assert counted[-1] == pytest.approx(len(embedded((tmp_path / "page.html").read_text())), rel=0.15)
+
+
+@pytest.mark.parametrize("record", [True, False])
+def test_a_film_is_not_recorded_over_itself(tmp_path, record):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    before = path.read_bytes()
+    with Film(path) as film, View(film, port=0) as view, pytest.raises(ArgumentError, match="is the input itself"):
+        view.record(path, overwrite=True) if record else view.run(duration_s=0.1, html=path, overwrite=True)
+    assert path.read_bytes() == before
+
+
+def test_a_recording_that_cannot_be_written_is_told(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    with Film(path) as film, View(film, port=0) as view:
+        view._page.show = lambda *_: (tmp_path / "page.html").touch()  # noqa: SLF001  somebody was faster
+        with pytest.raises(ArgumentError, match="exists; give another name"):
+            view.record(tmp_path / "page.html")
+        assert view.recorded is None
+
+
+def controls(view):
+    return view._page._chosen  # noqa: SLF001
+
+
+@pytest.mark.parametrize(
+    ("window_m", "shown_m", "top_m", "told"),
+    [
+        (None, (0.0, 5.0), 5.0, "Range 0–5 m"),
+        ((0.6, 1.0), (0.6, 1.0), 5.0, "Range 0.6–1 m"),
+        ((10.0, 20.0), (10.0, 20.0), 20.0, "Range 10–20 m"),
+    ],
+)
+def test_the_slider_of_ranges_shows_the_window(window_m, shown_m, top_m, told):
+    source = Source()
+    source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
+    with View(source, port=0, choices=Choices(range_m=window_m)) as view:
+        view.run(duration_s=0.1)
+        slider = controls(view)["range_m"]
+        assert (slider.value, slider.max, slider.label) == (pytest.approx(shown_m), pytest.approx(top_m), told)
+        view._orders.put(Order("range_m", (1.0, 2.0)))  # noqa: SLF001  as a browser does
+        view.run(duration_s=0.1)
+        assert slider.label == "Range 1–2 m"
+
+
+def test_numbers_that_cannot_be_are_put_back(monkeypatch):
+    source = Source()
+    with View(source, port=0, choices=Choices(threshold_db=-15.0)) as view:
+        box = controls(view)["threshold_db"]
+
+        def type_in(number):
+            box.value = number
+            view._orders.put(Order("threshold_db", number))  # noqa: SLF001  as a browser does
+            view.run(duration_s=0.05)
+            return box.value, view.choices.threshold_db
+
+        assert type_in(5.0) == (5.0, -15.0)  # it may be half of a number
+        monkeypatch.setattr(viewing, "_TYPED_S", 0.0)
+        assert type_in(-100.0) == (-15.0, -15.0)
+        assert type_in(-30.0) == (-30.0, -30.0)

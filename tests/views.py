@@ -1,0 +1,98 @@
+"""Images, sources and browsers that the tests of the live view share."""
+
+import time
+
+import numpy as np
+
+from ertis_numba.frames import Stamp
+from ertis_numba.viewer import Pose, Taken
+from ertis_numba.viewer._choices import colour_table
+from tests.files import image
+
+TABLE = colour_table("inferno")
+PATIENCE_S = 20.0
+
+
+def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp):
+    """An image with one reflector, soft enough to lie between directions and ranges."""
+    made = image(np.linspace(-90, 90, 91))
+    across = (np.degrees(made.azimuth_rad) - azimuth_deg) / 4
+    along = (made.range_m - range_m) / 0.03
+    energy = made.energy * 0.01 + (level * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
+    return made.replace(energy=energy.astype(np.float32), stamp=Stamp(sensor=sensor, sequence=sequence, **stamp))
+
+
+def taken(made, pose=None, time_s=0.0, interval_s=None):
+    return Taken(made, pose or Pose(), time_s, interval_s)
+
+
+def brightest(picture):
+    """The middle of the pixels of the highest level, but for those of the scale below: x, y."""
+    away = np.abs(picture.astype(int) - TABLE[255].astype(int)).sum(axis=2)
+    rows, columns = np.nonzero(away <= away.min() + 6)
+    return columns.mean() + 0.5, rows.mean() + 0.5
+
+
+def wait_for(reached):
+    end_s = time.monotonic() + PATIENCE_S
+    while not (found := reached()):
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0)
+    return found
+
+
+def stamped(count, *, sensors=("front",), step_s=0.05):
+    return [
+        spot(0, 1.0 + number, sensor=name, sequence=number, timestamp_ns=round(1e18 + number * step_s * 1e9) + index)
+        for number in range(count)
+        for index, name in enumerate(sensors)
+    ]
+
+
+class Client:
+    """A browser that asks for a file."""
+
+    def __init__(self, number=0):
+        self.client_id = number
+        self.files, self.notices = [], []
+
+    def send_file_download(self, name, content, *, save_immediately):
+        assert save_immediately
+        self.files.append((name, content))
+
+    def add_notification(self, title, body, **_):
+        self.notices.append((title, body))
+
+
+class Source:
+    """A live source whose clock and images are those that a test gives."""
+
+    is_film = False
+    title, state, connected = "source", "live", True
+    dropped = skipped = received = 0
+
+    def __init__(self):
+        self.clock_s, self.waiting = 100.0, []
+
+    def notes(self):
+        return []
+
+    def take(self):
+        came, self.waiting = self.waiting, []
+        self.received += len(came)
+        return came
+
+    def latency_s(self, _):
+        return None
+
+
+def settled(view, *, within_s=0.12):
+    """Let a view draw what there is, and return what it told at last."""
+    rows = {}
+    page = view._page  # noqa: SLF001  what it tells goes to browsers only
+    tell = page.tell
+    page.tell = lambda told, *, playing: rows.update(told) or tell(told, playing=playing)
+    view.run(duration_s=within_s)
+    view._tell()  # noqa: SLF001
+    page.tell = tell
+    return {name: value for name, (_, value) in rows.items()}
