@@ -99,7 +99,8 @@ def _filtered(
         blocks = padded[:, tap : tap + n_outputs * factor]
         if blocks.shape[1] < n_outputs * factor:
             blocks = np.pad(blocks, ((0, 0), (0, n_outputs * factor - blocks.shape[1])))
-        total += blocks.reshape(len(signals), n_outputs, factor)[:, :, : len(part)] @ part
+        with np.errstate(invalid="ignore"):  # BLAS may set the flag for lanes that it throws away; these are finite
+            total += blocks.reshape(len(signals), n_outputs, factor)[:, :, : len(part)] @ part
     return total
 
 
