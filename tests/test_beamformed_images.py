@@ -13,6 +13,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
+from ertis_numba.stages import planner
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -45,7 +46,8 @@ def test_pipeline_gives_the_same_bits_on_any_number_of_threads(beamformer):
 def test_the_chain_makes_zeros_of_zeros(device, beamformer):
     settings = cases.CASES["line of 8"]
     settings = settings.replace(processing=settings.processing.replace(beamformer=beamformer))
-    chain = FastChain(settings, KERNELS[device], threads=1)
+    planned = planner.complete(settings, KERNELS[device], threads=1)
+    chain = FastChain(planned, KERNELS[device], threads=1)
     out = np.full((len(chain.grid), len(chain.range_m)), 12_345, dtype=np.float32)
     chain.process_signals(np.zeros((8, settings.recording.n_samples)), out)
     assert not out.any()
