@@ -54,9 +54,14 @@ def tuned_for(settings, plan):
     return settings.replace(accuracy=plan)
 
 
+def kernels_for(plan):
+    """The processor's kernels, or NumPy's for 16 bits on a processor that has no dot product of them."""
+    return CPU if plan.precision != "int16" or CPU.tile_ranges else kernels.load("numpy")
+
+
 def image_of(measurement, settings):
     """The image by a complete plan: (direction, range) float32."""
-    chain = FastChain(settings, CPU, threads=2)
+    chain = FastChain(settings, kernels_for(settings.accuracy), threads=1)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
     chain.process(measurement.words.reshape(len(measurement.words), -1), image)
     return image
@@ -73,7 +78,7 @@ class Rated:
     def predicted(self, plan):
         """What the planner expects, knowing what is heard."""
         settings = tuned_for(self.settings, plan)
-        return Planner(settings, CPU, threads=2, texture=self.texture).chosen(plan)
+        return Planner(settings, kernels_for(plan), threads=1, texture=self.texture).chosen(plan)
 
     def measured_db(self, plan):
         image = image_of(self.measurement, tuned_for(self.settings, plan))

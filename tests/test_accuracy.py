@@ -10,7 +10,7 @@ from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages.accuracy import PARTS, Texture, decibels
 from ertis_numba.stages.planner import Planner
 from tests import reference
-from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, random_measurement, rated
+from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, kernels_for, random_measurement, rated
 from tests.test_real import RAW
 
 OPTIMISTIC_DB, PESSIMISTIC_DB = 1.0, 3.0
@@ -66,7 +66,7 @@ def test_without_a_measurement_predictions_err_on_the_safe_side(seed):
     for name in list(PLANS)[seed % 5 :: 5]:
         plan = PLANS[name]
         measured_db = case.measured_db(plan)
-        chosen = Planner(settings.replace(accuracy=plan), CPU, threads=1).chosen(plan)
+        chosen = Planner(settings.replace(accuracy=plan), kernels_for(plan), threads=1).chosen(plan)
         # By how much the modulators' noise is louder than echoes, nobody can know beforehand.
         if chosen.parts["filter"] < 0.01 * sum(chosen.parts.values()) and measured_db > FLOOR_DB:
             assert chosen.error_db > measured_db - 0.5, name
