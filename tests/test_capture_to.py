@@ -219,11 +219,12 @@ def test_what_ends_a_capture_loses_nothing(tmp_path, kill):
 @pytest.mark.usefixtures("sensors")
 def test_a_second_signal_ends_it_at_once(tmp_path):
     with start(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 2, "--patience", 3600) as process:
+        has_all = is_waiting = False
         for line in process.stdout:
-            if json.loads(line).get("sequence") == 1:
-                break
-        for line in process.stdout:  # it waits for the central node by now
-            if "does not answer" in json.loads(line).get("text", ""):
+            event = json.loads(line)
+            has_all |= event.get("sequence") == 1
+            is_waiting |= "does not answer" in event.get("text", "")  # of the central node
+            if has_all and is_waiting:
                 break
         process.send_signal(signal.SIGINT)
         with pytest.raises(subprocess.TimeoutExpired):

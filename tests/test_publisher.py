@@ -117,6 +117,7 @@ def test_a_publisher_that_comes_back_listens_where_it_was_told_to(tmp_path):
             loop.until(lambda: loop.processing.refused.get("unknown key"))
 
 
+@pytest.mark.alone  # who is silent for seconds is forgotten, and a busy machine makes an application be silent
 def test_a_sensor_may_change_as_often_as_it_likes():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", "raw", credit=64)

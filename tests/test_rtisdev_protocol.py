@@ -27,6 +27,7 @@ from ertis_numba.devices.emulator.registers import Registers
 from ertis_numba.devices.setup import call_codes, call_hash
 from ertis_numba.settings import Call
 
+pytestmark = pytest.mark.alone  # the driver waits for an answer for no longer than it was written to
 N_SAMPLES = 65_536
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
 PASSIVE = [words[::-1].copy() for words in WORDS]
