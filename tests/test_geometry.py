@@ -16,9 +16,11 @@ from ertis_numba.geometry import (
     azimuth_columns,
     direction_grid,
     far_field_delays,
+    is_closed,
     layout_names,
     load_layout,
     microphones,
+    reach_rad,
     spacing_rad,
     spherical_delays,
     unit_vectors,
@@ -322,19 +324,65 @@ def test_spacing_is_that_of_the_grid():
         assert np.degrees(spacing_rad(unit_vectors(grid.azimuth_rad, grid.elevation_rad))) == pytest.approx(spacing_deg)
 
 
-@pytest.mark.parametrize("name", ["2d:7", "3d:500", "3d:1"])
-def test_azimuth_columns_hold_every_direction_once(name):
+@pytest.mark.parametrize("name", ["2d:7", "3d:10", "3d:500", "3d:4000", "3d:1"])
+def test_azimuth_columns_show_each_direction_about_its_azimuth(name):
     grid = direction_grid(Processing(directions=name))
     shuffled = np.random.default_rng(1).permutation(len(grid))
     azimuth_rad, elevation_rad = grid.azimuth_rad[shuffled], grid.elevation_rad[shuffled]
+    spacing = spacing_rad(unit_vectors(azimuth_rad, elevation_rad))
     columns = azimuth_columns(azimuth_rad, elevation_rad)
-    assert sorted(columns.order) == list(range(len(grid)))
     assert (np.diff(columns.azimuth_rad) > 0).all()
-    whose = np.searchsorted(columns.starts, np.arange(len(grid)), side="right") - 1
-    apart = np.abs(azimuth_rad[columns.order] - columns.azimuth_rad[whose])
-    assert apart.max() <= (0 if name == "2d:7" else spacing_rad(unit_vectors(azimuth_rad, elevation_rad)) / 2 + 1e-12)
-    strongest = np.maximum.reduceat(azimuth_rad[columns.order], columns.starts)
-    assert len(strongest) == len(columns.azimuth_rad)
+    shown = columns.strongest(np.eye(len(grid), dtype=np.float32))  # each direction by itself
+    for direction in range(len(grid)):
+        at = columns.azimuth_rad[shown[:, direction] > 0]
+        assert np.abs(at - azimuth_rad[direction]).max() <= (0 if name == "2d:7" else spacing / 2 + 1e-9)
+        inner = np.abs(azimuth_rad[direction]) < np.abs(azimuth_rad).max() - spacing
+        assert not inner or len(at) < 3 or abs(at.mean() - azimuth_rad[direction]) <= spacing / 8 + 1e-9
+        assert np.abs(at - azimuth_rad[direction]).min() <= spacing / 8 + 1e-9
+
+
+def test_azimuth_columns_of_few_directions_are_theirs():
+    azimuth_rad, elevation_rad = np.radians([[-45.0, 45.0, 0.0], [-19.0, -19.0, 41.0]])
+    columns = azimuth_columns(azimuth_rad, elevation_rad)
+    assert_allclose(np.degrees(columns.azimuth_rad), [-45.0, 0.0, 45.0])
+    assert columns.strongest(np.array([1.0, 2.0, 3.0])).tolist() == [1.0, 3.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("gaps_deg", "wanted_deg"),
+    [
+        ([], []),
+        ([5], [1]),
+        ([2, 2, 2], [2.6, 2.6, 2.6]),
+        ([30, 30, 30], [39, 39, 39]),
+        ([2, 2, 20, 2, 2], [2.6, 10, 2.6, 10, 2.6]),
+        ([6, 6, 1, 1, 1], [7.8, 7.8, 7.8, 1.3, 1.3]),
+        ([9, 9, 2, 2, 2, 2, 2, 9, 9], [10, 10, 10, 2.6, 2.6, 2.6, 10, 10, 10]),
+    ],
+    ids=["none", "one", "even", "even and wide", "gap", "coarser part", "coarser by far"],
+)
+def test_something_is_known_as_far_as_directions_are_usually_apart(gaps_deg, wanted_deg):
+    """1.3 of it, and among wider ones up to 10°."""
+    assert_allclose(np.degrees(reach_rad(np.radians(gaps_deg))), wanted_deg)
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "wanted"),
+    [
+        (np.arange(-180, 180, 2), True),
+        (np.linspace(-180, 180, 181), False),  # the last is the first
+        (np.arange(0, 357, 3), False),
+        (3.1 * np.arange(116), True),
+        ([0, 120, 240], True),
+        ([0, 180], False),
+        (np.linspace(-90, 90, 37), False),
+        ([*range(-173, -30, 10), *range(-27, 30, 2), *range(33, 174, 10)], True),
+        ([*range(-173, -30, 10), *range(-27, 30, 2), *range(33, 164, 10)], False),
+    ],
+    ids=["even", "turn", "one missing", "a little more", "three", "two", "ahead", "finer ahead", "finer ahead, one missing"],
+)
+def test_directions_go_all_around_where_no_more_is_missing_than_elsewhere(azimuth_deg, wanted):
+    assert is_closed(np.radians(azimuth_deg)) == wanted
 
 
 def test_metres_in_a_layout_are_refused(tmp_path):

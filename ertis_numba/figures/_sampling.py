@@ -11,6 +11,7 @@ from ertis_numba.geometry import azimuth_columns, is_closed, reach_rad, spacing_
 
 __all__ = [
     "PIXELS",
+    "centres",
     "flattened",
     "join_ranges",
     "polar_raster",
@@ -24,6 +25,12 @@ _RADIAL_BINS = 500
 _NEAREST = 4  # directions that a place between them is interpolated from
 _SAME_RAD = 1e-9  # between directions that are one
 _THIN = 0.005  # of the range, to either side: ranges within it would be too thin to be seen
+
+
+def centres(first: float, last: float, step: float) -> NDArray[np.float64]:
+    """Return the middles of about such steps from one end to the other, which may be the smaller: (step,) float64."""
+    count = max(1, round(abs(last - first) / step))
+    return np.asarray(first + (np.arange(count) + 0.5) * (last - first) / count)
 
 
 def join_ranges(
@@ -176,7 +183,7 @@ def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArra
     They run on without a jump, and if they go all around the first is the last as well, a turn later.
     """
     columns = azimuth_columns(image.azimuth_rad, image.elevation_rad)
-    highest_db = np.maximum.reduceat(level_db[columns.order], columns.starts, axis=0)
+    highest_db = columns.strongest(level_db)
     azimuth_rad = unrolled_rad(columns.azimuth_rad)
     order = np.argsort(azimuth_rad, kind="stable")
     azimuth_rad, highest_db = azimuth_rad[order], highest_db[order]

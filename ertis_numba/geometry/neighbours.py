@@ -1,7 +1,8 @@
 """How far directions lie apart, and which of them share an azimuth."""
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,10 @@ from ertis_numba.geometry.delays import unit_vectors
 
 __all__ = ["AzimuthColumns", "azimuth_columns", "spacing_rad"]
 
+Level = TypeVar("Level", bound=np.generic)
+
 _NEAREST_RAD = 1e-9  # directions that are the same have no spacing
+_FINER = 4  # columns of a raster to a spacing: a direction is shown at most an eighth of it aside
 
 
 def spacing_rad(directions: NDArray[np.float64]) -> float:
@@ -30,35 +34,45 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
     return 2 * math.asin(min(1.0, float(np.median(distance[:, 1])) / 2))
 
 
-class AzimuthColumns(NamedTuple):
-    """Directions by their azimuth: ``np.maximum.reduceat(levels[order], starts)`` is the strongest of each.
+@dataclass(frozen=True, slots=True)
+class AzimuthColumns:
+    """Azimuths, and the directions that lie about each.
 
     Attributes
     ----------
     azimuth_rad : (column,) float64
         Rising.
-    order : (direction,) intp
-    starts : (column,) intp
-        Where in the order the directions of each azimuth begin.
     """
 
     azimuth_rad: NDArray[np.float64]
-    order: NDArray[np.intp]
-    starts: NDArray[np.intp]
+    _order: NDArray[np.intp]
+    _edges: NDArray[np.intp]
+
+    def strongest(self, levels: NDArray[Level]) -> NDArray[Level]:
+        """Return the strongest about each azimuth, (column, ...), of levels (direction, ...)."""
+        ordered = levels[np.append(self._order, self._order[-1])]  # one more, as the last may end there
+        return np.asarray(np.maximum.reduceat(ordered, self._edges, axis=0)[::2])
 
 
 def azimuth_columns(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> AzimuthColumns:
-    """Gather directions of about the same azimuth; in a plane each is one by itself.
+    """Return the azimuths at which to show directions, and those that lie within half their spacing of each.
+
+    Directions of several elevations have azimuths of their own each; where there are many, a raster of a quarter of
+    their spacing stands for them. In a plane each is shown by itself.
 
     Parameters
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
     """
-    if len(azimuth_rad) == 1 or not np.any(elevation_rad):
-        order = np.argsort(azimuth_rad, kind="stable")
-        return AzimuthColumns(azimuth_rad[order], order, np.arange(len(order)))
-    step_rad = max(spacing_rad(unit_vectors(azimuth_rad, elevation_rad)), _NEAREST_RAD)
-    bins = np.rint((azimuth_rad - azimuth_rad.min()) / step_rad).astype(np.intp)
-    order = np.argsort(bins, kind="stable")
-    filled, starts = np.unique(bins[order], return_index=True)
-    return AzimuthColumns(azimuth_rad.min() + filled * step_rad, order, starts)
+    order = np.argsort(azimuth_rad, kind="stable")
+    rising = azimuth_rad[order]
+    columns = rising[np.diff(rising, prepend=-np.inf) > _NEAREST_RAD]
+    half_rad = _NEAREST_RAD
+    if len(columns) > 1 and np.any(elevation_rad):
+        half_rad = max(spacing_rad(unit_vectors(azimuth_rad, elevation_rad)) / 2, _NEAREST_RAD)
+        count = math.ceil(float(columns[-1] - columns[0]) / half_rad * _FINER / 2) + 1
+        if count < len(columns):
+            columns = np.linspace(columns[0], columns[-1], count)
+    first, stop = np.searchsorted(rising, columns - half_rad), np.searchsorted(rising, columns + half_rad, side="right")
+    some = stop > first
+    return AzimuthColumns(columns[some], order, np.stack([first[some], stop[some]], axis=1).ravel())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import ALONE_RAD, azimuth_columns, is_closed, reach_rad, unrolled_rad
+from ertis_numba.stages.levels import below_strongest_db
 from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_text
 
 __all__ = ["Look", "Polar", "cropped", "is_within"]
@@ -89,9 +90,9 @@ class Polar:
     def __init__(self, image: Energyscape, *, dynamic_range_db: float = 40.0, width_px: int = 520) -> None:
         if width_px < 4 * SIDE_PX:
             raise ArgumentError(f"width_px is {width_px}; give at least {4 * SIDE_PX}")
-        self._floor = np.float32(10 ** (-dynamic_range_db / 20))
         self._dynamic_range_db = dynamic_range_db
-        azimuth_rad, self._order, self._starts = azimuth_columns(unrolled_rad(image.azimuth_rad), image.elevation_rad)
+        self._columns = azimuth_columns(unrolled_rad(image.azimuth_rad), image.elevation_rad)
+        azimuth_rad = self._columns.azimuth_rad
         self._range_m = float(image.range_m[0]), float(image.range_m[-1])
         if self._range_m[1] <= 0:
             raise ArgumentError("the image ends at range 0; give one with ranges")
@@ -131,9 +132,8 @@ class Polar:
     def levels(self, energy: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the levels to draw: (azimuth, range) uint8, 255 the strongest and 0 silence."""
         joined = np.maximum.reduceat(energy, self._bins, axis=1)
-        highest = np.maximum.reduceat(joined[self._order], self._starts, axis=0)
-        strongest = np.float32(highest.max(initial=0.0)) or np.float32(1)
-        level_db = 20 * np.log10(np.maximum(highest / strongest, self._floor))
+        highest = self._columns.strongest(joined)
+        level_db = below_strongest_db(highest, self._dynamic_range_db)
         return np.rint(255 * (1 + level_db / self._dynamic_range_db)).astype(np.uint8)
 
     def picture(self, levels: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -203,7 +203,7 @@ class Polar:
         gap = np.clip(np.searchsorted(self._fan_rad, azimuth_rad, side="right") - 1, 0, len(self._reach_rad) - 1)
         away_rad = np.minimum(azimuth_rad - self._fan_rad[gap], self._fan_rad[gap + 1] - azimuth_rad)
         inside &= away_rad <= self._reach_rad[gap]
-        n_azimuths, n_bins = len(self._starts), len(self._bins_m)
+        n_azimuths, n_bins = len(self._columns.azimuth_rad), len(self._bins_m)
         last = n_azimuths if self._is_closed else n_azimuths - 1
         at = np.interp(azimuth_rad[inside], self._fan_rad, np.linspace(0, last, len(self._fan_rad)))
         before = np.floor(at).astype(np.intp)
