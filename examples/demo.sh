@@ -43,7 +43,7 @@ ertis status "$central"
 end
 set -x
 
-ertis verify demo/recordings/*.h5
+ertis verify demo/recordings/*.h5 || [ $? -eq 3 ] # gaps: what came too late for a busy machine is told, the rest sound
 ertis process demo/recordings/*.h5 --sensor front --output demo/image.h5 --directions 2d:181 --force
 ertis peaks demo/image.h5 --measurement 0
 ertis plot demo/image.h5 --output demo/image.png --force

@@ -102,6 +102,19 @@ def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
     assert not link.is_symlink()
 
 
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_script_ends_what_it_has_in_the_background(emulate, recording, tmp_path, number, code):
+    """Whose background jobs a shell has ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = emulate(recording, "--sensor", "left")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    process.stdout.readline()
+    assert ended(process, getattr(signal, number))[0] == code
+    assert not (tmp_path / "links" / "left").is_symlink()
+
+
 def test_a_killed_emulator_leaves_a_link_that_the_next_replaces(emulate, recording, tmp_path):
     link = tmp_path / "links" / "left"
     process = emulate(recording, "--sensor", "left")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.journal import Entry
 
-__all__ = ["Signals", "Watch", "report", "stopped_by_signals"]
+__all__ = ["Signals", "Watch", "broken_off_by_signals", "report", "stopped_by_signals"]
 
 _REFRESH_S = 0.25
 _ALIVE = 0.05  # share of ones, and of zeros, of a microphone that is
@@ -73,12 +73,34 @@ class Signals:
 def stopped_by_signals() -> Iterator[Signals]:
     """Yield what remembers the signals that ask this program to end."""
     asked = Signals()
-    before = {name: signal.signal(getattr(signal, name), asked) for name in _SIGNALS if hasattr(signal, name)}
-    try:
+    with _handled_by(asked):
         yield asked
+
+
+@contextmanager
+def broken_off_by_signals() -> Iterator[None]:
+    """Have signals that ask this program to end break into the block, so that it clears up.
+
+    Also those that it was begun with ignoring, as a shell's script begins its background jobs.
+    """
+
+    def end(number: int, _: object) -> NoReturn:
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.exit(128 + number)
+
+    with _handled_by(end):
+        yield
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
+    before = {name: signal.signal(getattr(signal, name), handler) for name in _SIGNALS if hasattr(signal, name)}
+    try:
+        yield
     finally:
-        for name, handler in before.items():
-            signal.signal(getattr(signal, name), handler)
+        for name, earlier in before.items():
+            signal.signal(getattr(signal, name), earlier)
 
 
 class Watch:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from ertis_cli import options
+from ertis_cli._watch import broken_off_by_signals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -111,6 +112,7 @@ def emulate(
     if count is not None and not is_scene:
         raise click.UsageError("--count is of scenes; a recording has its own", ctx=click.get_current_context())
     with ExitStack() as stack:
+        stack.enter_context(broken_off_by_signals())
         names = _names(path, sensor, is_scene=is_scene)
         if link is not None and len(names) > 1:
             raise click.UsageError(
