@@ -76,11 +76,11 @@ def require_room(folder: Path, n_bytes: int) -> None:
     DataError
         The disk is full, or nearly so.
     """
-    free = shutil.disk_usage(folder).free
-    if free < n_bytes + SPARE_BYTES:
+    free, wanted = shutil.disk_usage(folder).free, n_bytes + SPARE_BYTES
+    if free < wanted:
         raise DataError(
-            f"{folder} has {free / 1e6:.1f} MB free, wanted {n_bytes / 1e6:.1f} MB and {SPARE_BYTES / 1e6:.0f} MB "
-            "to spare; free some space or write elsewhere"
+            f"{folder} has {free / 1e6:.1f} MB free, wanted {wanted / 1e6:.1f} MB for what is next, "
+            f"{SPARE_BYTES / 1e6:.0f} MB of it to spare; {_ELSEWHERE}"
         )
 
 
@@ -120,10 +120,15 @@ def replacing(path: Path, *, overwrite: bool = False, token: str | None = None) 
     except BaseException as error:  # Ctrl-C, too, must leave nothing behind
         with suppress(OSError):  # where nothing can be written, nothing can be removed: what came first is to be told
             part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and str(error.filename) == str(part):
+        if isinstance(error, OSError) and (str(error.filename) == str(part) or _tells_no_name(error)):
             error.filename = str(path)  # nobody else knows the name of a part
         raise
     sync(path.parent)
+
+
+def _tells_no_name(error: OSError) -> bool:
+    """Whether an error says that a disk is full, but not which file it was that had no room."""
+    return error.filename is None and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def sync(path: Path) -> None:

@@ -30,3 +30,10 @@ def test_what_came_first_is_told_where_nothing_can_be_removed(tmp_path, monkeypa
     with pytest.raises(OSError, match="cannot be written") as caught, replacing(tmp_path / "a.txt") as part:
         raise OSError(errno.EROFS, "cannot be written", str(part))
     assert caught.value.filename == str(tmp_path / "a.txt")
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    """Where the system tells an error of a file that is open, it has no name."""
+    with pytest.raises(OSError, match="No space") as caught, replacing(tmp_path / "a.txt"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "a.txt")
