@@ -1,27 +1,64 @@
 """Frozen structures with TOML in and out: what settings, scenes and layouts are made of.
 
-A structure checks itself once, when it is made, in its ``__post_init__``. Unknown keys are refused.
+A structure checks itself once, when it is made, in its ``__post_init__``: first that values are of the types of their
+fields, then what they are. Unknown keys are refused.
 """
 
 import bisect
+import os
 import re
+import reprlib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_args, get_origin
 
 import msgspec
 import tomli_w
 
 from ertis_numba import checks
-from ertis_numba.errors import SettingsError
+from ertis_numba.errors import ArgumentError, SettingsError
 
 __all__ = ["Document", "Table"]
 
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
 _KEY = re.compile(r"\s*([\w.-]+)\s*=")
+_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
+_EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
+_WANTED = {
+    "array": "a list",
+    "bool": "true or false",
+    "float": "a number",
+    "int": "a whole number",
+    "null": "None",
+    "str": "text",
+}
+"""What msgspec calls types, in words."""
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a TOML file."""
+    """A table of a TOML file.
+
+    Lists may stand for tuples, whole numbers for numbers, those and arrays of NumPy for Python's own, and paths for
+    their text; fields hold what a file would give.
+    """
+
+    def __post_init__(self) -> None:
+        try:
+            typed = msgspec.convert(self, _plain_twin(type(self)), from_attributes=True)
+        except msgspec.ValidationError:
+            given = {name: _plain(getattr(self, name)) for name in self.__struct_fields__}
+            try:
+                typed = msgspec.convert(given, _plain_twin(type(self)))
+            except msgspec.ValidationError as error:
+                raise ArgumentError(_told_of_type(self, given, str(error))) from None
+        for name in self.__struct_fields__:
+            msgspec.structs.force_setattr(self, name, getattr(typed, name))
+
+    @classmethod
+    def label(cls) -> str:
+        """Return what errors call it."""
+        return cls.__name__.lower().lstrip("_")
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked again.
@@ -57,22 +94,13 @@ class Document(Table, frozen=True, kw_only=True):
         SettingsError
             The text is not TOML, has unknown keys, or a value cannot be used.
         """
-        for former, key in cls.former_keys.items():
-            text = re.sub(rf"\b{former}(?=\s*=)", key, text)
+        text = cls._renamed(text)
         try:
             return msgspec.toml.decode(text, type=cls)
         except msgspec.ValidationError as error:
             line = _line_to_blame(cls, text, error)
             raise SettingsError(_told(cls, source, error, f", line {line}" if line else "")) from error
         except msgspec.DecodeError as error:  # a syntax error, which names its line itself
-            raise SettingsError(_told(cls, source, error)) from error
-
-    @classmethod
-    def from_tables(cls, tables: dict[str, Any], source: str | None = None) -> Self:
-        """Read what a TOML parser returns; errors are those of `from_toml`, without a line."""
-        try:
-            return msgspec.convert(tables, type=cls)
-        except msgspec.ValidationError as error:
             raise SettingsError(_told(cls, source, error)) from error
 
     @classmethod
@@ -84,23 +112,75 @@ class Document(Table, frozen=True, kw_only=True):
         SettingsError
             The file cannot be read or used.
         """
+        return cls._load(Path(path))[0]
+
+    @classmethod
+    def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
+        """Return what is in a file, and the tables of it as they are written, by the keys of now."""
         try:
-            text = Path(path).read_text(encoding="utf-8-sig")
+            text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
-        return cls.from_toml(text, str(path))
+        return cls.from_toml(text, str(path)), msgspec.toml.decode(cls._renamed(text))
+
+    @classmethod
+    def _renamed(cls, text: str) -> str:
+        for former, key in cls.former_keys.items():
+            text = re.sub(rf"\b{former}(?=\s*=)", key, text)
+        return text
 
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""
-        return tomli_w.dumps(_without_none(msgspec.to_builtins(self, enc_hook=_plain)))
+        return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
+
+
+@cache
+def _plain_twin(kind: type[Table]) -> type[msgspec.Struct]:
+    """Return a structure of the same fields that checks their types only; choices are left to their own check."""
+    fields = [
+        (field.name, str if get_origin(field.type) is Literal else field.type) for field in msgspec.structs.fields(kind)
+    ]
+    return msgspec.defstruct(kind.__name__, fields, kw_only=True)
 
 
 def _plain(value: Any) -> Any:
-    """Return a number of NumPy, such as a position that was computed, as Python's own."""
-    if hasattr(value, "item"):
-        return value.item()
-    raise NotImplementedError(f"{type(value).__name__} has no form in TOML")
+    """Return what is of NumPy, such as a position that was computed, or a path, as Python's own."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _told_of_type(table: Table, given: dict[str, Any], error: str) -> str:
+    """Return an error of types in the words of this package: the key, what came, what was wanted."""
+    reason, _, path = error.partition(" - at `$")
+    expected = _EXPECTED.match(reason)
+    if expected is None and reason != "Number out of range":  # a table's own, given as a dictionary
+        return reason
+    value: Any = given
+    for name, place in _PART.findall(path):
+        value = value[name or int(place)]
+    key = f"{table.label()}{path.rstrip('`')}"
+    if expected is None:
+        return f"{key} is beyond all numbers; give a finite number"
+    if expected[2]:
+        return f"{key} has shape ({expected[3]},); give shape ({expected[2]},)"
+    field = next(field for field in msgspec.structs.fields(table) if field.name == _PART.findall(path)[0][0])
+    tables = " or ".join(f"{kind.__name__}(...)" for kind in _tables(field.type))
+    wanted = [_WANTED.get(name, tables) for name in expected[1].split(" | ")]
+    return f"{key} is {' '.join(reprlib.repr(value).split())}; give {' or '.join(wanted)}"
+
+
+def _tables(kind: Any) -> Iterator[type[Table]]:
+    """Yield the tables that a field may hold."""
+    if isinstance(kind, type) and issubclass(kind, Table):
+        yield kind
+    for part in get_args(kind):
+        yield from _tables(part)
 
 
 def _without_none(value: Any) -> Any:

@@ -1,7 +1,8 @@
 """What flows through the system: measurements in, energyscapes and peaks out."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from datetime import UTC, datetime
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from ertis_numba.settings import Settings
 
 __all__ = ["Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"]
+
+_SET_NS: Final = 946_684_800 * 10**9  # the year 2000: nobody has recorded before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +39,25 @@ class Stamp:
     timestamp_ns: int = 0
     timestamp_uncertainty_ns: int = 0
     epoch: int = 0
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether its clock was that of the world: one that was never set, or is simulated, begins at 1970."""
+        return self.timestamp_ns >= _SET_NS
+
+    @property
+    def iso(self) -> str | None:
+        """Its time as ISO 8601 has it, to a nanosecond; None where that is not known."""
+        if not self.is_timed:
+            return None
+        seconds, nanoseconds = divmod(self.timestamp_ns, 10**9)
+        return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds:09d}Z"
+
+    @property
+    def utc(self) -> str | None:
+        """Its time in words, to a millisecond; None where that is not known."""
+        iso = self.iso
+        return iso and f"{iso[:10]} {iso[11:23]} UTC"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from ertis_cli import options
 from ertis_cli.main import COMMANDS, cli
 
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.settings import PRESETS, Air
+from ertis_numba.settings import PRESETS, Air, Array
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
 
@@ -167,6 +167,25 @@ def test_settings_file_changes_what_it_holds(recording, tmp_path):
         assert back.settings.processing.directions == "2d:5"
         assert back.settings.processing.range_decimation == SMALL.processing.range_decimation
         assert len(back.azimuth_rad) == 5
+
+
+def test_files_that_a_settings_file_names_are_beside_it(recording, tmp_path, monkeypatch):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "some.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "two.csv"\n')
+    (folder / "line.csv").write_text("".join(f"{10 * channel}, 0\n" for channel in range(32)))
+    (folder / "two.csv").write_text("-10, 0\n10, 0\n")
+    monkeypatch.chdir(tmp_path)
+    run("process", recording, "-o", "img.h5", "--settings", "mine/some.toml", *FAST[:2])
+    with open_energyscapes(tmp_path / "img.h5") as back:
+        assert back.settings.array.positions_m[1][1] - back.settings.array.positions_m[0][1] == pytest.approx(0.01)
+        np.testing.assert_allclose(np.degrees(back.azimuth_rad), [-10, 10])
+    words = np.zeros(SMALL.recording.n_samples, "<u4")
+    (tmp_path / "a.bin").write_bytes(words.tobytes())
+    (folder / "all.toml").write_text(SMALL.replace(array=Array(layout="line.csv")).to_toml())
+    run("import", "a.bin", "--settings", "mine/all.toml", "-o", "a.h5")
+    with open_recording(tmp_path / "a.h5") as imported:
+        assert len(imported.settings.array.positions_m) == 32
 
 
 def test_settings_file_replaces_an_array_as_a_whole(recording, tmp_path):

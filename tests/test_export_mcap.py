@@ -195,6 +195,24 @@ def test_maps_of_few_directions(azimuth_deg, elevation_deg, shape):
     assert pixels.max() == 255
 
 
+@pytest.mark.parametrize("azimuth_deg", [np.arange(150, 211, 10), [150, 160, 170, 180, -170, -160, -150]])
+def test_the_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_deg):
+    """It is 210°, wherever azimuths are said to begin."""
+    energy = np.geomspace(0.1, 1.0, 7, dtype=np.float32)[:, None].repeat(50, axis=1)  # the farther left, the louder
+    pixels = _pixels(image(azimuth_deg, range_m=np.linspace(0.5, 1.5, 50)).replace(energy=energy))
+    assert pixels.shape == (50, 7)
+    assert (np.diff(pixels[0].astype(int)) < 0).all()
+
+
+def test_a_map_of_what_is_behind_the_sensor_is_that_of_what_is_ahead():
+    azimuth_deg, elevation_deg = (axis.ravel() for axis in np.meshgrid(np.arange(-30, 31, 5), np.arange(-20, 21, 5)))
+    ahead = image(azimuth_deg, elevation_deg)
+    behind = image((azimuth_deg + 360) % 360 - 180, elevation_deg)
+    wanted = _pixels(ahead)
+    assert wanted.shape == (9, 13)
+    np.testing.assert_array_equal(_pixels(behind), wanted)
+
+
 def test_static_transforms(bag):
     message = bag[0]["/tf_static", TIME_NS]
     found = {each.child_frame_id: (each.header.frame_id, told(each.transform)) for each in message.transforms}

@@ -4,6 +4,7 @@ import functools
 import io
 import itertools
 import time
+from dataclasses import replace
 
 import matplotlib.text
 import matplotlib.transforms
@@ -167,6 +168,17 @@ def test_pictures_say_what_they_show(kind):
         wanted += ["method fast", "error up to −35 dB"]
     assert all(word in heading for word in wanted), heading
     assert any("dB" in text for text in texts)
+
+
+@pytest.mark.parametrize("timestamp_ns", [0, 50_000_000, 5 * 10**9, 946_684_800 * 10**9 - 1])
+def test_clocks_that_were_not_set_are_no_time(timestamp_ns):
+    """Simulations count from 0, and a board without a clock from 1970."""
+    stamp = Stamp(sequence=1, timestamp_ns=timestamp_ns)
+    measured = heard(1)
+    for figure in (figures.plot(image().replace(stamp=stamp)), figures.signals(replace(measured, stamp=stamp))):
+        words = " ".join(text.get_text() for text in figure.texts)
+        assert "measurement 1" in words
+        assert "UTC" not in words
 
 
 def test_sizes_of_print():

@@ -379,7 +379,7 @@ def test_something_is_known_as_far_as_directions_are_usually_apart(gaps_deg, wan
         ([*range(-173, -30, 10), *range(-27, 30, 2), *range(33, 174, 10)], True),
         ([*range(-173, -30, 10), *range(-27, 30, 2), *range(33, 164, 10)], False),
     ],
-    ids=["even", "turn", "one missing", "a little more", "three", "two", "ahead", "finer ahead", "finer ahead, one missing"],
+    ids=["even", "turn", "one missing", "a little more", "three", "two", "ahead", "finer ahead", "finer, one missing"],
 )
 def test_directions_go_all_around_where_no_more_is_missing_than_elsewhere(azimuth_deg, wanted):
     assert is_closed(np.radians(azimuth_deg)) == wanted

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.frames import Measurement
+from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Call, Recording, Settings
 from ertis_numba.simulation import Electronics, Point, Tone
@@ -326,7 +326,8 @@ def run(*arguments, code=0):
 @pytest.fixture
 def sick(tmp_path):
     """Ten measurements; the last one alone has a stuck bit."""
-    given = [real()] * 9 + [dataclasses.replace(real(), words=real().words & ~np.uint32(1 << 4))]
+    words = [real().words] * 9 + [real().words & ~np.uint32(1 << 4)]
+    given = [Measurement(each, REAL, Stamp(sequence=number)) for number, each in enumerate(words)]
     return write_recording(tmp_path / "rec.h5", given)
 
 
@@ -353,7 +354,8 @@ def test_info_tells_the_health(sick, tmp_path):
 def faulty(tmp_path):
     """A recording whose first measurement has two stuck bits."""
     words = real().words & ~np.uint32(1 << 4) | np.uint32(1 << 9)
-    return write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), words=words), real()])
+    second = dataclasses.replace(real(), stamp=Stamp(sequence=1))
+    return write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), words=words), second])
 
 
 FAST = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet"]

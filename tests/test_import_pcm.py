@@ -266,6 +266,18 @@ def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
         ertis.open_pcm(tmp_path / "a.h5")
 
 
+@pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
+def test_numbers_of_acoular_have_one_full_scale(tmp_path, kind):
+    given = numbers()
+    most = 1.0 if kind.startswith("f") else -float(np.iinfo(kind).min)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_data"] = (np.rint(given * most).clip(-most, most - 1) if most > 1 else given).astype(kind)
+        file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
+    (measurement,) = reader = ertis.open_pcm(tmp_path / "a.h5", PCM)
+    signals = measurement.words / reader.settings.recording.full_scale
+    assert np.abs(signals - given).max() <= (2.0**-7 if kind == "int8" else 2.0**-15)
+
+
 def test_other_hdf5_is_refused(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     with pytest.raises(DataError, match=r"holds no time_data with a sample_freq; give a file of Acoular"):
@@ -289,6 +301,15 @@ def test_from_wav_to_reflectors(tmp_path, measurement):
     first, second = json.loads(command("peaks", tmp_path / "img.h5", "--top", "2", "--json"))["peaks"]
     assert first["azimuth_deg"] == pytest.approx(24.0, abs=0.2)
     assert second["range_m"] == pytest.approx(1.6, abs=1e-3)
+
+
+def test_air_goes_before_that_of_the_signals(tmp_path, measurement):
+    ertis.export(tmp_path / "a.h5", [measurement], file_format="acoular")
+    command("import", tmp_path / "a.h5", "--temperature", 3, "-o", tmp_path / "rec.h5")
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.settings.air == PCM.air.replace(temperature_c=3.0)
+        assert recording[0].settings.air == recording.settings.air
+        assert recording.settings.call == PCM.call
 
 
 def test_times_and_what_hinders_are_told(tmp_path):

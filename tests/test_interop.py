@@ -63,6 +63,21 @@ def test_lengths_that_are_refused(tmp_path, n_bytes, message):
         open_raw(tmp_path / "raw.bin", SHORT)
 
 
+@pytest.mark.parametrize(
+    ("settings", "n_bytes", "message"),
+    [
+        pytest.param(line(8, 8), 163_840, r"its length fits the presets default_…$", id="8"),
+        pytest.param(line(70, 16), 2 * 5 * 65_536, r"its length fits the presets short_…$", id="70 in 16"),
+        pytest.param(line(64, 64), 4 * 163_840, r"copy it again if it is cut short", id="half of 64"),
+    ],
+)
+def test_presets_that_fit_depend_on_the_array(tmp_path, settings, n_bytes, message):
+    settings = settings.replace(recording=Recording(n_samples=100_003))
+    (tmp_path / "raw.bin").write_bytes(bytes(n_bytes))
+    with pytest.raises(DataError, match=message):
+        open_raw(tmp_path / "raw.bin", settings)
+
+
 def test_places_that_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"none.bin: No such file or directory; give a file of raw words"):
         open_raw(tmp_path / "none.bin", SHORT)

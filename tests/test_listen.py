@@ -4,6 +4,8 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from ertis_cli._heard import Heard
 from ertis_cli.main import cli
 
 from ertis_numba.network.keys import KeyPair
+from ertis_numba.network.products import Arrival
 from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
 from tests.central import running
 from tests.pages import environment
@@ -151,6 +154,16 @@ def test_where_nobody_answers_that_is_told_once(monkeypatch):
     assert done.stderr.splitlines() == [text, "0 received, 0 dropped"]
     waiting, _ = events(done)
     assert waiting == {"event": "waiting", "address": "tcp://127.0.0.1:1", "text": text}
+
+
+def test_points_are_found_in_the_directions_of_each_image(capsys):
+    """Also where a part of what came before is kept."""
+    heard, flat = Heard(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
+    raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
+    for item in (flat, raised):
+        heard.product(Arrival(item, SimpleNamespace(number=0), 0, 0, 0), SimpleNamespace(dropped=0))
+    found = [json.loads(line)["nearest"]["elevation_deg"] for line in capsys.readouterr().out.splitlines()]
+    assert found == [0.0, 20.0]
 
 
 def test_who_comes_late_is_told_of(capsys):

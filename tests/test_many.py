@@ -286,6 +286,42 @@ def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
     assert told == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
+def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(runs, out, monkeypatch):
+    searched = []
+
+    def died_of_c(do, about, *more):
+        if do == "make" and about["path"].endswith("c.h5"):
+            return {"error": "ended by SIGKILL", "by_chance": True}
+        return work.follow(do, about, *more)
+
+    monkeypatch.setattr("tests.campaigns.follow", died_of_c)
+    monkeypatch.setattr(campaign, "clear_parts", lambda _, names: searched.append(set(names)))
+    (runs / "b.h5").write_bytes(b"no recording")
+    found, _ = run_here(monkeypatch, [runs], out, Options(settings=narrow))
+    assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made"}
+    assert searched[1:-1] == [{"c.energy.h5"}]  # between what is done before all and after it
+
+
+def test_a_pipeline_that_another_thread_has_made_again_is_closed(monkeypatch):
+    made = []
+
+    class Counted:
+        def __init__(self, settings, **_):
+            self.settings, self.closed = settings, 0
+            made.append(self)
+
+        def close(self):
+            self.closed += 1
+
+    monkeypatch.setattr(work, "Pipeline", Counted)
+    monkeypatch.setattr(work, "_kept", {})
+    borrow = vars(work)["_pipelines"]
+    with borrow([SMALL], "cpu", 1) as (first,), borrow([SMALL], "cpu", 1) as (second,):
+        assert first is not second
+    with borrow([SMALL], "cpu", 1) as (again,):
+        assert [each.closed for each in made] == [again is not each for each in made]
+
+
 class Watched(Here):
     """A crew that notes how many orders it has in hand whenever it gets one, and what it had when it was limited."""
 
@@ -336,7 +372,7 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, most):
     ],
 )
 def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
-    monkeypatch.setattr(campaign, "_n_cores", lambda: 4)
+    monkeypatch.setattr(campaign, "usable_cores", lambda: 4)
     recordings = [Source(Path(f"{number}.h5")) for number in range(count)]
     assert Campaign(recordings, tmp_path / "out", wanted, workers=workers).workers == found
 

@@ -5,15 +5,16 @@ import pytest
 
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Point, Scene, Sensor
-from ertis_numba.stages import planner
+from ertis_numba.stages import finder, planner
 from ertis_numba.stages.cfar import clean
 from ertis_numba.stages.detect import _interpolate, find_peaks, neighbours_of
 from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.finder import PointFinder
 from ertis_numba.stages.points import PointExtractor
 from tests.cases import noise as words_of_noise
 from tests.scenes import heard
@@ -256,6 +257,49 @@ def test_what_an_array_cannot_tell_is_infinite(positions_m, directions, is_finit
     assert len(uncertainty_m) > 2
     assert np.isfinite(uncertainty_m[:, 0]).all()
     assert np.isfinite(uncertainty_m[:, 1]).all() == is_finite
+
+
+def few_points():
+    return image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"call": Call(start_frequency_hz=90e3, stop_frequency_hz=20e3)},
+        {"array": Array(layout="uRTIS_v1")},
+        {"air": Air(temperature_c=35.0)},
+        {"processing": Processing(directions="2d:181", beamformer="dmas")},
+    ],
+    ids=["call", "array", "air", "beamformer"],
+)
+def test_a_finder_finds_what_an_extractor_does_though_settings_change(changes):
+    image = few_points()
+    changed = image.replace(settings=image.settings.replace(**changes))
+    find = PointFinder(top=2)
+    for each in (image, changed, image):
+        wanted, found = PointExtractor(each.settings, top=2)(each), find(each)
+        np.testing.assert_array_equal(found.position_m, wanted.position_m)
+        np.testing.assert_array_equal(found.uncertainty_m, wanted.uncertainty_m)
+    assert find(changed).settings is changed.settings
+
+
+def test_a_finder_finds_in_the_directions_of_each_sensor():
+    image, other = few_points(), noise("3d:60")
+    find = PointFinder()
+    for each in (image, other, other.replace(stamp=Stamp(sensor="other")), image):
+        np.testing.assert_array_equal(find(each).position_m, PointExtractor(each.settings)(each).position_m)
+
+
+def test_a_finder_makes_tables_once_for_a_sensor(monkeypatch):
+    made = []
+    monkeypatch.setattr(finder, "PointExtractor", lambda *given: made.append(given) or PointExtractor(*given))
+    find, image = PointFinder(), few_points()
+    warmer = image.settings.replace(air=Air(temperature_c=35.0))
+    for sensor in ("front", "left", "front", "left"):
+        find(image.replace(stamp=Stamp(sensor=sensor)))
+        find(image.replace(stamp=Stamp(sensor=sensor), settings=warmer, azimuth_rad=image.azimuth_rad.copy()))
+    assert len(made) == 2
 
 
 def test_known_positions_in_the_frame_of_rep_103():

@@ -41,6 +41,12 @@ def test_python_lines(place):
     assert (place / "image.png").stat().st_size > 10_000
 
 
+def test_every_folder_is_told_of():
+    _, _, told = README.partition("## Where things are")
+    folders = {path.parent.name for path in (ROOT / "ertis_numba").glob("*/__init__.py")}
+    assert {name for name in folders if f"`{name}/`" not in told and f"`ertis_numba/{name}/`" not in told} == set()
+
+
 def test_commands(place):
     """Each in a process of its own where it is shown first."""
     started = set()

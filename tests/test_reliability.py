@@ -41,6 +41,10 @@ def test_no_fault_on_the_wire_is_taken_for_a_measurement():
     assert found["untouched_lost"] == found["mixed"] == found["wrong_counter"] == found["twice"] == 0
 
 
+def test_a_plug_after_which_nothing_came_has_no_time():
+    assert vars(captures)["_waits_s"]([1_000_000_000, 5_000_000_000], [0, 4_000_000_000, 2_500_000_000]) == [1.5]
+
+
 def test_a_pulled_plug(tmp_path):
     found = captures.unplugs(SOURCE, tmp_path, seed=SEED, count=SHORT.n_unplugs)
     assert (found["noticed"], found["wrong"]) == (SHORT.n_unplugs, 0)

@@ -25,6 +25,7 @@ from ertis_numba.settings import (
     Processing,
     Recording,
     Settings,
+    suit_ranges,
 )
 
 TWO = ((0.0, 0.0, 0.0), (0.0, 0.01, 0.0))
@@ -204,6 +205,18 @@ def test_bad_settings_are_refused(text, message):
         (lambda: Array(word_bits="32"), r"array\.word_bits is '32'; give a whole number"),
         (lambda: Array(positions_m=((0.0, 0.0),)), r"array\.positions_m\[0\] has shape \(2,\); give shape \(3,\)"),
         (lambda: Array(positions_m=((0.0,) * 3,) * 1025), r"number of array\.positions_m is 1025; give .* 1 to 1024"),
+        (lambda: Array(positions_m=TWO, enabled=(1, 0)), r"array\.enabled\[0\] is 1; give true or false"),
+        (lambda: Array(positions_m=TWO, enabled=("yes", "no")), r"array\.enabled\[0\] is 'yes'; give true or false"),
+        (lambda: Array(positions_m=5), r"array\.positions_m is 5; give a list or None"),
+        (lambda: Array(layout=3), r"array\.layout is 3; give text"),
+        (lambda: Accuracy(zones=1.5), r"accuracy\.zones is 1\.5; give a whole number or None"),
+        (lambda: Processing(range_m="12"), r"processing\.range_m is '12'; give a list"),
+        (lambda: Processing(range_m=(1, 2, 3)), r"processing\.range_m has shape \(3,\); give shape \(2,\)"),
+        (lambda: Processing(range_m=(1, 10**400)), r"processing\.range_m\[1\] is beyond all .*; give a finite number"),
+        (lambda: Processing(method=3), r"processing\.method is 3; give text"),
+        (lambda: Settings(processing="90"), r"settings\.processing is '90'; give Processing\(\.\.\.\)"),
+        (lambda: Settings(air={"pressure_pa": "low"}), r"settings\.air\.pressure_pa is 'low'; give a number"),
+        (lambda: Settings(air={"pressure_pa": 1}), r"^air\.pressure_pa is 1; give a number from 10000 to 200000$"),
         (lambda: Processing(method="slow"), r"processing\.method 'slow' is unknown; known are fast, paper"),
         (lambda: Air(temperature_c="warm"), r"air\.temperature_c is 'warm'; give a number"),
         (lambda: Air().replace(temperature=3), r"Air field 'temperature' is unknown .did you mean 'temperature_c'"),
@@ -214,6 +227,28 @@ def test_bad_settings_are_refused(text, message):
 def test_bad_arguments_are_refused(make, message):
     with pytest.raises(ArgumentError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("made", "wanted"),
+    [
+        pytest.param(Processing(range_m=[0.5, 1]), Processing(range_m=(0.5, 1.0)), id="a list"),
+        pytest.param(Processing(range_m=np.array([0.5, 1])), Processing(range_m=(0.5, 1.0)), id="an array"),
+        pytest.param(Processing(dmas_order=np.int64(3)), Processing(dmas_order=3), id="a number of NumPy"),
+        pytest.param(Processing(directions=Path("d.csv")), Processing(directions="d.csv"), id="a path of directions"),
+        pytest.param(Array(layout=Path("mine.csv")), Array(layout="mine.csv"), id="a path of a layout"),
+        pytest.param(Array(positions_m=np.array(TWO)), Array(positions_m=TWO), id="positions"),
+        pytest.param(
+            Array(positions_m=TWO, enabled=np.array([True, False])),
+            Array(positions_m=TWO, enabled=(True, False)),
+            id="flags",
+        ),
+    ],
+)
+def test_what_stands_for_a_field_is_taken_as_a_file_gives_it(made, wanted):
+    assert made == wanted
+    assert hash(made) == hash(wanted)
+    assert repr(made) == repr(wanted)  # 1 is equal to 1.0, and a number of NumPy to Python's
 
 
 def test_each_interpolation_takes_the_taps_that_it_implies():
@@ -316,3 +351,61 @@ def test_files_that_settings_name_are_beside_them(tmp_path, monkeypatch):
     (folder / "s.toml").write_text('[array]\nlayout = "uRTIS_v1"\n[processing]\ndirections = "90"\n')
     named = Settings(array=Array(layout="uRTIS_v1"), processing=Processing(directions="90"))
     assert Settings.load("mine/s.toml") == named
+
+
+def test_a_file_changes_what_it_holds_and_names_files_beside_it(tmp_path, monkeypatch):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    known = Settings(
+        array=Array(layout="of a recording", positions_m=TWO, gain=(2.0, 3.0)),
+        recording=Recording(n_samples=100_000),
+        processing=Processing(directions="near.csv", range_m=(1.0, 2.0)),
+    )
+    (folder / "s.toml").write_text("\ufeff[recording]\npdm_rate_hz = 4e6\n[processing]\nrange_m = [1, 3]\n", "utf-8")
+    changed = known.changed_by("mine/s.toml")
+    assert changed.recording == Recording(sample_rate_hz=4e6, n_samples=100_000)
+    assert changed.processing == known.processing.replace(range_m=(1.0, 3.0))
+    assert (changed.array, changed.call) == (known.array, known.call)
+    (folder / "s.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "far.csv"\n')
+    changed = known.changed_by("mine/s.toml")
+    assert changed.array == Array(layout=str(Path("mine/line.csv")))
+    assert changed.processing == known.processing.replace(directions=str(Path("mine/far.csv")))
+
+
+def test_a_file_that_does_not_suit_the_rest_is_refused(tmp_path):
+    (tmp_path / "s.toml").write_text("[processing]\nrange_decimation = 50\n")
+    known = Settings(processing=Processing(decimation=20))
+    with pytest.raises(SettingsError, match=r"s\.toml: processing\.decimation is 20; give a divisor of .* \(50\)"):
+        known.changed_by(tmp_path / "s.toml")
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "band_hz", "step"),
+    [
+        pytest.param(4.5e6, (25e3, 50e3), 100, id="the paper's"),
+        pytest.param(4.5e6, (20e3, 80e3), 40, id="the wide preset"),
+        pytest.param(4.5e6, (40e3, 50e3), 100, id="a narrow band keeps the default"),
+        pytest.param(1e6, (25e3, 50e3), 20, id="a multiple of 4"),
+        pytest.param(192e3, (25e3, 50e3), 4, id="PCM"),
+        pytest.param(192e3, (15e3, 90e3), 1, id="no room"),
+    ],
+)
+def test_ranges_suit_rate_and_band(rate_hz, band_hz, step):
+    call = Call(start_frequency_hz=band_hz[1], stop_frequency_hz=band_hz[0])
+    recording = Recording(sample_rate_hz=rate_hz, n_samples=round(rate_hz / 20))
+    assert suit_ranges(Processing(), recording, call).range_decimation == step
+
+
+def test_a_window_is_where_the_whole_echo_fits():
+    def window_m(n_samples, **processing):
+        recording = Recording(sample_rate_hz=1e6, n_samples=n_samples)
+        return suit_ranges(Processing(**processing), recording, Call()).range_m
+
+    assert window_m(10**6) == (0.5, 5.0)
+    assert window_m(22_500) == (0.5, 3.0)
+    assert window_m(5_000) == (0.0, 0.3)
+    assert window_m(2_810) == (0.0, 0.046)  # less than a step of the window
+    assert window_m(2_810, range_m=(0.2, 9.0)) == (0.2, 9.0)
+    with pytest.raises(ArgumentError, match=r"recording lasts 2\.5 ms, the call alone 2\.5 ms; give more samples"):
+        window_m(2_500)

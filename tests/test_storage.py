@@ -22,6 +22,7 @@ from ertis_numba.storage import (
     write_recording,
 )
 from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, lay_out
+from ertis_numba.words import word_format
 from tests.files import SMALL, image, line, noise
 
 
@@ -270,6 +271,96 @@ def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", measurements)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("stamp", "message"),
+    [
+        (Stamp(sequence=2**63), "sequence is 9223372036854775808; give a whole number from 0"),
+        (Stamp(sequence=-1), "sequence is -1; give a whole number from 0"),
+        (Stamp(sequence=1.0), "sequence is 1.0; give a whole number"),
+        (Stamp(timestamp_ns=2**63), "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808"),
+        (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; give"),
+        (Stamp(epoch=2**63), "epoch is 9223372036854775808; give"),
+    ],
+    ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "epoch"],
+)
+def test_stamps_that_no_file_can_hold(tmp_path, stamp, message):
+    with pytest.raises(ArgumentError, match=message):
+        write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].words, SMALL, stamp)])
+    with pytest.raises(ArgumentError, match=message):
+        write_energyscapes(tmp_path / "img.h5", [image().replace(stamp=stamp)])
+    assert not list(tmp_path.iterdir())
+
+
+def numbered(*numbers, epoch=0):
+    words = noise(count=1)[0].words
+    return [Measurement(words, SMALL, Stamp(sequence=number, epoch=epoch)) for number in numbers]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "place"),
+    [((0, 0), 1), ((3, 4, 3), 2), ((7, 2, 5, 2), 3), ((7, 2, 5, 7), 3), ((9, 4, 4), 2)],
+    ids=["at once", "rising", "falling", "highest", "late"],
+)
+def test_a_number_comes_once_in_a_run(tmp_path, numbers, place):
+    message = rf"measurement {place} has sequence {numbers[place]} of epoch 0, which one before it has; give each"
+    with pytest.raises(ArgumentError, match=message):
+        write_recording(tmp_path / "rec.h5", numbered(*numbers))
+    given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], epoch=1)]
+    given += [Measurement(m.words, SMALL, Stamp(sensor="other", sequence=m.stamp.sequence)) for m in given[:place]]
+    write_recording(tmp_path / "rec.h5", given)
+
+
+def test_numbers_that_have_not_come_may_come_late(tmp_path):
+    order = np.random.default_rng(1).permutation(50).tolist()
+    path = write_recording(tmp_path / "rec.h5", numbered(*order))
+    with open_recording(path) as recording:
+        assert [stamp.sequence for stamp in recording.stamps()] == order
+
+
+PCM_OF = {
+    encoding: line(4, 8).replace(recording=Recording(sample_rate_hz=192_000.0, n_samples=64, encoding=encoding))
+    for encoding in ("int16", "float32")
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "dtype"),
+    [
+        (SMALL, "float64"),
+        (SMALL, "int32"),
+        (SMALL, "uint16"),
+        (PCM_OF["int16"], "float32"),
+        (PCM_OF["int16"], "int32"),
+        (PCM_OF["int16"], "uint8"),
+        (PCM_OF["float32"], "float64"),
+        (PCM_OF["float32"], "int16"),
+    ],
+    ids=lambda given: given if isinstance(given, str) else given.recording.encoding,
+)
+def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, dtype):
+    words = word_format(settings)
+    message = rf"measurement 0 holds {dtype} words, its settings want {words.dtype.name}; convert them, or give"
+    with pytest.raises(ArgumentError, match=message):
+        write_recording(tmp_path / "rec.h5", [Measurement(np.zeros(words.shape, dtype), settings)])
+
+
+@pytest.mark.parametrize("settings", [SMALL, *PCM_OF.values()], ids=["pdm", *PCM_OF])
+def test_words_of_another_byte_order_are_the_same_words(tmp_path, settings):
+    given = np.ones(word_format(settings).shape, word_format(settings).dtype.newbyteorder(">"))
+    write_recording(tmp_path / "rec.h5", [Measurement(given, settings)])
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert np.array_equal(recording[0].words, given)
+
+
+@pytest.mark.parametrize("number", [np.nan, -np.inf], ids=str)
+def test_what_is_no_number_is_not_recorded(tmp_path, number):
+    settings = PCM_OF["float32"]
+    words = np.zeros(word_format(settings).shape, np.float32)
+    words[7, 2] = number
+    with pytest.raises(ArgumentError, match=rf"measurement 0 holds {number} at \[7, 2\]; give finite numbers"):
+        write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
 
 
 @pytest.mark.parametrize(

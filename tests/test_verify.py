@@ -80,6 +80,13 @@ def test_gaps_and_all_damaged_measurements_are_told(recording):
     assert (told["whole"], told["sensors"][0]["missing"], len(told["sensors"][0]["damaged"])) == (False, 6, 4)
 
 
+@pytest.fixture
+def unnumbered(monkeypatch):
+    """Write as a program would that gives numbers as it likes."""
+    monkeypatch.setattr(RecordingWriter, "_numbered", False)
+
+
+@pytest.mark.usefixtures("unnumbered")
 def test_disorder_is_told(tmp_path):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2, 4, 3, 4))
     (report,) = verify(path)
@@ -87,6 +94,7 @@ def test_disorder_is_told(tmp_path):
     assert "1 out of order (at 3)" in run("verify", path, code=3).stdout
 
 
+@pytest.mark.usefixtures("unnumbered")
 def test_a_number_that_comes_twice_is_told(tmp_path):
     write_recording(tmp_path / "rec.h5", measurements(1, 2, 2, 3))
     done = run("verify", tmp_path / "rec.h5", code=3)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
-from ertis_numba.settings import Processing
+from ertis_numba.settings import Call, Processing
 from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, Scene, Sector, Taken, _axes
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._choices import colour_table
@@ -217,6 +217,20 @@ def test_the_points_that_are_saved_are_those_that_are_drawn():
         assert len(stored) == drawn.n_points > 3
         np.testing.assert_allclose(stored, drawn.position_m, atol=1e-5)
         assert np.isfinite(vertex["uncertainty_range"]).all()
+
+
+def test_points_have_the_uncertainty_of_their_own_call():
+    """Also where a sensor calls otherwise from one image to the next."""
+    first = spot(10, 1.5)
+    wider = first.settings.replace(call=Call(start_frequency_hz=90e3, stop_frequency_hz=20e3))
+    second = first.replace(settings=wider)
+    scenes = Scene(), Scene()
+    scenes[0].take(taken(first, TURNED))
+    for scene in scenes:
+        scene.take(taken(second, TURNED, time_s=1.0))
+    (_, found, _), (_, wanted, _) = (scene.latest(Choices())[0] for scene in scenes)
+    assert np.isfinite(wanted.uncertainty_m).all()
+    np.testing.assert_array_equal(found.uncertainty_m, wanted.uncertainty_m)
 
 
 def test_nothing_is_drawn_beyond_the_image():

@@ -323,6 +323,7 @@ LAG = """() => new Promise(resolve => {
 })"""
 
 
+@pytest.mark.alone
 def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
     with ExitStack() as stack:
         served = stack.enter_context(serving(*LOOPBACK, "--workers", "1", "--device", "cpu"))

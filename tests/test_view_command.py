@@ -6,6 +6,8 @@ import re
 import signal
 import socket
 import sys
+import threading
+import webbrowser
 
 import pytest
 from click.testing import CliRunner
@@ -18,7 +20,7 @@ from ertis_numba.viewer._recordings import MOST_BYTES
 from tests.pages import ROOT, commands_in, run, run_here
 from tests.publishing import Publisher
 from tests.publishing import image as published
-from tests.views import stamped
+from tests.views import PATIENCE_S, stamped
 
 BIND = socket.socket.bind
 
@@ -184,3 +186,57 @@ def test_the_limit_of_recordings_is_the_one_that_is_told():
     told = f"at most {MOST_BYTES / 1e6:g} MB"
     assert told in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
     assert told in " ".join((ROOT / "docs" / "view.md").read_text().split())
+
+
+class InTerminal(webbrowser.GenericBrowser):
+    """A browser that returns when somebody ends it."""
+
+    def __init__(self):
+        super().__init__("w3m")
+        self.came, self.ended = threading.Event(), threading.Event()
+
+    def open(self, url, *_):
+        self.url = url
+        self.came.set()
+        assert self.ended.wait(PATIENCE_S)
+
+
+def test_a_browser_does_not_keep_the_view_from_beginning(tmp_path, monkeypatch):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    browser = InTerminal()
+    monkeypatch.setattr(webbrowser, "get", lambda: browser)
+    done = CliRunner().invoke(cli, ["view", str(path), "--open", "--port", "0", "--duration", "0.1", "--json"])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    assert browser.came.wait(PATIENCE_S)
+    assert browser.url == json.loads(done.stdout)["url"]
+    assert not browser.ended.is_set()
+    browser.ended.set()
+
+
+@pytest.mark.parametrize(
+    ("browser", "is_opened"),
+    [
+        (webbrowser.BackgroundBrowser("xdg-open"), True),
+        (webbrowser.Chrome("chromium"), True),
+        (webbrowser.BaseBrowser("another system's"), True),
+        (webbrowser.GenericBrowser("w3m"), False),
+        (webbrowser.Elinks("elinks"), False),
+    ],
+    ids=["xdg-open", "chromium", "other", "w3m", "elinks"],
+)
+def test_a_browser_that_takes_the_terminal_is_opened_for_who_asks(monkeypatch, browser, is_opened):
+    opened = []
+    monkeypatch.setattr(webbrowser, "get", lambda: browser)
+    monkeypatch.setattr(browser, "open", opened.append)
+    view._open("page", asked=False)  # noqa: SLF001  what a terminal is needed for
+    assert opened == ["page"] * is_opened
+    view._open("page", asked=True)  # noqa: SLF001
+    assert opened == ["page"] * (is_opened + 1)
+
+
+def test_where_there_is_no_browser_none_is_opened(monkeypatch):
+    def get():
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", get)
+    view._open("page", asked=True)  # noqa: SLF001  as above

@@ -33,6 +33,13 @@ def test_a_film_shows_all_sensors_of_a_moment_together(tmp_path):
         assert film.moments[2].measurements == (("left", 2),)
 
 
+def test_a_film_of_one_sensor_takes_its_name(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(2, sensors=("front", "left")))
+    for named in ("left", ["left"]):
+        with Film(path, sensors=named) as film:
+            assert [moment.measurements for moment in film.moments] == [(("left", 0),), (("left", 1),)]
+
+
 def test_a_film_plays_pauses_and_steps(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(4))
     with Film(path) as film:
@@ -113,7 +120,7 @@ def test_after_a_seek_nothing_of_another_time_is_shown(tmp_path):
         def shown_at(place):
             view._orders.put(Order("seek", place))  # noqa: SLF001  as a browser does
             wait_for(lambda: view.run(duration_s=0.02) or film.shown == place)
-            return {name: drawn.sequence for name, drawn in view._frame.sensors.items()}  # noqa: SLF001
+            return {name: drawn.stamp.sequence for name, drawn in view._frame.sensors.items()}  # noqa: SLF001
 
         assert shown_at(10) == {"a": 5, "b": 4}
         assert shown_at(2) == {"a": 1, "b": 0}

@@ -33,6 +33,15 @@ def view_of(source, **choices):
     return View(source, port=0, choices=Choices(**choices))
 
 
+def test_images_whose_clock_was_not_set_have_no_age_by_it():
+    """Those of others beside them have."""
+    unset, timed = (taken(spot(0, 2.0, timestamp_ns=at_ns)) for at_ns in (50_000_000, 1_700_000_000 * 10**9))
+    with Live("tcp://127.0.0.1:1") as live:
+        assert live.latency_s([unset]) is None
+        assert live.latency_s([]) is None
+        assert live.latency_s([unset, timed]) == pytest.approx(time.time() - 1_700_000_000, abs=5)
+
+
 def test_what_fades_is_drawn_again_though_nothing_comes():
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]

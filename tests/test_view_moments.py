@@ -24,6 +24,23 @@ def times_s(found):
     return [moment.time_s for moment in found]
 
 
+@pytest.mark.parametrize(
+    ("at_ns", "iso", "utc"),
+    [
+        (0, None, None),
+        (50_000_000, None, None),
+        (-1, None, None),
+        (946_684_799_999_999_999, None, None),
+        (946_684_800_000_000_000, "2000-01-01T00:00:00.000000000Z", "2000-01-01 00:00:00.000 UTC"),
+        (1_700_000_000_123_456_789, "2023-11-14T22:13:20.123456789Z", "2023-11-14 22:13:20.123 UTC"),
+        (2**63 - 1, "2262-04-11T23:47:16.854775807Z", "2262-04-11 23:47:16.854 UTC"),
+    ],
+)
+def test_a_time_is_told_where_the_clock_was_set(at_ns, iso, utc):
+    stamp = Stamp(timestamp_ns=at_ns)
+    assert (stamp.is_timed, stamp.iso, stamp.utc) == (iso is not None, iso, utc)
+
+
 def test_a_clock_that_is_set_halfway_plays_on():
     found, notes = moments(a=steps(BOOT_NS, 3) + steps(NOW_NS, 5))
     assert times_s(found) == pytest.approx([number / 10 for number in range(8)])

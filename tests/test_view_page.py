@@ -5,7 +5,9 @@ import http.client
 import re
 import socket
 from contextlib import closing
+from types import SimpleNamespace
 
+import msgspec
 import pytest
 import viser
 import zstandard
@@ -90,6 +92,13 @@ def embedded(page):
     return zstandard.ZstdDecompressor().decompressobj().decompress(packed[8:])
 
 
+def times_s(page):
+    """When something is drawn in a page, and how long it lasts."""
+    inner = embedded(page)
+    held = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
+    return {time_s for time_s, _ in held["messages"]}, held["durationSeconds"]
+
+
 def moving(count):
     """Images of a reflector that is elsewhere in each, each of which takes 1.4 kB of a recording."""
     return [spot(2 * number, 2.0, sequence=number, timestamp_ns=round(1e18 + number * 5e7)) for number in range(count)]
@@ -119,6 +128,35 @@ def test_a_browser_does_not_end_the_recording_of_another(tmp_path):
     assert name == "img.html"
     assert embedded(content.decode())
     assert len(other.files) == 1
+
+
+def test_a_recording_lasts_as_long_as_somebody_recorded(tmp_path, monkeypatch):
+    """Not since what it begins with was drawn, and until its end though nothing more comes."""
+    source, client = Source(), Client()
+    clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
+    monkeypatch.setattr(viewing, "time", clock)
+    with View(source, port=0) as view:
+
+        def come():
+            source.waiting = [taken(spot(5 * len(turns), 2.0), time_s=source.clock_s)]
+
+        def press():
+            view._orders.put(Order("record", client=client))  # noqa: SLF001  as a browser does
+
+        turns = [(0.0, come), (7.0, come), (600.0, press), (2.0, come), (3.0, press), (4.0, come), (5.0, view.stop)]
+        turns.append((0.0, list))  # the one in which it ends
+
+        def turn():
+            after_s, does = turns.pop(0)
+            clock.now_s += after_s
+            does()
+            return []
+
+        source.notes = turn
+        view.run(html=tmp_path / "ours.html")
+    ((_, content),) = client.files
+    assert times_s(content.decode()) == ({0.0, 2.0}, 5.0)
+    assert times_s((tmp_path / "ours.html").read_text()) == ({0.0, 7.0, 609.0, 616.0}, 621.0)
 
 
 def test_a_recording_is_made_by_who_began_it_though_a_browser_records(tmp_path):

@@ -92,15 +92,21 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
     events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
     plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
-    stored_ns = sorted(line["timestamp_ns"] for line in lines if line["event"] == "stored")
-    after_s = [(min(t for t in stored_ns if t > plugged) - plugged) / 1e9 for plugged in plugged_ns]
+    stored_ns = [line["timestamp_ns"] for line in lines if line["event"] == "stored"]
+    after_s = _waits_s(plugged_ns, stored_ns)
     return {
         "unplugged": count,
-        "noticed": len(back_s),
+        "noticed": min(len(back_s), len(after_s)),
         "wrong": found["wrong"],
         "stored": lines[-1]["stored"],
         "slowest_s": max(after_s, default=0.0),
     }
+
+
+def _waits_s(plugged_ns: list[int], stored_ns: list[int]) -> list[float]:
+    """Return the times from each plug-in to the first measurement after it, where there is one."""
+    firsts = ((plugged, min((t for t in stored_ns if t > plugged), default=None)) for plugged in plugged_ns)
+    return [(first - plugged) / 1e9 for plugged, first in firsts if first is not None]
 
 
 def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
@@ -193,7 +199,7 @@ def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
 
 
 def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
-    """Start a capture, kill it and all that it has started some time after its first line, return what it printed."""
+    """Start a capture, kill it some time after its first line, return what it printed; one that seals goes on."""
     command = [*_ERTIS, "capture", *_ports(ports), "-o", str(target), "--rate", "20", "--json", "--quiet", "-n", "16"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
         assert process.stdout is not None  # noqa: S101  it is a pipe

@@ -6,6 +6,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ertis_numba.cores import usable_cores
+
 __all__ = ["describe", "sentence"]
 
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
@@ -25,7 +27,7 @@ def describe() -> dict[str, Any]:
     flags = processor.get("flags", processor.get("Features", "")).split()
     return {
         "cpu": processor.get("model name") or platform.processor() or platform.machine(),
-        "cores": _usable_cores(),
+        "cores": usable_cores(),
         "flags": [flag for flag in _FLAGS if flag in flags],
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -42,12 +44,6 @@ def _processor() -> dict[str, str]:
     block = path.read_text("utf-8").split("\n\n")[0]
     pairs = (line.partition(":") for line in block.splitlines())
     return {key.strip(): value.strip() for key, _, value in pairs}
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def sentence(machine: dict[str, Any]) -> str:

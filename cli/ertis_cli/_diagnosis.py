@@ -89,11 +89,12 @@ def _versions(_folder: Path) -> Iterator[Finding]:
 
 def _processor(_folder: Path) -> Iterator[Finding]:
     from ertis_numba import kernels
+    from ertis_numba.cores import usable_cores
     from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     threads = kernels.load("cpu").max_threads
     few = threads < cores
     yield Finding(

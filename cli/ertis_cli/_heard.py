@@ -1,5 +1,6 @@
 """What is told of what a central node publishes."""
 
+import functools
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,10 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.frames import Energyscape, PointCloud
+    from ertis_numba.frames import PointCloud
     from ertis_numba.network.products import Arrival
     from ertis_numba.network.subscriber import SubscriberCounts
-    from ertis_numba.stages.points import PointExtractor
+    from ertis_numba.stages.finder import PointFinder
 
 __all__ = ["Heard"]
 
@@ -28,7 +29,6 @@ class Heard:
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self._said = self._noted = False
-        self._extractors: dict[tuple[str, int], PointExtractor] = {}
 
     def head(self) -> None:
         """Print what the columns are."""
@@ -120,7 +120,7 @@ class Heard:
 
         item = arrival.item
         if isinstance(item, Energyscape):
-            return self._of_points("energyscape", self._extracted(item))
+            return self._of_points("energyscape", self._find(item))
         if isinstance(item, PointCloud):
             return self._of_points("points", item)
         if isinstance(item, Measurement):
@@ -136,15 +136,11 @@ class Heard:
             f"{item.state}, {len(item.sensors)} sensors, {received} received",
         )
 
-    def _extracted(self, image: "Energyscape") -> "PointCloud":
-        from ertis_numba.geometry import Grid
-        from ertis_numba.stages.points import PointExtractor
+    @functools.cached_property
+    def _find(self) -> "PointFinder":
+        from ertis_numba.stages.finder import PointFinder
 
-        key = (image.stamp.sensor, id(image.azimuth_rad))  # all images of a description share their axes
-        if key not in self._extractors:
-            self._extractors = {kept: made for kept, made in self._extractors.items() if kept[0] != key[0]}
-            self._extractors[key] = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad))
-        return self._extractors[key](image)
+        return PointFinder()
 
     @staticmethod
     def _of_points(product: str, cloud: "PointCloud") -> tuple[dict[str, Any], str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _progress, _tables, options, plans
+from ertis_cli import _plans, _progress, _tables, options
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -193,19 +193,19 @@ def _lines(event: "Ended", *, told: bool) -> Iterator[str]:
     """Yield what there is to say; of plans only where they are not in an object."""
     match event.outcome:
         case "made":
-            yield from _plans(event, told=told)
+            yield from _plan_lines(event, told=told)
             yield from summary(event.output, event.made["sensors"], event.made["device"])
         case "there":
-            yield from _plans(event, told=told)
+            yield from _plan_lines(event, told=told)
             yield f"{event.output}: made before"
         case "passed over":
             yield f"{event.recording}: is no recording but an energyscape file, passed over"
 
 
-def _plans(event: "Ended", *, told: bool) -> Iterator[str]:
+def _plan_lines(event: "Ended", *, told: bool) -> Iterator[str]:
     for row in event.made.get("sensors", ()):
         if told:
-            yield from plans.said_of(row["sensor"], row)
+            yield from _plans.said_of(row["sensor"], row)
 
 
 def _object(event: "Ended") -> dict[str, Any]:

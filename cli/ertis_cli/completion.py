@@ -11,8 +11,8 @@ __all__ = ["completion"]
 def completion(ctx: click.Context, *, shell: str) -> None:
     """Print what makes a shell complete commands and options.
 
-    For bash or zsh, add eval "$(ertis completion bash)" to ~/.bashrc or ~/.zshrc; for fish, save what is printed as
-    ~/.config/fish/completions/ertis.fish.
+    For bash, add eval "$(ertis completion bash)" to ~/.bashrc; for zsh, its like to ~/.zshrc, after 'autoload -U
+    compinit; compinit'; for fish, save what is printed as ~/.config/fish/completions/ertis.fish.
     """
     from click.shell_completion import BashComplete, FishComplete, ZshComplete
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["import_raw"]
 
+_END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 
 
@@ -53,8 +54,8 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 @click.option(
     "--start",
     metavar="TIME",
-    type=click.DateTime(["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%dT%H:%M:%S.%f%z"]),
-    help="PCM: when the first emission was, as 2026-05-04T12:30:00, in UTC unless it says otherwise.",
+    type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
+    help="PCM: when the first emission was, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it says otherwise.",
 )
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
@@ -111,9 +112,11 @@ def import_raw(
     measurements: PcmReader | RawReader
     if is_pcm:
         times = {"skip_s": skip_s or 0.0, "length_s": length_s, "start_ns": _since_1970_ns(start)}
-        measurements = _opened_pcm(raw, layout, preset, settings_file, air, sensor, times)
+        measurements = _opened_pcm(raw, layout, preset, settings_file, sensor, times)
     else:
-        measurements = _opened_raw(raw, folder, layout, preset, settings_file, air, sensor)
+        measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor)
+    settings = measurements.settings
+    measurements.settings = settings.replace(air=settings.air.replace(**air))
     source = ", ".join(path.name for path in raw)
     with options.progress(measurements, length=len(measurements), label="importing", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=source)
@@ -129,11 +132,9 @@ def import_raw(
 def _beside(first: Path) -> Path:
     """Return the recording's name where none is given."""
     if first.suffix.lower() == ".h5":
-        raise click.MissingParameter(
-            "the recording cannot have the name of the file that it is made of",
-            ctx=click.get_current_context(),
-            param_hint="'--output'",
-            param_type="option",
+        raise click.UsageError(
+            f"{first} cannot become a recording of the same name; give another one (--output)",
+            click.get_current_context(),
         )
     return first.with_suffix(".h5")
 
@@ -144,21 +145,19 @@ def _opened_raw(
     layout: str | None,
     preset: str | None,
     settings_file: Path | None,
-    air: dict[str, float],
     sensor: str,
 ) -> "RawReader":
     from ertis_numba.interop import open_raw, open_rtis_folder
-    from ertis_numba.settings import Air
 
     if folder is not None:
         if typed("settings_file"):
             raise click.UsageError(
                 "--settings is for files, and a folder holds settings; leave it out", click.get_current_context()
             )
-        return open_rtis_folder(folder, layout=layout, preset=preset, air=Air(**air), sensor=sensor)
+        return open_rtis_folder(folder, layout=layout, preset=preset, sensor=sensor)
     if settings_file is None and (layout is None or preset is None):
         _require("--layout" if layout is None else "--preset")
-    return open_raw(raw, _settings(layout, preset, settings_file, air), sensor=sensor)
+    return open_raw(raw, _settings(layout, preset, settings_file), sensor=sensor)
 
 
 def _opened_pcm(
@@ -166,7 +165,6 @@ def _opened_pcm(
     layout: str | None,
     preset: str | None,
     settings_file: Path | None,
-    air: dict[str, float],
     sensor: str,
     times: dict[str, Any],
 ) -> "PcmReader":
@@ -176,7 +174,7 @@ def _opened_pcm(
     if any(part is not None for part in (layout, preset, settings_file)):
         if settings_file is None and (layout is None or preset is None):
             _require("--layout" if layout is None else "--preset")
-        settings = _settings(layout, preset, settings_file, air)
+        settings = _settings(layout, preset, settings_file)
     elif raw[0].suffix.lower() == ".wav":
         _require("--settings")
     return open_pcm(raw, settings, sensor=sensor, **times)
@@ -186,9 +184,13 @@ def _since_1970_ns(start: datetime | None) -> int:
     if start is None:
         return 0
     given = start if start.tzinfo else start.replace(tzinfo=UTC)
-    if given.year < 1970:
-        raise click.BadParameter("is before 1970; give a later time", param_hint="'--start'")
-    return (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
+    since_1970_ns = (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
+    if not 0 <= since_1970_ns < _END_NS:
+        raise click.BadParameter(
+            f"{given.isoformat()} is no time from 1970 to 2262, which a recording can hold; give another",
+            param_hint="'--start'",
+        )
+    return since_1970_ns
 
 
 def _say_what_hinders(settings: "Settings", *, quiet: bool) -> None:
@@ -208,12 +210,10 @@ def _require(option: str) -> None:
     raise click.MissingParameter(ctx=click.get_current_context(), param_hint=f"'{option}'", param_type="option")
 
 
-def _settings(layout: str | None, preset: str | None, settings_file: Path | None, air: dict[str, float]) -> "Settings":
+def _settings(layout: str | None, preset: str | None, settings_file: Path | None) -> "Settings":
     """Return what the files do not say, of preset, settings file and options."""
     from ertis_numba.settings import Array, Settings
 
     settings = Settings() if preset is None else Settings.from_preset(preset)
     settings = options.settings_with(settings, settings_file=settings_file)
-    if layout is not None:
-        settings = settings.replace(array=Array(layout=layout))
-    return settings.replace(air=settings.air.replace(**air))
+    return settings if layout is None else settings.replace(array=Array(layout=layout))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 __all__ = ["info"]
 
 _LOOKED_AT = 8
-_CLOCK_SET_NS = 946_684_800 * 10**9  # 2000: nobody has recorded before
 _WIDTH = 7  # at least
 _COLUMNS = {  # name: digits, of the report and of the table
     "offset": (6, 4),
@@ -111,8 +109,8 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "samples": recording.n_samples,
         "sample_rate_hz": recording.sample_rate_hz,
         "duration_ms": round(1000 * recording.duration_s, 3),
-        "first": _iso(stamps[0].timestamp_ns),
-        "last": _iso(stamps[-1].timestamp_ns),
+        "first": stamps[0].iso,
+        "last": stamps[-1].iso,
         "missing": sum(gap.last - gap.first + 1 for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
         "translation_m": reader.translation_m.tolist(),
@@ -127,14 +125,6 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "range_m": [round(float(reader.range_m[index]), 4) for index in (0, -1)],
         "method": reader.settings.processing.method,
     }
-
-
-def _iso(time_ns: int) -> str | None:
-    """Return a time as ISO 8601; none is known where the clock was not set, and simulations have none."""
-    if time_ns < _CLOCK_SET_NS:
-        return None
-    second = datetime.fromtimestamp(time_ns // 10**9, UTC)
-    return f"{second:%Y-%m-%dT%H:%M:%S}.{time_ns % 10**9:09d}Z"
 
 
 def _tell_health(path: Path, *, as_json: bool) -> None:

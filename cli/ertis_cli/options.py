@@ -4,7 +4,6 @@ import json
 import signal
 import sys
 import threading
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -193,12 +192,16 @@ def settings_with(
     A settings file changes the keys that it holds; an array is replaced as a whole. Other options are named
     like the fields of `Processing`; those that are None change nothing.
     """
-    from ertis_numba.geometry import PAPER_GRIDS
-
-    settings = recorded if settings_file is None else _changed_by_file(recorded, settings_file)
+    settings = recorded if settings_file is None else recorded.changed_by(settings_file)
     given = {name: value for name, value in options.items() if value is not None}
     directions = given.get("directions", settings.processing.directions)
-    if directions in PAPER_GRIDS and {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys():
+    kind = directions.partition(":")[0]
+    limits = {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys()
+    if kind == "2d" and "elevation_limits_deg" in limits:
+        raise click.UsageError(
+            f"directions {directions} lie at elevation 0; give 3d:N with --elevation", ctx=click.get_current_context()
+        )
+    if limits and kind not in {"2d", "3d"}:
         raise click.UsageError(
             f"directions {directions} have limits of their own; give 2d:N or 3d:N with limits",
             ctx=click.get_current_context(),
@@ -207,22 +210,6 @@ def settings_with(
     if max_error_db is None:
         return settings
     return settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
-
-
-def _changed_by_file(recorded: "Settings", path: Path) -> "Settings":
-    from ertis_numba.errors import SettingsError
-    from ertis_numba.settings import Settings
-
-    Settings.load(path)  # by itself first: then errors name the line
-    try:
-        changes = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}; give a readable settings file") from error
-    tables = tomllib.loads(recorded.to_toml())
-    for name, table in changes.items():
-        whole = name == "array" or not isinstance(table, dict)
-        tables[name] = table if whole else {**tables.get(name, {}), **table}
-    return Settings.from_tables(tables, str(path))
 
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":

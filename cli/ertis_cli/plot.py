@@ -102,6 +102,7 @@ def plot(
     A recording is processed with its own settings first, where an image is drawn.
     """
     from ertis_numba import checks, figures
+    from ertis_numba.errors import DataError
     from ertis_numba.storage import check_target, replacing
 
     given: dict[str, object] = {
@@ -120,6 +121,8 @@ def plot(
             )
     if kind != "array":
         _require_no_array(path)
+    if not path.name:  # "." and "/", which a picture cannot be named after
+        raise DataError(f"{path} is a folder; give a recording or an energyscape file")
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _process_many, options, plans
+from ertis_cli import _plans, _process_many, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def process(
             wavefront=wavefront,
             max_error_db=max_error_db,
         )
-        plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
+        _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
 
     from ertis_numba.campaign import Options
@@ -201,7 +201,7 @@ def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as
             yield [stack.enter_context(wait(settings)) for settings in several]
 
     def show(sensor: str, told: dict[str, Any]) -> None:
-        for line in () if as_json else plans.said_of(sensor, told):
+        for line in () if as_json else _plans.said_of(sensor, told):
             click.echo(line, err=True)
 
     with making(

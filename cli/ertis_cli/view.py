@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 import webbrowser
 from collections.abc import Iterator
@@ -53,7 +54,12 @@ _ONLY = {
     help="Where to serve the page. Where others reach it, they see and steer the view: there is no password.",
 )
 @click.option("--port", type=click.IntRange(0, 65_535), default=8080, show_default=True, help="0 for any that is free.")
-@click.option("--open/--no-open", "opened", default=None, help="Open a browser; done by default on a terminal.")
+@click.option(
+    "--open/--no-open",
+    "opened",
+    default=None,
+    help="Open a browser; done by default on a terminal, unless it would run in that itself.",
+)
 @click.option("--threshold", type=float, default=-20.0, show_default=True, metavar="DB", help="Weakest points to show.")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
@@ -146,7 +152,9 @@ def view(
         else:
             _tell(what, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
-                webbrowser.open(shown.url)
+                # Some return when they are closed, and others after seconds.
+                asked = {"asked": bool(opened)}
+                threading.Thread(target=_open, args=(shown.url,), kwargs=asked, name="ertis-open", daemon=True).start()
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
     gc.freeze()  # to look through all that libraries have made would take a fifth of a second that nobody waits for
     if html is not None:
@@ -225,6 +233,23 @@ def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _open(url: str, *, asked: bool) -> None:
+    """Open a browser, unless it would take the terminal and nobody asked for it."""
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:  # there is none; where the page is was told
+        return
+    if asked or _has_window(browser):
+        browser.open(url)
+
+
+def _has_window(browser: webbrowser.BaseBrowser) -> bool:
+    """Whether a browser does not run in the terminal, as w3m does: Python begins it in the background."""
+    if isinstance(browser, webbrowser.GenericBrowser):
+        return isinstance(browser, webbrowser.BackgroundBrowser)
+    return getattr(browser, "background", True)
 
 
 def _tell(what: str, shown: "View", *, quiet: bool, as_json: bool) -> None:

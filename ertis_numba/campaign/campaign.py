@@ -1,6 +1,5 @@
 """The course of a campaign: who does what next, and what became of each recording."""
 
-import os
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
@@ -15,6 +14,7 @@ from ertis_numba.campaign.made import difference
 from ertis_numba.campaign.orders import HOW, MOST_BYTES, Crew, Do, News, Options, Order
 from ertis_numba.campaign.plans import Plans
 from ertis_numba.campaign.recordings import Source, outputs
+from ertis_numba.cores import usable_cores
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained
 from ertis_numba.settings import Accuracy, Settings
@@ -90,7 +90,7 @@ class Campaign:
     @property
     def workers(self) -> int:
         """How many processes of this machine share it: no more than there are recordings."""
-        cores = _n_cores()
+        cores = usable_cores()
         chosen = self._workers or (1 if self._options.device == "cuda" else cores // (self._options.threads or 1))
         return max(1, min(chosen, len(self._names)))
 
@@ -200,16 +200,13 @@ class Campaign:
                 yield from self._planned(crew, case, news.result)
                 return
         if "error" in news.result:
-            self._clear(case)
+            if order.do == "make" and "by_chance" in news.result:
+                clear_parts(self.folder, {case.target.name})  # that a worker which was killed has left
             yield case.ended("failed", error=news.result["error"])
         elif order.do == "look":
             yield from self._looked(case, news.result)
         else:
             yield case.ended("there" if case.is_there else "made", made=news.result)
-
-    def _clear(self, case: _Case) -> None:
-        """Remove what a worker that was killed has left."""
-        clear_parts(self.folder, {case.target.name})
 
     def _looked(self, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
         if told.get("passed_over"):
@@ -270,8 +267,3 @@ def _absolute(settings: Settings) -> Settings:
     if not directions.lower().endswith(".csv"):
         return settings
     return settings.replace(processing=settings.processing.replace(directions=str(Path(directions).absolute())))
-
-
-def _n_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -21,7 +21,7 @@ _TELL_S: Final = 0.5
 
 
 class Members:
-    """See `Crew`: the workers of a dask scheduler, one recording each at a time.
+    """See `Crew`: the workers of a dask scheduler, with no more recordings in hand than there are workers.
 
     They need this package and what it computes with, of the same versions, and have to see the files under the same
     names. What a lost worker had, dask starts again on another, a few times. Whoever reaches a scheduler can run code

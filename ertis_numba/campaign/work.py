@@ -82,9 +82,10 @@ def _plan(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
         return {"settings": planned.to_toml(), "device": loaded.device}
     with _pipelines([settings], about["device"], threads) as (pipeline,):
         planned, device = pipeline.settings, pipeline.device
-    with _turn:  # it is asked for by its plan from now on
-        if (made := _kept.pop((settings.to_toml(), about["device"], threads), None)) is not None:
-            _kept[planned.to_toml(), about["device"], threads] = made
+    with _turn:
+        made = _kept.pop((settings.to_toml(), about["device"], threads), None)
+    if made is not None:  # it is asked for by its plan from now on
+        _keep({(planned.to_toml(), about["device"], threads): made})
     return {"settings": planned.to_toml(), "device": device}
 
 
@@ -151,8 +152,16 @@ def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -
                 found[key] = Pipeline(given, device=device, threads=threads)
         yield [found[key] for key in keys]
     finally:
-        with _turn:
-            _kept.update(found)
+        _keep(found)
+
+
+def _keep(pipelines: Mapping[_Key, Pipeline]) -> None:
+    """Keep pipelines for who asks next, in place of those of the same settings that another thread has made."""
+    with _turn:
+        spare = [_kept.pop(key) for key in pipelines if key in _kept]
+        _kept.update(pipelines)
+    for each in spare:
+        each.close()
 
 
 _ORDERS: Final[dict[str, Callable[[Mapping[str, Any], Tell], dict[str, Any]]]] = {

@@ -15,7 +15,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._marks import name_points
-from ertis_numba.figures._page import Box, lay_out
+from ertis_numba.figures._page import lay_out
 from ertis_numba.figures._style import LINES, Style
 from ertis_numba.geometry import Layout, microphones, unit_vectors
 from ertis_numba.settings import Settings
@@ -71,7 +71,7 @@ def draw(
         box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
         for box in boxes
     ]
-    page.caption(_above(inner[0], em_pt), "microphones, seen from behind")
+    page.caption(inner[0], "microphones, seen from behind", above_pt=_ROOF_EMS * em_pt)
     _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
     told = [f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))]
     for box, axis, at_deg, other in (
@@ -83,7 +83,7 @@ def draw(
             sweep_deg if name == axis else np.full_like(sweep_deg, still_deg)
             for name, still_deg in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
         )
-        page.caption(_above(box, em_pt), f"along {axis}, at {other}")
+        page.caption(box, f"along {axis}, at {other}", above_pt=_ROOF_EMS * em_pt)
         axes = page.axes(box.inset(top=legend_pt), x=f"{axis} (°)", y="level (dB)")
         for number, line in enumerate(lines):
             level_db = pattern_db(
@@ -169,10 +169,6 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
         Cut(f"{_words.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
         for frequency_hz in frequencies_hz
     ]
-
-
-def _above(box: Box, em_pt: float) -> Box:
-    return Box(box.left, box.bottom, box.width, box.height + _ROOF_EMS * em_pt)
 
 
 def _colour(style: Style, number: int) -> object:

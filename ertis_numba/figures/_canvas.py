@@ -16,6 +16,7 @@ from ertis_numba.figures._page import Box, Page, lay_out
 from ertis_numba.figures._style import MONOSPACE, Style, text_width_pt
 from ertis_numba.figures._words import Heading, minus
 from ertis_numba.frames import Peak
+from ertis_numba.stages.levels import below_strongest_db
 
 __all__ = ["Canvas"]
 
@@ -58,10 +59,8 @@ class Canvas:
         )
 
     def level_db(self, energy: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the level below the strongest, cut at the dynamic range; silence is all floor."""
-        strongest = np.float32(energy.max(initial=0.0)) or np.float32(1)
-        floor = np.float32(10 ** (-self.dynamic_range_db / 20))
-        return np.asarray(20 * np.log10(np.maximum(energy / strongest, floor)), dtype=np.float32)
+        """Return the level below the strongest, cut at the dynamic range."""
+        return below_strongest_db(energy, self.dynamic_range_db)
 
     def show(
         self, axes: Axes, level_db: NDArray[np.floating], *, extent: tuple[float, float, float, float]

@@ -102,10 +102,10 @@ class Page:
             parse_math=False,  # a file's name may hold a dollar sign
         )
 
-    def caption(self, box: Box, text: str) -> None:
-        """Write a line at the top of a box, in its middle."""
+    def caption(self, box: Box, text: str, *, above_pt: float = 0.0) -> None:
+        """Write a line at the top of a box, or so far above it, in its middle."""
         if text:
-            left_pt, top_pt = box.left + box.width / 2, box.bottom + box.height
+            left_pt, top_pt = box.left + box.width / 2, box.bottom + (box.height + above_pt)
             self.text(text, left_pt, top_pt, self.style.label_pt, colour=self.style.faint, align="center")
 
     def axes(self, box: Box, *, title: str = "", x: str = "", y: str = "") -> Axes:

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Box, Page
-from ertis_numba.figures._sampling import PIXELS, flattened, join_ranges, polar_raster, thickened
+from ertis_numba.figures._sampling import PIXELS, centres, flattened, join_ranges, polar_raster, thickened
 from ertis_numba.figures._style import text_width_pt
 from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.geometry import ALONE_RAD
 
 __all__ = ["draw", "draw_into", "height_of"]
 
@@ -69,8 +70,8 @@ def draw_into(
         levels_db,
         azimuth_rad,
         rings_m,
-        left_m=-_centres(left, right, step_m),
-        ahead_m=_centres(bottom, top, step_m),
+        left_m=-centres(left, right, step_m),
+        ahead_m=centres(bottom, top, step_m),
     )
     shown = canvas.show(axes, raster, extent=extent)
     axes.set_xlim(left, right)
@@ -100,19 +101,14 @@ def _fan(
 
 def _ends(azimuth_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the first and the last azimuth to draw."""
-    first, last, half_rad = float(azimuth_rad.min()), float(azimuth_rad.max()), math.radians(1.0)
-    if last - first < half_rad:
-        return (first + last) / 2 + np.array([-half_rad, half_rad])
+    first, last = float(azimuth_rad.min()), float(azimuth_rad.max())
+    if last - first < ALONE_RAD:
+        return (first + last) / 2 + np.array([-ALONE_RAD, ALONE_RAD])
     return np.array([first, last])
 
 
 def _place(azimuth_rad: float, range_m: float) -> tuple[float, float]:
     return -range_m * math.sin(azimuth_rad), range_m * math.cos(azimuth_rad)
-
-
-def _centres(first: float, last: float, step: float) -> NDArray[np.float64]:
-    count = max(1, round((last - first) / step))
-    return first + (np.arange(count) + 0.5) * (last - first) / count
 
 
 def _extent(azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> tuple[float, float, float, float]:

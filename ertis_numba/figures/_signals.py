@@ -16,7 +16,6 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._hearing import Heard, signals
-from ertis_numba.figures._page import Box
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Settings
 
@@ -63,11 +62,11 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         for box in boxes
     ]
     loudest = float(np.quantile(np.abs(heard.values), _LOUDEST)) or 1.0
-    page.caption(_above(inner[0], em_pt), f"a row is ±{_words.number(loudest, 2)} of full scale")
+    page.caption(inner[0], f"a row is ±{_words.number(loudest, 2)} of full scale", above_pt=_ROOF_EMS * em_pt)
     axes = page.axes(inner[0], x="time (ms)", y="microphone (channel)")
     _traces(canvas, axes, heard, loudest)
     whose = f"mean of {rows} microphones" if rows > 1 else f"microphone {heard.channels[0]}"
-    page.caption(_above(inner[1], em_pt), f"spectrogram, {whose}")
+    page.caption(inner[1], f"spectrogram, {whose}", above_pt=_ROOF_EMS * em_pt)
     axes = page.axes(inner[1], x="time (ms)", y="frequency (kHz)")
     return canvas.side(page, side, _spectrogram(canvas, axes, heard, settings))
 
@@ -132,10 +131,6 @@ def spectrogram(
         power[first : first + step] = summed.reshape(*some.shape, -1).max(axis=1)
     times_s = heard.axis[columns].mean(axis=1) + (size - 1) / 2 / rate_hz
     return power.T / np.float32(len(heard.values)), frequency_hz[inside], times_s
-
-
-def _above(box: Box, em_pt: float) -> Box:
-    return Box(box.left, box.bottom, box.width, box.height + _ROOF_EMS * em_pt)
 
 
 def _traces(canvas: Canvas, axes: Axes, heard: Heard, loudest: float) -> None:

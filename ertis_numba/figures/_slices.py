@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Box, Page
-from ertis_numba.figures._sampling import join_ranges, thickened, volume_raster
+from ertis_numba.figures._sampling import centres, join_ranges, thickened, volume_raster
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 
@@ -82,8 +82,8 @@ class _Cut:
         """
         left, right, bottom, top = self.extent_m
         step_m = max(abs(right - left), top - bottom) / _PIXELS
-        across_m = _centres(left, right, step_m)
-        up_m = _centres(bottom, top, step_m)
+        across_m = centres(left, right, step_m)
+        up_m = centres(bottom, top, step_m)
         points_m = np.full((len(up_m), len(across_m), 3), self.at_m)
         points_m[..., self.across] = across_m
         points_m[..., self.up] = up_m[:, None]
@@ -112,7 +112,7 @@ class _Cut:
         inner = box.inset(
             left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
         ).fitted(self._ratio)
-        page.caption(Box(inner.left, inner.bottom, inner.width, inner.height + _ROOF_EMS * em_pt), self.title)
+        page.caption(inner, self.title, above_pt=_ROOF_EMS * em_pt)
         names = "x, forward (m)", "y, left (m)", "z, up (m)"
         axes = page.axes(inner, x=names[self.across], y=names[self.up])
         shown = canvas.show(axes, raster, extent=self.extent_m)
@@ -153,8 +153,3 @@ def _spans(image: Energyscape) -> list[tuple[float, float]]:
         spare = max(0.0, least_m - (last - first)) / 2
         spans.append((first - spare, last + spare))
     return spans
-
-
-def _centres(first: float, last: float, step: float) -> NDArray[np.float64]:
-    count = max(1, round(abs(last - first) / step))
-    return np.asarray(first + (np.arange(count) + 0.5) * (last - first) / count)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +45,7 @@ def of_image(image: Energyscape) -> Heading:
             f"method {processing.method}{adaptive}",
             *((f"error up to {minus(f'{budget_db:g}')} dB",) if processing.method == "fast" else ()),
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
-            *_time(image.stamp),
+            *filter(None, [image.stamp.utc]),
         ),
     )
 
@@ -68,7 +67,7 @@ def of_measurement(what: str, settings: Settings, stamp: Stamp, *parts: str, val
             *_of_sensor(settings),
             *parts,
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
-            *_time(stamp),
+            *filter(None, [stamp.utc]),
         ),
     )
 
@@ -95,18 +94,6 @@ def _of_sensor(settings: Settings) -> tuple[str, str]:
         settings.array.layout,
         f"call {khz(call.low_frequency_hz)}–{khz(call.high_frequency_hz)} kHz, {number(1e3 * call.duration_s, 6)} ms",
     )
-
-
-def _time(stamp: Stamp) -> tuple[str, ...]:
-    """Return when it was, if that is known."""
-    if not stamp.timestamp_ns:
-        return ()
-    seconds, nanoseconds = divmod(stamp.timestamp_ns, 10**9)
-    try:
-        moment = datetime.fromtimestamp(seconds, UTC)
-    except (OverflowError, OSError, ValueError):  # a clock that was never set
-        return ()
-    return (f"{moment:%Y-%m-%d %H:%M:%S}.{nanoseconds // 10**6:03d} UTC",)
 
 
 def number(value: float, digits: int = 3) -> str:

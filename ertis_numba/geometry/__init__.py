@@ -4,7 +4,7 @@ The sensor frame: x forward (boresight), y to azimuth +90°, z up (elevation +90
 taken from the centroid of the enabled microphones.
 """
 
-from ertis_numba.geometry.azimuths import ALONE_RAD, is_closed, reach_rad, unrolled_rad
+from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad
 from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
 from ertis_numba.geometry.grids import PAPER_GRIDS, Grid, direction_grid
 from ertis_numba.geometry.layouts import Layout, layout_names, load_layout, microphones, self_contained, storable
@@ -13,6 +13,7 @@ from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 
 __all__ = [
     "ALONE_RAD",
+    "FAR",
     "PAPER_GRIDS",
     "Grid",
     "Layout",

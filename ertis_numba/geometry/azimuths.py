@@ -5,12 +5,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ALONE_RAD", "is_closed", "reach_rad", "unrolled_rad"]
+__all__ = ["ALONE_RAD", "FAR", "is_closed", "reach_rad", "unrolled_rad"]
 
 ALONE_RAD = math.radians(1.0)
 """How far a direction reaches that has none beside it."""
 
-_FAR = 1.3  # spacings from the nearest direction, beyond which nothing is known
+FAR = 1.3
+"""Spacings from the nearest direction, beyond which nothing is known."""
+
 _FAR_RAD = math.radians(10.0)  # the same at most, where directions lie wider apart than is usual
 _CLOSED = 1.5  # widest spacings between the last direction and the first, up to which they go all around
 _TURN = 2 * math.pi
@@ -30,7 +32,7 @@ def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.full(len(gaps_rad), ALONE_RAD)
     usual_rad = np.sort(gaps_rad)[(len(gaps_rad) - 1) // 2]
     beside_rad = np.maximum(np.append(gaps_rad[1:], 0), np.append(0, gaps_rad[:-1]))
-    return np.asarray(np.maximum(_FAR * usual_rad, np.minimum(_FAR * beside_rad, _FAR_RAD)))
+    return np.asarray(np.maximum(FAR * usual_rad, np.minimum(FAR * beside_rad, _FAR_RAD)))
 
 
 def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> NDArray[np.float64]:

@@ -57,12 +57,15 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     try:
         with h5py.File(path, "r") as file:
             numbers = np.asarray(file["time_data"][()])
-            rate_hz = float(file["time_data"].attrs["sample_freq"])
+            rates_hz = np.asarray(file["time_data"].attrs["sample_freq"], dtype=np.float64)
             told = file["metadata"].attrs.get("settings") if "metadata" in file else None
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
             f"{path} holds no time_data with a sample_freq; give a file of Acoular, or a recording to 'ertis process'"
         ) from error
+    if rates_hz.size != 1:
+        raise DataError(f"{path}: sample_freq is {rates_hz.tolist()}; give one number, the rate in Hz")
+    rate_hz = float(rates_hz.item())
     numbers = numbers[:, None] if numbers.ndim == 1 else numbers
     if numbers.ndim != 2 or not numbers.size or numbers.dtype.kind not in "fi":
         raise DataError(

@@ -121,8 +121,8 @@ def export(
     ----------
     path : str or Path
     items : iterable of Energyscape or of Measurement
-        Energyscapes, of several sensors where the format allows it; for ``acoular`` one measurement. They are written
-        as they come, but for ``npz`` gathered first where they have no length.
+        Energyscapes, of several sensors where the format allows it; for ``acoular`` one measurement. ``mcap`` is
+        written as they come, and so is ``npz`` where they have a length; points of other formats are gathered first.
     file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular"}, optional
         By the ending of the path by default.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
@@ -218,7 +218,8 @@ def _write_points(
     text: bool,
 ) -> None:
     from ertis_numba.interop import _mcap, _point_files  # noqa: PLC0415
-    from ertis_numba.interop._points import PointFinder, PointTable  # noqa: PLC0415
+    from ertis_numba.interop._points import PointTable  # noqa: PLC0415
+    from ertis_numba.stages.finder import PointFinder  # noqa: PLC0415
 
     find = PointFinder(**finding)
     if name == "mcap":

@@ -15,12 +15,13 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import self_contained, unit_vectors
 from ertis_numba.interop._messages import encoder, schema
 from ertis_numba.interop._mountings import PLATFORM, Mountings
 from ertis_numba.interop._picture import Picture
-from ertis_numba.interop._points import PointFinder, ros_time, same_directions
+from ertis_numba.interop._points import Find, ros_time
+from ertis_numba.stages.finder import same_directions
 
 __all__ = ["TOPICS", "write_mcap"]
 
@@ -53,7 +54,7 @@ _NAMED = re.compile(r"[^A-Za-z0-9]+")
 
 
 def write_mcap(
-    path: Path, images: Iterable[Energyscape], find: PointFinder, mountings: Mountings, *, topics: Collection[str]
+    path: Path, images: Iterable[Energyscape], find: Find, mountings: Mountings, *, topics: Collection[str]
 ) -> None:
     """Write the messages of images as they come.
 
@@ -80,7 +81,7 @@ def write_mcap(
 class _Bag:
     """What is being written: its topics, and the sensors that have come."""
 
-    def __init__(self, writer: Any, find: PointFinder, mountings: Mountings, topics: Collection[str]) -> None:
+    def __init__(self, writer: Any, find: Find, mountings: Mountings, topics: Collection[str]) -> None:
         self._writer, self._find, self._mountings = writer, find, mountings
         self._topics = [topic for topic in TOPICS if topic in topics]
         self._channels: dict[str, int] = {}
@@ -134,7 +135,7 @@ class _Bag:
         )
 
     def _points(self, image: Energyscape) -> dict[str, Any]:
-        cloud: PointCloud = self._find(image)
+        cloud = self._find(image)
         rows = np.column_stack([cloud.position_m, cloud.energy]).astype("<f4")
         fields = [
             {"name": name, "offset": 4 * number, "datatype": _FLOAT32, "count": 1}

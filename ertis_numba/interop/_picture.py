@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import spacing_rad, unit_vectors
+from ertis_numba.geometry import FAR, spacing_rad, unit_vectors, unrolled_rad
+from ertis_numba.stages.levels import below_strongest_db
 
 __all__ = ["DYNAMIC_RANGE_DB", "Picture"]
 
 DYNAMIC_RANGE_DB = 40.0
 """Below the strongest, at which a pixel is black."""
 _MOST_PIXELS = 1000  # along a side of a map
-_GAP = 1.3  # spacings from the nearest direction, beyond which a pixel of a map shows nothing
 
 
 class Picture:
@@ -29,15 +29,13 @@ class Picture:
     """
 
     def __init__(self, image: Energyscape) -> None:
-        self._columns = np.argsort(-image.azimuth_rad, kind="stable")
+        self._columns = np.argsort(-unrolled_rad(image.azimuth_rad), kind="stable")
         self._map = None if image.is_planar else _map(image)
 
     def __call__(self, energy: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the picture of energies, (direction, range): (row, column) uint8, 255 the strongest."""
-        floor = 10 ** (-DYNAMIC_RANGE_DB / 20)
         shown = energy if self._map is None else energy.max(axis=1, keepdims=True)
-        strongest = float(shown.max(initial=0.0)) or 1.0
-        level_db = 20 * np.log10(np.maximum(shown / strongest, floor))
+        level_db = below_strongest_db(shown, DYNAMIC_RANGE_DB)
         grey = np.rint(255 * (1 + level_db / DYNAMIC_RANGE_DB)).astype(np.uint8)
         if self._map is None:
             return np.ascontiguousarray(grey[self._columns].T[::-1])
@@ -50,10 +48,10 @@ def _map(image: Energyscape) -> NDArray[np.int64]:
     tree = KDTree(directions)
     apart_rad = spacing_rad(directions) or math.pi
     axes = []
-    for angle_rad in (image.azimuth_rad, image.elevation_rad):
+    for angle_rad in (unrolled_rad(image.azimuth_rad, 1.5 * apart_rad), image.elevation_rad):
         span_rad = float(np.ptp(angle_rad))
         count = min(_MOST_PIXELS, 1 + round(span_rad / max(apart_rad, span_rad / _MOST_PIXELS)))
         axes.append(np.linspace(angle_rad.max(), angle_rad.min(), count))
     looks = unit_vectors(*np.meshgrid(*axes))
     distance, nearest = tree.query(looks)
-    return np.where(distance > _GAP * apart_rad, len(directions), nearest).astype(np.int64)
+    return np.where(distance > FAR * apart_rad, len(directions), nearest).astype(np.int64)

@@ -1,19 +1,20 @@
 """The points of several measurements as one table."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
-from ertis_numba.geometry import Grid
 from ertis_numba.interop._mountings import PLATFORM, Mountings
-from ertis_numba.stages.points import PointExtractor
 
-__all__ = ["PointFinder", "PointTable", "ros_time", "same_directions"]
+__all__ = ["Find", "PointTable", "ros_time"]
+
+Find: TypeAlias = Callable[[Energyscape], PointCloud]
+"""Returns the points of an image, in the frame of its sensor."""
 
 _POINT: Final = np.dtype(
     [
@@ -24,38 +25,6 @@ _POINT: Final = np.dtype(
 )
 _NS = 1_000_000_000
 _MOST_SEC = 2**31 - 1
-
-
-class PointFinder:
-    """Finds the points of images of any sensors, with an extractor for each.
-
-    Parameters
-    ----------
-    top, min_level_db : optional
-        As for `ertis_numba.stages.points.PointExtractor`.
-    """
-
-    def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:
-        given = {"top": top, "min_level_db": min_level_db}
-        self._finding: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
-
-    def __call__(self, image: Energyscape) -> PointCloud:
-        """Return the points of an image, in the frame of its sensor."""
-        known = self._extractors.get(image.stamp.sensor)
-        if known is None or not same_directions(known[0], image):
-            grid = Grid(image.azimuth_rad, image.elevation_rad)
-            extractor = PointExtractor(image.settings, grid, **self._finding)
-            known = self._extractors[image.stamp.sensor] = image, extractor
-        return known[1](image)
-
-
-def same_directions(image: Energyscape, other: Energyscape) -> bool:
-    """Whether two images have the same directions."""
-    return all(
-        getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
-        for name in ("azimuth_rad", "elevation_rad")
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +46,7 @@ class PointTable:
     frame: str
 
     @classmethod
-    def of(cls, images: Iterable[Energyscape], find: PointFinder, mountings: Mountings) -> "PointTable":
+    def of(cls, images: Iterable[Energyscape], find: Find, mountings: Mountings) -> "PointTable":
         """Gather the points of images.
 
         Raises

@@ -2,6 +2,7 @@
 
 import struct
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -12,7 +13,7 @@ from ertis_numba.errors import DataError
 __all__ = ["read_wav"]
 
 _OPEN_END = {0, 2**32 - 1}  # sizes that programs write who do not know yet how long it will be
-_WIDE = {b"RF64", b"BW64"}  # whose sizes are in a chunk of their own
+_WIDE = b"RF64"  # whose sizes are in a chunk of their own
 
 
 def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
@@ -21,7 +22,7 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
     Raises
     ------
     DataError
-        The file is no WAV, is cut short, or its header was never finished.
+        The file is no WAV, has no samples, is cut short, or its header was never finished.
     """
     with path.open("rb") as file:
         _require_whole(path, file)
@@ -43,30 +44,47 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
 
 def _require_whole(path: Path, file: BinaryIO) -> None:
     """Refuse what is no WAV, and a file that holds less than its header says."""
-    kind, size, form = struct.unpack("<4sI4s", file.read(12).ljust(12, b"\0"))
-    if kind not in {b"RIFF", b"RIFX", *_WIDE} or form != b"WAVE":
+    kind, _, form = struct.unpack("<4sI4s", file.read(12).ljust(12, b"\0"))
+    if kind not in {b"RIFF", b"RIFX", _WIDE} or form != b"WAVE":
         raise DataError(f"{path} is no WAV file, it begins with {kind!r}; give WAV, or HDF5 of Acoular (.h5)")
     order = ">" if kind == b"RIFX" else "<"
-    wide = 0
+    wide = frame_bytes = 0
+    for name, size, there in _chunks(file, order):
+        if name == b"ds64":
+            wide = struct.unpack("<8xQ", file.read(16).ljust(16, b"\0"))[0]
+        if name == b"fmt ":
+            n_channels, frame_bytes = struct.unpack(f"{order}2xH8xH", file.read(14).ljust(14, b"\0"))
+            if not n_channels:
+                raise DataError(f"{path} cannot be read (it has 0 channels); save it again as WAV")
+        if name == b"data" and there:
+            said = wide if kind == _WIDE and size in _OPEN_END else size
+            _require_samples(path, said, there, frame_bytes)
+            return
+    raise DataError(f"{path} has no samples; save it again as WAV")
+
+
+def _chunks(file: BinaryIO, order: str) -> Iterator[tuple[bytes, int, int]]:
+    """Yield name, size and what there is of each chunk, in which the file then stands."""
     n_bytes = file.seek(0, 2)
     place = 12
     while place + 8 <= n_bytes:
         file.seek(place)
         name, size = struct.unpack(f"{order}4sI", file.read(8))
-        if name == b"ds64":
-            wide = struct.unpack("<8xQ", file.read(16).ljust(16, b"\0"))[0]
-        if name == b"data":
-            size = wide if kind in _WIDE and size in _OPEN_END else size
-            there = n_bytes - place - 8
-            if size in _OPEN_END:
-                raise DataError(
-                    f"{path} has a header that was never finished, as of a recording that was cut off; "
-                    "let a program that ignores its lengths save it again"
-                )
-            if size > there:
-                raise DataError(
-                    f"{path} is cut short: it has {there} bytes of samples, its header says {size}; copy it again"
-                )
-            return
+        yield name, size, n_bytes - place - 8
         place += 8 + size + size % 2
-    raise DataError(f"{path} has no samples; save it again as WAV")
+
+
+def _require_samples(path: Path, size: int, there: int, frame_bytes: int) -> None:
+    """Refuse samples that are not those of the header: ``size`` bytes of them, of which no more are ``there``."""
+    if size in _OPEN_END:
+        raise DataError(
+            f"{path} has a header that was never finished, as of a recording that was cut off; "
+            "let a program that ignores its lengths save it again"
+        )
+    if size > there:
+        raise DataError(f"{path} is cut short: it has {there} bytes of samples, its header says {size}; copy it again")
+    if frame_bytes and size % frame_bytes:
+        raise DataError(
+            f"{path} has {size} bytes of samples, which are no whole frames of {frame_bytes} bytes; copy it again, or "
+            "save it again as WAV"
+        )

@@ -15,14 +15,14 @@ from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.interop._wav import read_wav
-from ertis_numba.settings import Call, Processing, Recording, Settings
+from ertis_numba.settings import Recording, Settings, suit_ranges
 
 __all__ = ["PcmReader", "open_pcm"]
 
-_SLOWEST_AIR_M_S = 300.0  # as for the presets: the whole echo fits into the record in any air
-_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth, as the presets have it
 _ACOULAR = {".h5", ".hdf5", ".hdf"}
 _MIDDLE_OF_BYTES = 128
+_LONGEST_S = 1e9
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,15 @@ class PcmReader:
         self._files = [_look(path) for path in paths]
         first = self._files[0]
         self._require_alike()
-        self._skipped = round(checks.between("skip_s", skip_s, 0.0, math.inf) * first.rate_hz)
+        known = _known(settings, first)
+        _require_channels(first, known)
+        self._skipped = round(checks.between("skip_s", skip_s, 0.0, _LONGEST_S) * first.rate_hz)
         shortest = min(file.n_samples for file in self._files) - self._skipped
         # From one emission to the next there may be a part of a sample, which would add up.
-        self._period = float(shortest) if length_s is None else checks.positive("length_s", length_s) * first.rate_hz
+        self._period = float(shortest)
+        if length_s is not None:
+            checks.positive("length_s", length_s)
+            self._period = checks.between("length_s", length_s, 0.0, _LONGEST_S) * first.rate_hz
         self._n_samples = math.floor(self._period * (1 + 1e-12))
         self._counts = [1 if length_s is None else self._whole(file) for file in self._files]
         self._require_measurements(first)
@@ -84,11 +89,10 @@ class PcmReader:
         left = sum(file.n_samples - end for file, end in zip(self._files, ends, strict=True))
         self.rest_s = left / first.rate_hz
         recording = Recording(sample_rate_hz=first.rate_hz, n_samples=self._n_samples, encoding=first.encoding)
-        self.settings = _fitted(_known(settings, first), recording, first)
-        self._require_channels(first)
+        self.settings = _fitted(known, recording, first)
         self._enabled = microphones(self.settings.array).enabled
         self._sensor = checks.sensor_name(sensor)
-        self._start_ns = checks.whole("start_ns", start_ns, 0)
+        self._start_ns = checks.whole("start_ns", start_ns, 0, 2**63 - 1)
 
     def __len__(self) -> int:
         return sum(self._counts)
@@ -145,18 +149,6 @@ class PcmReader:
                         f"{file.path} has {_plain(came)} {name}, {first.path.name} {_plain(wanted)}; import each by "
                         "itself"
                     )
-
-    def _require_channels(self, first: _File) -> None:
-        layout = microphones(self.settings.array)
-        wanted = len(layout.enabled)
-        if first.n_channels == wanted:
-            return
-        if first.n_samples == wanted:
-            raise DataError(f"{first.path} has {first.n_channels} channels of {wanted} samples; transpose it")
-        raise DataError(
-            f"{first.path} has {first.n_channels} channels, array {layout.name!r} has {wanted}; give the layout of its "
-            "array, a row for each channel (--layout)"
-        )
 
 
 def open_pcm(
@@ -217,9 +209,22 @@ def _known(settings: Settings | None, first: _File) -> Settings:
     return known
 
 
+def _require_channels(first: _File, settings: Settings) -> None:
+    layout = microphones(settings.array)
+    wanted = len(layout.enabled)
+    if first.n_channels == wanted:
+        return
+    if first.n_samples == wanted:
+        raise DataError(f"{first.path} has {first.n_channels} channels of {wanted} samples; transpose it")
+    raise DataError(
+        f"{first.path} has {first.n_channels} channels, array {layout.name!r} has {wanted}; give the layout of its "
+        "array, a row for each channel (--layout)"
+    )
+
+
 def _fitted(settings: Settings, recording: Recording, first: _File) -> Settings:
     """Return settings for another recording, with ranges that suit it."""
-    processing, call = settings.processing, settings.call
+    call = settings.call
     if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
         raise DataError(
             f"{first.path} has {recording.sample_rate_hz:g} Hz, too few for a call that reaches "
@@ -230,26 +235,15 @@ def _fitted(settings: Settings, recording: Recording, first: _File) -> Settings:
             f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, the call alone lasts "
             f"{1e3 * call.duration_s:.4g} ms; give a longer --length, or skip less (--skip)"
         )
-    changes: dict[str, Any] = {}
-    if processing.range_m == Processing().range_m:
-        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
-        last_m = max(0.0, min(processing.range_m[1], math.floor(10 * echo_m) / 10))
-        changes["range_m"] = (min(processing.range_m[0], last_m), last_m)
-    band_hz = call.high_frequency_hz - call.low_frequency_hz
-    if recording.sample_rate_hz / processing.range_decimation < _RATE_BY_BAND * band_hz * (1 - 1e-9):
-        changes |= {"range_decimation": _range_step(recording.sample_rate_hz, call), "decimation": None}
-    return settings.replace(recording=recording, processing=processing.replace(**changes))
-
-
-def _range_step(rate_hz: float, call: Call) -> int:
-    """Return how many samples apart ranges may be: a multiple of the decimation that suits the call, where there is."""
-    step = max(1, int(rate_hz / (_RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz))))
-    suits = max(1, int(rate_hz / (4.4 * call.high_frequency_hz)))
-    return min(10_000, step - step % suits if step > suits else step)
+    return settings.replace(recording=recording, processing=suit_ranges(settings.processing, recording, call))
 
 
 def _look(path: Path) -> _File:
     rate_hz, numbers, settings = _read(path)
+    try:
+        Recording(sample_rate_hz=rate_hz)
+    except ArgumentError as error:
+        raise DataError(f"{path}: {error}") from error
     is_short = numbers.dtype.kind in "iu" and numbers.dtype.itemsize <= 2
     n_samples, n_channels = numbers.shape
     return _File(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings)
@@ -269,20 +263,23 @@ def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
 def _words(file: _File, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
     """Return some of the numbers as a recording holds them; in disabled channels, what is no number becomes 0."""
     numbers = numbers[samples]
-    if numbers.dtype == np.uint8:  # the one kind of WAV that has no sign
-        return ((numbers.astype(np.int16) - _MIDDLE_OF_BYTES) * 256).astype("<i2")
+    if numbers.dtype.itemsize == 1:  # of WAV they have no sign
+        middle = _MIDDLE_OF_BYTES if numbers.dtype.kind == "u" else 0
+        return ((numbers.astype(np.int16) - middle) * 256).astype("<i2")
     if file.encoding == "int16":
         return numbers.astype("<i2")
     if numbers.dtype.kind == "i":
         return (numbers / 2.0 ** (8 * numbers.dtype.itemsize - 1)).astype("<f4")
-    words = numbers.astype("<f4")
+    with np.errstate(over="ignore"):  # which is refused below
+        words = numbers.astype("<f4")
     broken = ~np.isfinite(words)
     words[broken & ~enabled] = 0
     if broken[:, enabled].any():
         sample, channel = np.argwhere(broken & enabled)[0].tolist()
+        came = numbers[sample, channel]
         raise DataError(
-            f"{file.path} holds {numbers[sample, channel]} at sample {samples.start + sample} of channel {channel}; "
-            "give finite numbers"
+            f"{file.path} holds {came:g} at sample {samples.start + sample} of channel {channel}; "
+            + (f"give numbers up to {_LARGEST:.4g}" if np.isfinite(came) else "give finite numbers")
         )
     return words
 

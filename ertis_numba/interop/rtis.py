@@ -8,9 +8,12 @@ import numpy as np
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import PRESETS, Settings
-from ertis_numba.words import word_format
+from ertis_numba.words import WordFormat, word_format
 
 __all__ = ["RawReader", "open_raw"]
+
+
+_END = 2**63  # of sequence numbers
 
 
 class RawReader:
@@ -51,6 +54,8 @@ class RawReader:
                     f"{path} holds {count} measurements, and the next file is number {following}; give the files "
                     "themselves in their order"
                 )
+        if starts[-1] + counts[-1] > _END:
+            raise DataError(f"{paths[-1]} is number {starts[-1]}, which no recording can hold; give it a smaller one")
         self._files = list(zip(paths, counts, starts, strict=True))
 
     def __len__(self) -> int:
@@ -84,7 +89,7 @@ class RawReader:
             raise DataError(f"{path} is empty, {wanted}; record it again")
         if n_bytes % self._format.dtype.itemsize:
             raise DataError(f"{path} has {n_bytes} bytes, which are no whole words, {wanted}; copy it again")
-        raise DataError(f"{path} has {n_bytes} bytes, {wanted}; {_remedy(n_bytes)}")
+        raise DataError(f"{path} has {n_bytes} bytes, {wanted}; {_remedy(n_bytes, self._format)}")
 
     def _words(self) -> str:
         return f"{self._format.n_bytes // self._format.dtype.itemsize} words of {self._format.dtype.itemsize} bytes"
@@ -93,10 +98,11 @@ class RawReader:
 _OTHERWISE = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
 
 
-def _remedy(n_bytes: int) -> str:
+def _remedy(n_bytes: int, words: WordFormat) -> str:
     """Return what to do about a file of another length: another preset, where one fits."""
+    tick_bytes = words.n_bytes // words.shape[0]
     lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}
-    fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (4 * n_samples) == 0]
+    fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (tick_bytes * n_samples) == 0]
     return f"its length fits the presets {', '.join(fitting)}" if fitting else _OTHERWISE
 
 

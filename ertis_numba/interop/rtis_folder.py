@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ertis_numba import checks
-from ertis_numba.errors import DataError
+from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop.rtis import RawReader
-from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, suit_ranges
 
 __all__ = ["open_rtis_folder"]
 
@@ -45,10 +45,6 @@ _NOT_HELD = {
 }
 """Keys that name other files, with what to do."""
 _KNOWN = {*_RECORDING, *_PROCESSING, *_DUMPED, *_NOT_HELD, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
-_SLOWEST_AIR_M_S = 300.0  # as for the presets: the whole echo fits into the record in any air
-_FARTHEST_M = 5.0
-_RANGE_STEPS = (100, 40, 20, 10)
-_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth, as the presets have it
 
 
 def open_rtis_folder(
@@ -93,6 +89,8 @@ def open_rtis_folder(
     layout = layout or told.get("microphoneLayout")
     if layout is None:
         raise DataError(f"{folder} does not say which array it was (microphoneLayout); give --layout")
+    if not isinstance(layout, str):
+        raise ArgumentError(f"{folder}: microphoneLayout is {layout!r}; give the name of an array, or --layout")
     if preset is not None:
         settings = Settings.from_preset(preset)
     elif told.keys() & {*_RECORDING, "callCustom"}:
@@ -164,12 +162,7 @@ def _recorded(folder: Path, told: dict[str, Any]) -> Settings:
     )
     n_samples = checks.whole(f"{folder}: microphoneSamples", told.get("microphoneSamples", 163_840), 1)
     recording = Recording(sample_rate_hz=number["microphoneSampleFrequency"], n_samples=n_samples)
-    echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
-    last_m = min(_FARTHEST_M, math.floor(10 * echo_m) / 10)
-    least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
-    step = next((step for step in _RANGE_STEPS if recording.sample_rate_hz / step >= least_hz), _RANGE_STEPS[-1])
-    processing = Processing(range_m=(min(0.5, max(0.0, last_m)), max(0.0, last_m)), range_decimation=step)
-    return Settings(call=call, recording=recording, processing=processing)
+    return Settings(call=call, recording=recording, processing=suit_ranges(Processing(), recording, call))
 
 
 def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Processing:
@@ -192,9 +185,10 @@ def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Proc
     is_flat = told.get("2D", True)
     if not isinstance(is_flat, bool):
         is_flat = bool(number("2D", 1))
-    planar = not any(told[_ELEVATIONS]) if _ELEVATIONS in told else is_flat
-    half_turn = (-math.pi / 2, math.pi / 2)
-    azimuth_rad = told.get(_AZIMUTHS, half_turn) if planar else half_turn
+    planar = not any(_angles_rad(folder, told, _ELEVATIONS)) if _ELEVATIONS in told else is_flat
+    azimuth_rad = [-math.pi / 2, math.pi / 2]
+    if planar and _AZIMUTHS in told:
+        azimuth_rad = _angles_rad(folder, told, _AZIMUTHS)
     return processing.replace(
         directions=f"{2 if planar else 3}d:{count}",
         azimuth_limits_deg=(
@@ -203,6 +197,14 @@ def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Proc
         ),
         elevation_limits_deg=(number("elevationLowLimit", -90.0), number("elevationHighLimit", 90.0)),
     )
+
+
+def _angles_rad(folder: Path, told: dict[str, Any], name: str) -> list[float]:
+    """Return the angles of all directions."""
+    angles = told[name]
+    if not isinstance(angles, list) or not angles:
+        raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or take it out")
+    return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]
 
 
 def _refuse(folder: Path, told: dict[str, Any], *names: str) -> None:

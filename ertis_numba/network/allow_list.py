@@ -41,6 +41,7 @@ class Permission(Table, frozen=True, kw_only=True):
     serials: Annotated[tuple[str, ...], msgspec.Meta(max_length=1024)] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require_name(self.name)
         require_key(self.public)
         checks.choice("role", self.role, ROLES)
@@ -72,6 +73,7 @@ class AllowList(Document, frozen=True, kw_only=True):
     keys: tuple[Permission, ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for what in ("name", "public"):
             seen: set[str] = set()
             for permission in self.keys:

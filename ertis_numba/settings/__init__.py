@@ -9,6 +9,7 @@ from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MOST
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.ranges import suit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import PRESETS, Settings
 
@@ -25,4 +26,5 @@ __all__ = [
     "Processing",
     "Recording",
     "Settings",
+    "suit_ranges",
 ]

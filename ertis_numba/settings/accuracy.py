@@ -62,6 +62,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
     zones: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
         checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)

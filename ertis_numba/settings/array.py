@@ -40,6 +40,7 @@ class Array(Table, frozen=True, kw_only=True):
     word_bits: int = 32
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.choice("array.word_bits", checks.whole("array.word_bits", self.word_bits, 1), WORD_BITS)
         if self.positions_m is None:
             for name in ("enabled", "gain", "delay_s"):
@@ -47,8 +48,6 @@ class Array(Table, frozen=True, kw_only=True):
                     raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
             return
         n_channels = checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
-        for channel, position_m in enumerate(self.positions_m):
-            checks.shape(f"array.positions_m[{channel}]", np.shape(position_m), (3,))
         checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
         for channel, position in enumerate(self.positions_m):
             for coordinate_m in position:

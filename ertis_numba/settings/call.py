@@ -34,6 +34,7 @@ class Call(Table, frozen=True, kw_only=True):
     modulation: Literal["hyperbolic", "linear"] = "hyperbolic"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.positive("call.sample_rate_hz", self.sample_rate_hz)
         for name in ("start_frequency_hz", "stop_frequency_hz"):
             frequency_hz = checks.positive(f"call.{name}", getattr(self, name))

@@ -57,6 +57,7 @@ class Processing(Table, frozen=True, kw_only=True):
     loading: float = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.choice("processing.method", self.method, ("fast", "paper"))
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)

@@ -39,6 +39,7 @@ class Recording(Table, frozen=True, kw_only=True):
     encoding: Literal["pdm", "int16", "float32"] = "pdm"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.choice("recording.encoding", self.encoding, ENCODINGS)
         checks.between("recording.sample_rate_hz", self.sample_rate_hz, 1e3, 1e9)
         checks.whole("recording.n_samples", self.n_samples, 1, _MOST_SAMPLES)
@@ -67,6 +68,7 @@ class Air(Table, frozen=True, kw_only=True):
     pressure_pa: float = STANDARD_PRESSURE_PA
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.between("air.temperature_c", self.temperature_c, -40.0, 60.0)
         checks.between("air.humidity_percent", self.humidity_percent, 0.0, 100.0)
         checks.between("air.pressure_pa", self.pressure_pa, 10_000.0, 200_000.0)

@@ -1,27 +1,24 @@
 """All settings of one sensor."""
 
-import math
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from ertis_numba import checks
 from ertis_numba.documents import Document
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import INTERPOLATIONS, Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.ranges import largest_decimation, suit_ranges
 from ertis_numba.settings.recording import DEFAULT_SAMPLES, Air, Recording
 
 __all__ = ["PRESETS", "Settings"]
 
 _WORDS = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
-_SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
-_MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
 _WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
 _NARROWEST_HZ = 100.0  # a narrower band pass would ring for seconds
-_LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
 
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
@@ -40,6 +37,7 @@ class Settings(Document, frozen=True, kw_only=True):
     former_keys: ClassVar[dict[str, str]] = {"pdm_rate_hz": "sample_rate_hz"}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
@@ -89,6 +87,27 @@ class Settings(Document, frozen=True, kw_only=True):
         """
         return super().load(path).beside(Path(path).parent)
 
+    def changed_by(self, path: str | Path) -> Self:
+        """Return settings changed by the keys that a file holds; an array is replaced as a whole.
+
+        Files that it names are looked for beside it.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read or used, by itself or with the rest of these settings.
+        """
+        held, tables = self._load(Path(path))
+        held = held.beside(Path(path).parent)
+        try:
+            changes: dict[str, Any] = {"array": held.array} if tables.pop("array", None) else {}
+            for name, table in tables.items():
+                given = {key: getattr(getattr(held, name), key) for key in table}
+                changes[name] = getattr(self, name).replace(**given)
+            return self.replace(**changes)
+        except ArgumentError as error:
+            raise SettingsError(f"{path}: {error}") from error
+
     def beside(self, folder: Path) -> Self:
         """Return settings whose files, of a layout and of directions, are looked for in a folder."""
         array, processing = self.array, self.processing
@@ -102,9 +121,8 @@ class Settings(Document, frozen=True, kw_only=True):
     def from_preset(cls, name: str, **sections: Any) -> Self:
         """Return the settings of a recording preset, such as ``default_25_50``.
 
-        ``sections`` replace whole sections. If ``processing`` is not among them, its range window ends
-        where the whole echo still fits into the record, at most at 5 m, and its range spacing suits the
-        bandwidth: with the paper's 3.8 mm, a pulse of 60 kHz can lie between two ranges and lose 2 dB.
+        ``sections`` replace whole sections. If ``processing`` is not among them, its ranges suit record and call,
+        see `suit_ranges`.
 
         Raises
         ------
@@ -116,10 +134,7 @@ class Settings(Document, frozen=True, kw_only=True):
         low_hz, high_hz = _BANDS_HZ[band]
         call = Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz)
         recording = Recording(n_samples=_WORDS[length])
-        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
-        processing = Processing(range_m=(0.5, min(5.0, math.floor(10 * echo_m) / 10)))
-        if band == "20_80":
-            processing = processing.replace(range_decimation=40)
+        processing = suit_ranges(Processing(), recording, call)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 
     @property
@@ -138,8 +153,7 @@ class Settings(Document, frozen=True, kw_only=True):
 
     @property
     def _largest_decimation(self) -> int:
-        least_hz = _LEAST_RATE[self.processing.method] * self.call.high_frequency_hz
-        return min(max(1, math.floor(self.recording.sample_rate_hz / least_hz)), _MOST_DECIMATION)
+        return largest_decimation(self.recording.sample_rate_hz, self.call, self.processing.method)
 
     @property
     def output_decimation(self) -> int:

@@ -41,6 +41,7 @@ class Placed(Table, frozen=True, kw_only=True):
     waypoints: tuple[tuple[float, float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         name = self.label()
         polar = [value for value in (self.azimuth_deg, self.elevation_deg, self.range_m) if value is not None]
         if (self.position_m is not None) + bool(polar) + bool(self.waypoints) != 1:
@@ -66,11 +67,6 @@ class Placed(Table, frozen=True, kw_only=True):
             if after_s <= before_s:
                 raise ArgumentError(f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give rising times")
             checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, _FASTEST_M_S)
-
-    @classmethod
-    def label(cls) -> str:
-        """Return what errors call it."""
-        return cls.__name__.lower()
 
     @property
     def moves(self) -> bool:

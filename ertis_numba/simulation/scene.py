@@ -69,6 +69,7 @@ class Scene(Document, frozen=True, kw_only=True):
     ambient: Ambient | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.whole("seed", self.seed, 0, 2**63 - 1)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
         checks.whole("count", self.count, 1, 10**9)

@@ -42,6 +42,7 @@ class Emitter(Table, frozen=True, kw_only=True):
     silent: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
         checks.between("emitter.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
         if self.direct_sound_db is not None:
@@ -81,6 +82,7 @@ class Electronics(Table, frozen=True, kw_only=True):
     stuck_high: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.noise_dbfs is not None:
             checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
         checks.whole("electronics.modulator_order", self.modulator_order, 1, 4)

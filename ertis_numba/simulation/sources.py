@@ -89,6 +89,7 @@ class Ambient(Table, frozen=True, kw_only=True):
     band_hz: tuple[float, float] = (20_000.0, 80_000.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.between("ambient.level_dbfs", self.level_dbfs, -300.0, 0.0)
         _check_band("ambient.band_hz", self.band_hz)
 

@@ -30,6 +30,10 @@ class Runs:
     def __init__(self) -> None:
         self._numbers: dict[int, Numbers] = {}
 
+    def holds(self, number: int, epoch: int) -> bool:
+        """Return whether a number of a run has come."""
+        return epoch in self._numbers and number in self._numbers[epoch]
+
     def add(self, number: int, epoch: int) -> None:
         """Take the next number of a run."""
         self._numbers.setdefault(epoch, Numbers()).add(number)
@@ -65,16 +69,25 @@ class Numbers:
         self.jumps: list[Range] = []
         self._first: int | None = None
         self._last = 0
-        self._rises = True
+        self._highest = -1
+        self._skipped: list[Range] = []  # below the highest, when that came; some may have come late
+        self._late: set[int] = set()  # what did not rise
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._late or (number <= self._highest and not any(_shared((number, number), self._skipped)))
 
     def add(self, number: int) -> None:
         """Take the next number."""
         if self._first is None:
             self._first = number
+        elif number > self._last + 1:
+            self.jumps.append((self._last + 1, number - 1))
+        if number <= self._highest:
+            self._late.add(number)
         else:
-            if number > self._last + 1:
-                self.jumps.append((self._last + 1, number - 1))
-            self._rises = self._rises and number > self._last
+            if number > self._highest + 1:
+                self._skipped.append((self._highest + 1, number - 1))
+            self._highest = number
         self._last = number
 
     def missing(self, noted: Iterable[Hole]) -> list[Hole]:
@@ -90,7 +103,7 @@ class Numbers:
             What somebody knows about. Where two overlap, the one that begins first is believed.
         """
         known = list(_disjoint(noted))
-        if self._first is not None and self._rises:
+        if self._first is not None and not self._late:
             absent = [(-_END, self._first - 1), *self.jumps, (self._last + 1, _END)]
             known = [(first, last, item[2]) for item in known for first, last in _shared(item[:2], absent)]
         holes = [item[:2] for item in known]

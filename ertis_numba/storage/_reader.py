@@ -4,12 +4,12 @@ import errno
 import hashlib
 import operator
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import ClassVar, Self, TypeVar, overload
 
 import h5py
 import numpy as np
@@ -27,6 +27,7 @@ Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
 _SYSTEM_SAYS = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
 _PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
+_LEFT_OPEN = "already open for write"  # a mark in the file, which a program that is killed leaves behind
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -56,8 +57,8 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
         return tuple(file["sensors"])
 
 
-class Reader(ABC, Generic[Item]):
-    """A file of one row per measurement, as a sequence that reads a row when asked for it.
+class Reader(Sequence[Item]):
+    """A file of one row per measurement, as a sequence that reads a row when asked for it; slices are lists.
 
     Close it after use, or use it in a ``with`` statement.
 
@@ -135,7 +136,15 @@ class Reader(ABC, Generic[Item]):
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, index: int) -> Item:
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Item]: ...
+
+    def __getitem__(self, index: int | slice) -> Item | list[Item]:
+        if isinstance(index, slice):
+            return [self[each] for each in range(*index.indices(len(self)))]
         index = operator.index(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path} has no measurement {index}; it has {len(self)}, counted from 0")
@@ -236,7 +245,14 @@ def _open(path: Path) -> h5py.File:
         raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file, import raw words first")
     try:
         return h5py.File(path, "r")
+    except BlockingIOError as error:
+        raise DataError(f"{path} is in use by another program, which writes it; close it there first") from error
     except OSError as error:
+        if _LEFT_OPEN in str(error):
+            raise DataError(
+                f"{path} is in use by another program, which writes it, or was when that was killed; close it there, "
+                "or copy it again"
+            ) from error
         wanted = _STORED_END.search(str(error))
         amount = f" of {wanted[1]}" if wanted else ""
         raise DataError(f"{path} is cut short or damaged, it has {n_bytes}{amount} bytes; copy it again") from error

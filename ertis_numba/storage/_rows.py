@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.atomic import require_room
-from ertis_numba.errors import DamagedError
+from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Stamp
 from ertis_numba.storage._gaps import Runs
 from ertis_numba.storage.schema import CHUNK_ROWS
@@ -24,7 +24,15 @@ _STAMP_FIELDS = {
     "sync_count": "sync_count",
     "epoch": "epoch",
 }
-_MOST_EPOCH = 2**63 - 1
+_COUNT = (0, 2**63 - 1)
+_INT64 = (-(2**63), 2**63 - 1)
+_LIMITS = {
+    "timestamp_ns": _INT64,
+    "timestamp_uncertainty_ns": (0, 2**32 - 1),
+    "sequence": _COUNT,
+    "sync_count": _INT64,
+    "epoch": _COUNT,
+}
 
 
 class RowWriter:
@@ -35,11 +43,14 @@ class RowWriter:
     group : h5py.Group
     data : str
         Name of the variable with one array per measurement.
+    numbered : bool
+        Whether a sequence number comes only once in an epoch.
     """
 
-    def __init__(self, group: h5py.Group, data: str) -> None:
+    def __init__(self, group: h5py.Group, data: str, *, numbered: bool) -> None:
         self._group = group
         self._data = group[data]
+        self._numbered = numbered
         self._folder = Path(group.file.filename).parent
         self._columns: dict[str, list[float]] = {}
         self._n_stored = 0
@@ -52,27 +63,28 @@ class RowWriter:
         """Append one measurement: its array as one chunk, and its number in every column."""
         stored = np.ascontiguousarray(row, dtype=self._data.dtype)
         checks.shape(f"measurement {self._n_rows}", stored.shape, self._data.shape[1:])
-        uncertainty_ns = checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1)
-        epoch = checks.whole("epoch", stamp.epoch, 0, _MOST_EPOCH)
+        stamps = {
+            name: checks.whole(field, getattr(stamp, field), *_LIMITS[field]) for name, field in _STAMP_FIELDS.items()
+        }
+        self._require_new(stamps["sequence"], stamps["epoch"])
         require_room(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
         # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
-        self.runs.add(stamp.sequence, epoch)
+        self.runs.add(stamps["sequence"], stamps["epoch"])
         self.check = zlib.crc32(stored.data, self.check)
-        stamps = {
-            "time": stamp.timestamp_ns,
-            "time_uncertainty": uncertainty_ns,
-            "sequence": stamp.sequence,
-            "sync_count": stamp.sync_count,
-            "epoch": epoch,
-            "crc32": zlib.crc32(stored.data),
-        }
-        for name, value in {**stamps, **columns}.items():
+        for name, value in {**stamps, "crc32": zlib.crc32(stored.data), **columns}.items():
             self._columns.setdefault(name, []).append(value)
         if self._n_rows % CHUNK_ROWS == 0:
             self.flush()
+
+    def _require_new(self, sequence: int, epoch: int) -> None:
+        if self._numbered and self.runs.holds(sequence, epoch):
+            raise ArgumentError(
+                f"measurement {self._n_rows} has sequence {sequence} of epoch {epoch}, which one before it has; give "
+                "each measurement of a sensor a number of its own (Stamp.sequence)"
+            )
 
     def flush(self) -> None:
         """Write the columns gathered so far."""

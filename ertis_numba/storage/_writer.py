@@ -44,6 +44,7 @@ class Writer(ABC, Generic[Item]):
     _kind: ClassVar[str]
     _data: ClassVar[str]
     _table: ClassVar[tuple[Variable, ...]]
+    _numbered: ClassVar[bool]
     _part_token: ClassVar[str | None] = None
 
     def __init__(
@@ -90,7 +91,7 @@ class Writer(ABC, Generic[Item]):
         Raises
         ------
         ArgumentError
-            It does not fit to the ones before it.
+            It does not fit to the ones before it or to its settings.
         DataError
             The disk is full or cannot be written.
         """
@@ -101,7 +102,7 @@ class Writer(ABC, Generic[Item]):
             if sensor not in self._rows:
                 group = self._file.create_group(sensor_path(sensor), track_order=True)
                 self._begin(group, item)
-                self._rows[sensor] = RowWriter(group, self._data_of(group))
+                self._rows[sensor] = RowWriter(group, self._data_of(group), numbered=self._numbered)
             row, columns = self._row(item)
             self._rows[sensor].append(row, item.stamp, **columns)
 

@@ -54,6 +54,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
     _kind: ClassVar[str] = "energyscape"
     _data: ClassVar[str] = "energy"
     _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
+    _numbered: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out
 from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
-from ertis_numba.words import word_format
+from ertis_numba.words import WordFormat, word_format
 
 __all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
 
@@ -71,6 +71,7 @@ class RecordingWriter(Writer[Measurement]):
     _kind: ClassVar[str] = "recording"
     _data: ClassVar[str] = "pdm"
     _table: ClassVar[tuple[Variable, ...]] = RECORDING
+    _numbered: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -87,6 +88,7 @@ class RecordingWriter(Writer[Measurement]):
         self._given = settings
         self._settings: dict[str, Settings] = {}
         self._checked: dict[str, Settings] = {}
+        self._formats: dict[str, WordFormat] = {}
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
         self._noted: dict[str, list[Missing]] = {}
@@ -115,7 +117,8 @@ class RecordingWriter(Writer[Measurement]):
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
-        layout, words = microphones(settings.array), word_format(settings)
+        layout = microphones(settings.array)
+        words = self._formats[sensor] = word_format(settings)
         samples = call_samples(settings.call)
         data, table = _data_and_table(pdm=settings.recording.is_pdm)
         lay_out(
@@ -137,6 +140,7 @@ class RecordingWriter(Writer[Measurement]):
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
         self._require_same(item.stamp.sensor, item.settings)
+        self._require_words(item)
         air = item.settings.air
         return item.words, {name: getattr(air, field) for name, field in _AIR.items()}
 
@@ -149,6 +153,17 @@ class RecordingWriter(Writer[Measurement]):
             if getattr(came, name) != getattr(self._settings[sensor], name):
                 raise ArgumentError(f"a measurement has other {name} settings than the recording; write it to its own")
         self._checked[sensor] = settings
+
+    def _require_words(self, item: Measurement) -> None:
+        """Refuse words that would be stored as others, and what no pipeline would take."""
+        name, wanted = f"measurement {len(self._rows[item.stamp.sensor])}", self._formats[item.stamp.sensor].dtype
+        if not np.can_cast(item.words.dtype, wanted, "equiv"):  # which passes another byte order
+            raise ArgumentError(
+                f"{name} holds {item.words.dtype} words, its settings want {wanted.name}; convert them, or give the "
+                "settings that it was recorded with"
+            )
+        if wanted.kind == "f":
+            checks.finite_array(name, item.words)
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
@@ -302,7 +317,8 @@ def write_recording(
     Raises
     ------
     ArgumentError
-        There is no measurement, one does not fit to the others, or the file exists.
+        There is no measurement, one does not fit to the others or to its settings, has the sequence number of another,
+        or holds what is no number; or the file exists.
     DataError
         The disk is full or cannot be written.
     """

@@ -34,7 +34,7 @@ class Film:
     Parameters
     ----------
     path : str or Path
-    sensors : sequence of str, optional
+    sensors : str or sequence of str, optional
         All by default.
     device : {"auto", "cpu", "cuda", "numpy"}
         What processes recordings.
@@ -86,7 +86,7 @@ class Film:
             open_energyscapes if file_kind(path) == "energyscape" else open_recording
         )
         with self._stack:
-            for name in sensors or sensor_names(path):
+            for name in [sensors] if isinstance(sensors, str) else sensors or sensor_names(path):
                 self._readers[name] = reader = opened(path, sensor=name)
                 self._stack.callback(reader.close)
             if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):

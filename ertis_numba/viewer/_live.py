@@ -32,7 +32,7 @@ class Live:
     ----------
     address : str
         Where the central node publishes.
-    sensors : sequence of str, optional
+    sensors : str or sequence of str, optional
         All by default.
     keys : ClientKeys, optional
 
@@ -146,8 +146,8 @@ class Live:
 
     def latency_s(self, taken: Sequence[Taken]) -> float | None:
         """Return from the emission to now, of the oldest of some images; None where their time is not known."""
-        first_ns = min((each.image.stamp.timestamp_ns for each in taken), default=0)
-        return (time.time_ns() - first_ns) / 1e9 if first_ns else None
+        known_ns = [each.image.stamp.timestamp_ns for each in taken if each.image.stamp.is_timed]
+        return (time.time_ns() - min(known_ns)) / 1e9 if known_ns else None
 
     def _look_for_sensors(self, status: Status) -> None:
         """Tell, once, which of the sensors that were asked for there are not."""

@@ -9,12 +9,10 @@ from typing import Final, Self
 
 from ertis_numba.frames import Stamp
 
-__all__ = ["SET_NS", "UNTIMED_S", "Moment", "Track", "moments_of", "usual_s"]
+__all__ = ["UNTIMED_S", "Moment", "Track", "moments_of", "usual_s"]
 
 UNTIMED_S: Final = 0.1
 """Between measurements that have no time."""
-SET_NS: Final = 946_684_800 * 10**9
-"""The year 2000: clocks that show an earlier time were never set."""
 _PAUSE_S, _LONGEST_PAUSE_S = 10.0, 600.0  # that is played at least, and at most, whatever is usual
 _PAUSE: Final = 10.0  # of what usually lies between two moments, beyond which it is a pause
 _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are shown as one
@@ -82,7 +80,7 @@ def moments_of(stamps: dict[str, list[Stamp]]) -> tuple[tuple[Moment, ...], list
     no time: they are as far from those beside them as is usual. Where no times are known at all, numbers count.
     """
     given = {name: [stamp.timestamp_ns for stamp in each] for name, each in stamps.items()}
-    known = _known(given)
+    known = _known(stamps)
     begin_ns = min(
         (at_ns for name in given for at_ns, is_known in zip(given[name], known[name], strict=True) if is_known),
         default=0,
@@ -106,16 +104,18 @@ def moments_of(stamps: dict[str, list[Stamp]]) -> tuple[tuple[Moment, ...], list
     return moments, notes
 
 
-def _known(given: dict[str, list[int]]) -> dict[str, list[bool]]:
+def _known(stamps: dict[str, list[Stamp]]) -> dict[str, list[bool]]:
     """Return which measurements have a time that can be compared with those of others."""
-    some_set = any(at_ns >= SET_NS for each in given.values() for at_ns in each)
-    some_differ = any(len(set(each)) > 1 for each in given.values())
+    some_timed = any(stamp.is_timed for each in stamps.values() for stamp in each)
+    n_times = {name: len({stamp.timestamp_ns for stamp in each}) for name, each in stamps.items()}
+    some_differ = any(count > 1 for count in n_times.values())
     return {
         name: [
-            (at_ns >= SET_NS or not some_set) and (len(set(each)) > 1 or (len(each) == 1 and (some_set or some_differ)))
-            for at_ns in each
+            (stamp.is_timed or not some_timed)
+            and (n_times[name] > 1 or (len(each) == 1 and (some_timed or some_differ)))
+            for stamp in each
         ]
-        for name, each in given.items()
+        for name, each in stamps.items()
     }
 
 

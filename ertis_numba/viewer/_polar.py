@@ -134,7 +134,7 @@ class Polar:
         joined = np.maximum.reduceat(energy, self._bins, axis=1)
         highest = self._columns.strongest(joined)
         level_db = below_strongest_db(highest, self._dynamic_range_db)
-        return np.rint(255 * (1 + level_db / self._dynamic_range_db)).astype(np.uint8)
+        return np.asarray(np.rint(255 * (1 + level_db / self._dynamic_range_db)), dtype=np.uint8)
 
     def picture(self, levels: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the picture with its axes.

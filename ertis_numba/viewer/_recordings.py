@@ -1,5 +1,6 @@
 """HTML recordings of what is drawn: one for whoever began the view, and one for each browser that asks."""
 
+import math
 import threading
 from collections.abc import Callable, Hashable
 from contextlib import suppress
@@ -112,14 +113,21 @@ class ToBrowser:
 
 @dataclass(slots=True)
 class _Recording:
-    """What is being recorded, and how much of it has been counted."""
+    """What is being recorded, how much of it has been counted, and since when what was drawn last is shown."""
 
     serializer: Any
     receiver: Receiver
+    shown_s: float
     n_frames: int = 0
     n_bytes: int = 0
     n_messages: int = 0
     n_buffers: int = 0
+
+    def pass_to(self, now_s: float) -> None:
+        """Note how long what was drawn last has been shown."""
+        if now_s > self.shown_s:
+            self.serializer.insert_sleep(now_s - self.shown_s)
+        self.shown_s = now_s
 
     def count(self) -> None:
         """Add what was drawn since this was called last; viser has no other way to tell it."""
@@ -138,6 +146,8 @@ class _Recording:
 
 class Recordings:
     """Recordings that are being made, each of all that is drawn from its beginning to its end.
+
+    Their times are those of any one clock. None passes as long as nothing was drawn.
 
     A page is made, and delivered, in a thread of its own: of a long recording that takes seconds, for which a live view
     would stand still.
@@ -160,14 +170,15 @@ class Recordings:
         """Return how much each holds."""
         return {key: recording.n_bytes for key, recording in self._made.items()}
 
-    def begin(self, key: Hashable, receiver: Receiver) -> None:
-        """Begin a recording."""
-        self._made[key] = _Recording(self._serializer(), receiver)
+    def begin(self, key: Hashable, receiver: Receiver, now_s: float = math.inf) -> None:
+        """Begin a recording; where something is shown already, it begins with that, now."""
+        self._made[key] = _Recording(self._serializer(), receiver, now_s)
 
-    def end(self, key: Hashable) -> None:
+    def end(self, key: Hashable, now_s: float) -> None:
         """End a recording and deliver it, where there is one."""
         recording = self._made.pop(key, None)
         if recording is not None:
+            recording.pass_to(now_s)
             thread = threading.Thread(target=recording.finish, name="ertis-html", daemon=True)
             thread.start()
             self._threads.append(thread)
@@ -187,12 +198,12 @@ class Recordings:
             recording.count()
             if recording.n_bytes >= MOST_BYTES:
                 recording.receiver.full()
-                self.end(key)
+                self.end(key, recording.shown_s)
 
-    def pass_time(self, time_s: float) -> None:
-        """Note how long what was drawn last has been shown."""
+    def pass_to(self, now_s: float) -> None:
+        """Note how long what was drawn last has been shown, before something else is drawn."""
         for recording in self._made.values():
-            recording.serializer.insert_sleep(time_s)
+            recording.pass_to(now_s)
 
     def wait(self) -> None:
         """Wait until all that has ended is delivered."""

@@ -5,8 +5,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from ertis_numba.frames import Stamp
 from ertis_numba.viewer._recordings import MOST_BYTES
-from ertis_numba.viewer._saving import time_of
 from ertis_numba.viewer._shapes import Drawn
 
 if TYPE_CHECKING:
@@ -61,16 +61,15 @@ def rows_of(
     n_bytes: int | None,
 ) -> dict[str, tuple[str, str]]:
     """Return what there is to tell, by name: what it is, and its value."""
-    latest = max(sensors.values(), key=lambda drawn: drawn.timestamp_ns, default=None)
-    captured = time_of(latest.timestamp_ns) if latest else ()
+    latest = max((each.stamp for each in sensors.values()), key=lambda stamp: stamp.timestamp_ns, default=Stamp())
     live = source.is_film is False
     silent = live and bool(sensors) and all(each.overdue for each in sensors.values())
     latency_s = None if silent else counts.latency_s  # which is of an image of long ago then
     rows = {
         "state": ("state", _state(source, sensors, paused=paused and live)),
         "frames": ("frames shown", str(counts.shown)),
-        "sequence": ("measurement", _of_each(sensors, lambda drawn: str(drawn.sequence))),
-        "captured": ("captured", captured[0] if captured else _NONE),
+        "sequence": ("measurement", _of_each(sensors, lambda drawn: str(drawn.stamp.sequence))),
+        "captured": ("captured", latest.utc or _NONE),
         "age": ("age", _of_each(sensors, lambda drawn: _age(drawn, source.clock_s))),
         "rate": ("rate", f"{counts.rate_hz:.1f} Hz"),
         "latency": ("capture to shown", _NONE if latency_s is None else f"{1e3 * latency_s:.0f} ms"),

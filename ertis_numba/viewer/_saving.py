@@ -2,7 +2,6 @@
 
 import io
 import tempfile
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -11,12 +10,11 @@ from matplotlib.figure import Figure
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.interop._mountings import checked
 from ertis_numba.interop._point_files import write_ply
-from ertis_numba.interop._points import PointFinder, PointTable
+from ertis_numba.interop._points import PointTable
 from ertis_numba.viewer._axes import PAGE
-from ertis_numba.viewer._moments import SET_NS
 from ertis_numba.viewer._shapes import Frame, Pose
 
-__all__ = ["picture_png", "points_ply", "time_of"]
+__all__ = ["picture_png", "points_ply"]
 
 _DPI: Final = 100
 _HEAD_PX: Final = 34
@@ -33,7 +31,7 @@ def picture_png(frame: Frame) -> bytes:
     top_px = height_px
     for name, each in drawn:
         late = ["overdue"] if each.overdue else []
-        words = " · ".join([name, f"measurement {each.sequence}", *time_of(each.timestamp_ns), *late])
+        words = " · ".join([name, f"measurement {each.stamp.sequence}", *filter(None, [each.stamp.utc]), *late])
         place = (12 / width_px, (top_px - 12) / height_px)
         figure.text(*place, words, color="#e8eaf0", fontsize=9.5, va="top", parse_math=False)
         top_px -= _HEAD_PX + each.picture.shape[0]
@@ -41,18 +39,6 @@ def picture_png(frame: Frame) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=_DPI)
     return file.getvalue()
-
-
-class _Found(PointFinder):
-    """Has the points that were found already, so that those are saved which are drawn."""
-
-    def __init__(self, clouds: dict[str, PointCloud]) -> None:
-        super().__init__()
-        self._clouds = clouds
-
-    def __call__(self, image: Energyscape) -> PointCloud:
-        """Return the points of an image's sensor."""
-        return self._clouds[image.stamp.sensor]
 
 
 def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> bytes:
@@ -73,21 +59,9 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
     mountings = checked(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
     )
-    found = _Found({image.stamp.sensor: cloud for image, cloud, _ in points})
-    table = PointTable.of([image for image, _, _ in points], found, mountings)
+    found = {image.stamp.sensor: cloud for image, cloud, _ in points}  # those are saved which are drawn
+    table = PointTable.of([image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "points.ply"
         write_ply(path, table, text=False)
         return path.read_bytes()
-
-
-def time_of(timestamp_ns: int) -> tuple[str, ...]:
-    """Return a time in words, if it is known: simulated clocks begin at 0."""
-    if timestamp_ns < SET_NS:
-        return ()
-    seconds, nanoseconds = divmod(timestamp_ns, 10**9)
-    try:
-        moment = datetime.fromtimestamp(seconds, UTC)
-    except (OverflowError, OSError, ValueError):  # a clock that was never set
-        return ()
-    return (f"{moment:%Y-%m-%d %H:%M:%S}.{nanoseconds // 10**6:03d} UTC",)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.geometry import Grid, unit_vectors
-from ertis_numba.stages.points import PointExtractor
-from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, MOST_DECAY_S, Choices, colour_table
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.stages.finder import PointFinder, same_directions
+from ertis_numba.stages.levels import below_strongest_db
+from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, Choices, colour_table
 from ertis_numba.viewer._fusion import Fusion, is_level
 from ertis_numba.viewer._polar import Polar, cropped, is_within
 from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, Frame, Pose, Sector, Taken
@@ -49,7 +50,6 @@ class _Sensor:
     """What is kept of a sensor; what was drawn last is kept as long as it would come out the same."""
 
     latest: Taken
-    extract: PointExtractor
     clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MOST_CLOUDS))
     polar: Polar | None = None
     polar_for: tuple[object, ...] = ()
@@ -75,6 +75,7 @@ class Scene:
 
     def __init__(self, *, width_px: int = 520) -> None:
         self._width_px = width_px
+        self._find = PointFinder(top=_MOST_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
         self._sensors: dict[str, _Sensor] = {}
         self._fusion: tuple[list[tuple[Polar, Pose]], Fusion] | None = None
         self._plan: tuple[list[object], Sector] | None = None
@@ -100,15 +101,11 @@ class Scene:
         name = taken.image.stamp.sensor
         kept = self._sensors.get(name)
         if kept is None or not _same_axes(kept.latest.image, taken.image):
-            grid = Grid(taken.image.azimuth_rad, taken.image.elevation_rad)
-            extract = PointExtractor(taken.image.settings, grid, top=_MOST_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
-            kept = self._sensors[name] = _Sensor(taken, extract, *(() if kept is None else (kept.clouds,)))
+            kept = self._sensors[name] = _Sensor(taken, *(() if kept is None else (kept.clouds,)))
         kept.latest = taken
         while kept.clouds and kept.clouds[-1].time_s >= taken.time_s:
             kept.clouds.pop()
-        while kept.clouds and taken.time_s - kept.clouds[0].time_s > MOST_DECAY_S:
-            kept.clouds.popleft()
-        kept.clouds.append(_cloud_of(kept.extract(taken.image), taken))
+        kept.clouds.append(_cloud_of(self._find(taken.image), taken))
 
     def draw(self, choices: Choices, now_s: float | None = None) -> Frame:
         """Return what to draw of the images taken so far.
@@ -150,7 +147,7 @@ class Scene:
         kept.outside = not is_within(image, choices.range_m)
         if not kept.outside:
             image = cropped(image, choices.range_m)
-        polar_for = (id(kept.extract), len(image.range_m), float(image.range_m[0]), choices.dynamic_range_db)
+        polar_for = (len(image.range_m), float(image.range_m[0]), choices.dynamic_range_db)
         if kept.polar is None or kept.polar_for != polar_for:
             kept.polar = Polar(image, dynamic_range_db=choices.dynamic_range_db, width_px=self._width_px)
             kept.polar_for = polar_for
@@ -173,10 +170,7 @@ class Scene:
 
 
 def _same_axes(image: Energyscape, other: Energyscape) -> bool:
-    return all(
-        getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
-        for name in ("azimuth_rad", "elevation_rad", "range_m")
-    )
+    return same_directions(image, other) and np.array_equal(image.range_m, other.range_m)
 
 
 def _chosen(cloud: PointCloud, some: NDArray[np.bool_]) -> PointCloud:
@@ -230,8 +224,7 @@ def _drawn(kept: _Sensor, choices: Choices, now_s: float, pose: Pose | None, *, 
         position_m, colours, share_left = position_m[:0], colours[:0], share_left[:0]
     return Drawn(
         pose=pose,
-        sequence=taken.image.stamp.sequence,
-        timestamp_ns=taken.image.stamp.timestamp_ns,
+        stamp=taken.image.stamp,
         time_s=taken.time_s,
         overdue=overdue,
         picture=kept.picture,
@@ -263,13 +256,10 @@ def _points(
 
 
 def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
-    highest = image.energy.max(axis=1)
-    strongest = np.float32(highest.max(initial=0.0)) or np.float32(1)
-    level_db = 20 * np.log10(np.maximum(highest / strongest, np.float32(1e-10)))
-    shade = np.clip(1 + level_db / choices.dynamic_range_db, 0, 1)
+    shade = 1 + below_strongest_db(image.energy.max(axis=1), choices.dynamic_range_db) / choices.dynamic_range_db
     radius_m = _FARTHEST_DOME * float(image.range_m[-1])
     # Directions that are spread evenly over half a sphere have a square of this side each.
-    size_m = radius_m * math.sqrt(2 * math.pi / len(highest))
+    size_m = radius_m * math.sqrt(2 * math.pi / len(shade))
     return Dome(
         np.asarray(radius_m * unit_vectors(image.azimuth_rad, image.elevation_rad), dtype=np.float32),
         table[np.rint(255 * shade).astype(np.uint8)],

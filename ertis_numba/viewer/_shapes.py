@@ -111,8 +111,8 @@ class Drawn:
     ----------
     pose : Pose or None
         None where the sensor cannot be drawn on the platform: there are others, and nobody said where it is.
-    sequence : int
-    timestamp_ns : int
+    stamp : Stamp
+        Of the image.
     time_s : float
         When it was, by the clock of its source.
     overdue : bool
@@ -132,8 +132,7 @@ class Drawn:
     """
 
     pose: Pose | None
-    sequence: int
-    timestamp_ns: int
+    stamp: Stamp
     time_s: float
     overdue: bool
     picture: NDArray[np.uint8]

@@ -154,7 +154,7 @@ class View:
                 self._draw(now_s)
             if now_s - self._told_s >= _TELL_S:
                 self._tell()
-        self._finish()
+        self._finish(time.monotonic())
 
     def prepare(self) -> None:
         """Make the images of a film's first moment, which takes long where kernels are to be compiled."""
@@ -187,10 +187,11 @@ class View:
             for taken in film.at(place):
                 self._scene.take(taken)
             self._counts.shown += 1
+            self._recordings.pass_to(moment.time_s)
             self._show(moment.time_s, place, new=True)
             after_s = film.moments[place + 1].time_s if place + 1 < len(film.moments) else moment.time_s + _LAST_S
             self._fade(moment.time_s, after_s, place)
-        self._finish()
+        self._finish(film.moments[-1].time_s + _LAST_S)
 
     @property
     def shown(self) -> int:
@@ -218,24 +219,28 @@ class View:
     def _begin(self, html: Path, *, overwrite: bool) -> None:
         sources = () if self._film is None else (self._film.path,)
         self._file = ToFile(html, overwrite=overwrite, on_note=self._note, sources=sources)
-        self._recordings.begin(_OURS, self._file)
+        self._recordings.begin(_OURS, self._file, self._begun_s)
 
-    def _finish(self) -> None:
+    @property
+    def _begun_s(self) -> float:
+        """When a recording of the view begins: now, or with what is drawn first."""
+        return math.inf if self._frame is None else time.monotonic()
+
+    def _finish(self, now_s: float) -> None:
         """Wait for what is still written; a recording in which nothing was drawn is not."""
         if self._frame is None:
             self._recordings.drop(_OURS)
-        self._recordings.end(_OURS)
+        self._recordings.end(_OURS, now_s)
         self._recordings.wait()
         if self._file is not None:
             self._file.check()
 
     def _fade(self, clock_s: float, until_s: float, place: int) -> None:
-        """Record what changes until something new comes, and how long that takes."""
+        """Record what changes until something new comes."""
         while self._frame is not None and (next_s := max(self._frame.until_s, clock_s + _FADE_S)) < until_s:
-            self._recordings.pass_time(next_s - clock_s)
             clock_s = next_s
+            self._recordings.pass_to(clock_s)
             self._show(clock_s, place, new=False)
-        self._recordings.pass_time(until_s - clock_s)
 
     def _draw(self, now_s: float) -> None:
         """Draw what is new or has changed, if anything."""
@@ -250,8 +255,7 @@ class View:
         for each in taken:
             self._scene.take(each)
         self._changed = False
-        if math.isfinite(self._drawn_s):
-            self._recordings.pass_time(now_s - self._drawn_s)
+        self._recordings.pass_to(now_s)
         self._drawn_s = now_s
         self._show(clock_s, 0 if self._film is None else self._film.shown, new=bool(taken))
         self._page.limit_range(self._scene.farthest_m, self.choices.range_m)
@@ -353,9 +357,9 @@ class View:
     def _record(self, client: Any) -> None:
         """Begin the recording of a browser, or end it."""
         if client.client_id in self._recordings:
-            self._recordings.end(client.client_id)
+            self._recordings.end(client.client_id, time.monotonic())
         else:
-            self._recordings.begin(client.client_id, ToBrowser(client, self._name("html")))
+            self._recordings.begin(client.client_id, ToBrowser(client, self._name("html")), self._begun_s)
         self._told_s = -math.inf
 
     def _name(self, ending: str) -> str:

@@ -1,12 +1,12 @@
 """Local worker processes: started, fed, watched, killed and started again."""
 
-import os
 import time
 from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 
+from ertis_numba.cores import usable_cores
 from ertis_numba.network.log import Log
 from ertis_numba.network.processing.child import Child
 from ertis_numba.network.processing.choice import Choice
@@ -56,7 +56,7 @@ class Workers:
 
     def __init__(self, options: Options, log: Log) -> None:
         self._options, self._log = options, log
-        self._threads = options.threads or _n_cores()
+        self._threads = options.threads or usable_cores()
         count = options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads)
         self._chosen = Choice(count, self._threads)
         self._kinds: dict[int, Kind] = {}
@@ -311,8 +311,3 @@ class Workers:
         if job is not None:
             found.append(Lost(job, f"worker {pid} has died of it or was killed", again=True))
         return found
-
-
-def _n_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

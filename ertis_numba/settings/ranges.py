@@ -1,0 +1,60 @@
+"""Which ranges suit a record and its call."""
+
+import math
+from typing import Any
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings.call import Call
+from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.recording import Recording
+
+__all__ = ["largest_decimation", "suit_ranges"]
+
+_SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
+_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth
+_LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+_MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
+_MOST_STEP = 10_000
+
+
+def suit_ranges(processing: Processing, recording: Recording, call: Call) -> Processing:
+    """Return processing with ranges that suit a record and its call.
+
+    The default window ends where the whole echo still fits into the record in any air. A ``range_decimation`` that
+    leaves less than 1.8 ranges per second and hertz of the call's bandwidth gives way to one that suits both: with the
+    3.8 mm of the default, a pulse of 60 kHz can lie between two ranges and lose 2 dB.
+
+    Raises
+    ------
+    ArgumentError
+        The record is no longer than the call.
+    """
+    if recording.duration_s <= call.duration_s:
+        raise ArgumentError(
+            f"recording lasts {1e3 * recording.duration_s:.4g} ms, the call alone {1e3 * call.duration_s:.4g} ms; give "
+            "more samples"
+        )
+    changes: dict[str, Any] = {}
+    first_m, last_m = Processing().range_m
+    if processing.range_m == (first_m, last_m):
+        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
+        last_m = min(last_m, math.floor(10 * echo_m) / 10 or math.floor(1000 * echo_m) / 1000)
+        changes["range_m"] = (first_m if first_m < last_m else 0.0, last_m)
+    least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
+    if recording.sample_rate_hz / processing.range_decimation < least_hz * (1 - 1e-9):
+        suits = largest_decimation(recording.sample_rate_hz, call, processing.method)
+        changes |= {"range_decimation": _step(recording.sample_rate_hz / least_hz, suits), "decimation": None}
+    return processing.replace(**changes)
+
+
+def largest_decimation(sample_rate_hz: float, call: Call, method: str) -> int:
+    """Return the largest decimation whose low pass needs few taps."""
+    least_hz = _LEAST_RATE[method] * call.high_frequency_hz
+    return min(max(1, math.floor(sample_rate_hz / least_hz)), _MOST_DECIMATION)
+
+
+def _step(most: float, suits: int) -> int:
+    """Return how many samples apart ranges may be: where there is, a multiple of the decimation that suits the call."""
+    step = min(max(1, math.floor(most)), _MOST_STEP)
+    suits -= suits % 10 if suits > 10 else 0  # round numbers, as RTIS has them
+    return step - step % suits if step > suits else step
