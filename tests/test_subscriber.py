@@ -78,6 +78,9 @@ def test_what_came_with_a_product(publisher):
         assert latest.translation_m == publisher.translation_m
         assert latest.rotation_xyzw == publisher.rotation_xyzw
         assert latest.header.monotonic_ns == 5
+        publisher.publish(image(timestamp_ns=3_000_000_000))  # of a clock that was not set
+        got(publisher, subscriber)
+        assert subscriber.latest.age_s is None
 
 
 def test_images_of_half_precision_come_as_float32(publisher):

@@ -58,9 +58,12 @@ class Arrival:
 
     @property
     def age_s(self) -> float | None:
-        """From the emission to its being here, as far as the clocks of both machines agree; None if it has no time."""
-        stamped = getattr(self.header, "timestamp_ns", None)
-        return None if stamped is None else (self.arrived_utc_ns - stamped) / 1e9
+        """From the emission to its being here, as far as the clocks of both machines agree; None if it has no time.
+
+        A sensor has none either whose clock was never set.
+        """
+        stamp: Stamp | None = getattr(self.header, "stamp", None)
+        return (self.arrived_utc_ns - stamp.timestamp_ns) / 1e9 if stamp is not None and stamp.is_timed else None
 
     @property
     def made_in_s(self) -> float | None:
