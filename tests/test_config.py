@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -235,3 +236,23 @@ def test_completion_for_each_shell(tmp_path, shell):
     done = ertis("completion", shell, folder=tmp_path)
     assert done.returncode == 0
     assert "_ERTIS_COMPLETE" in done.stdout
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+def test_zsh_completes_after_what_the_page_names(tmp_path):
+    (before,) = re.findall(r"in ~/.zshrc, after: (.*)", (ROOT / "docs" / "command-line.md").read_text())
+    printed = tmp_path / "printed"
+    printed.write_text(ertis("completion", "zsh", folder=tmp_path).stdout)
+    done = subprocess.run(
+        # -u: whoever owns the folders of zsh here, ask nothing.
+        ["zsh", "-f", "-c", f'{before} -u; eval "$(<{printed})"; print ${{_comps[ertis]}}'],
+        cwd=tmp_path,
+        env=os.environ | {"HOME": str(tmp_path)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.stdout.split(), done.stderr) == (["_ertis_completion"], "")
+    assert before in " ".join(ertis("completion", "--help", folder=tmp_path).stdout.split())

@@ -181,6 +181,24 @@ def test_numbers_have_no_full_scale(scale):
     assert health(dataclasses.replace(numbers(), words=words)).faults == {"saturated": (5,)}
 
 
+def test_levels_of_numbers_beyond_1_refer_to_the_highest():
+    words = numbers().words
+    noise = np.random.default_rng(1).standard_normal(words.shape)
+    noisy = 0.1 * words / np.abs(words).max() + 1e-4 * noise
+
+    def told(peak):
+        given = (peak / np.abs(noisy).max() * noisy).astype(np.float32)
+        report = health(dataclasses.replace(numbers(), words=given))
+        return report.noise_dbfs, report.dynamic_range_db
+
+    at_full_scale = told(1.0)
+    for peak in (3e5, 3e12):
+        assert told(peak) == pytest.approx(at_full_scale, abs=0.01)
+    quieter = (at_full_scale[0] - 20, at_full_scale[1] + 20)  # full scale is 1 where nothing goes beyond it
+    assert told(0.1) == pytest.approx(quieter, abs=0.01)
+    assert at_full_scale[0] < -60
+
+
 def test_calibrated_gains_make_no_microphone_dead():
     gain = (1.0, 2.0, 0.5, 3.0, 0.7, 3.0, 0.2, 3.0)
     words = numbers().words * np.float32(gain)

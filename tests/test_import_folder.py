@@ -210,6 +210,12 @@ def test_numbers_that_overlap(tmp_path):
         open_rtis_folder(folder)
 
 
+@pytest.mark.parametrize("name", ["m_99999999999999999999999.bin", f"m_{2**63}.bin"], ids=["far", "just"])
+def test_numbers_that_no_recording_can_hold(tmp_path, name):
+    with pytest.raises(DataError, match=rf"{name} is number \d+, which no recording can hold; give it a smaller one"):
+        open_rtis_folder(folder_of(tmp_path, names=("m_0.bin", name)))
+
+
 def test_command(tmp_path):
     folder = folder_of(tmp_path, names=("m_5.bin", "m_7.bin"))
     done = CliRunner().invoke(cli, ["import", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"])

@@ -169,6 +169,26 @@ REFUSED = {
         {},
         r"holds nan at sample 0 of channel 3; give finite numbers",
     ),
+    "beyond float32": (
+        lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, 1e300, numbers())),
+        {},
+        r"holds 1e\+300 at sample 0 of channel 3; give numbers up to 3\.403e\+38",
+    ),
+    "skip for ever": (
+        lambda folder: write_wav(folder / "a.wav", numbers()),
+        {"skip_s": 1e308},
+        r"skip_s is 1e\+308; give",
+    ),
+    "last for ever": (
+        lambda folder: write_wav(folder / "a.wav", numbers()),
+        {"length_s": 1e308},
+        r"length_s is 1e\+308; give",
+    ),
+    "starts too late": (
+        lambda folder: write_wav(folder / "a.wav", numbers()),
+        {"start_ns": 2**70},
+        r"start_ns is \d+; give a whole number from 0 to 9223372036854775807",
+    ),
     "two rates": (
         lambda folder: [write_wav(folder / "a.wav", numbers()), write_wav(folder / "b.wav", numbers(), 96_000)],
         {},
@@ -185,10 +205,25 @@ REFUSED = {
         {},
         r"has a header that was never finished",
     ),
+    "no samples": (
+        lambda folder: write_wav(folder / "a.wav", np.zeros((0, 8), np.int16)),
+        {},
+        r"a\.wav has no samples; save it again",
+    ),
+    "half a frame": (
+        lambda folder: _changed(folder / "a.wav", lambda content: _with_data_size(content, 191_996)),
+        {},
+        r"has 191996 bytes of samples, which are no whole frames of 64 bytes; copy it again",
+    ),
+    "BW64": (
+        lambda folder: _changed(folder / "a.wav", lambda content: b"BW64" + content[4:]),
+        {},
+        r"is no WAV file, it begins with b'BW64'; give WAV",
+    ),
     "no channels": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[:22] + b"\0\0" + content[24:]),
         {},
-        r"cannot be read .*; save it again as WAV",
+        r"cannot be read \(it has 0 channels\); save it again as WAV",
     ),
     "shorter than the call": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
@@ -278,6 +313,44 @@ def test_numbers_of_acoular_have_one_full_scale(tmp_path, kind):
     assert np.abs(signals - given).max() <= (2.0**-7 if kind == "int8" else 2.0**-15)
 
 
+def write_acoular(path, given, rate_hz):
+    with h5py.File(path, "w") as file:
+        file["time_data"] = given
+        file["time_data"].attrs["sample_freq"] = rate_hz
+    return path
+
+
+@pytest.mark.parametrize("rate_hz", [np.array([192e3]), np.array([[192_000]]), 192_000], ids=["list", "table", "whole"])
+def test_a_rate_may_be_an_array_of_one_number(tmp_path, rate_hz):
+    path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32), rate_hz)
+    assert ertis.open_pcm(path, PCM).settings.recording.sample_rate_hz == RATE_HZ
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "message"),
+    [
+        (np.nan, r"a\.h5: recording\.sample_rate_hz is nan; give a finite number"),
+        (np.inf, r"a\.h5: recording\.sample_rate_hz is inf; give a finite number"),
+        (0.0, r"a\.h5: recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
+        (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; give a number"),
+        (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; give one number, the rate in Hz"),
+        ("fast", "holds no time_data with a sample_freq"),
+    ],
+    ids=["nan", "inf", "zero", "huge", "two", "text"],
+)
+def test_rates_that_are_refused(tmp_path, rate_hz, message):
+    path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32), rate_hz)
+    with pytest.raises(DataError, match=message):
+        ertis.open_pcm(path, PCM, skip_s=0.001)
+
+
+@pytest.mark.parametrize("options", [{}, {"skip_s": 0.001}, {"length_s": 0.01}], ids=["all", "skip", "length"])
+def test_data_that_lie_the_other_way_round(tmp_path, options):
+    path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32).T, RATE_HZ)
+    with pytest.raises(DataError, match=r"a\.h5 has 3000 channels of 8 samples; transpose it"):
+        ertis.open_pcm(path, PCM, **options)
+
+
 def test_other_hdf5_is_refused(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     with pytest.raises(DataError, match=r"holds no time_data with a sample_freq; give a file of Acoular"):
@@ -326,6 +399,42 @@ def test_times_and_what_hinders_are_told(tmp_path):
     with open_recording(tmp_path / "rec.h5") as recording:
         times_s = [stamp.timestamp_ns / 1e9 for stamp in recording.stamps()]
     assert times_s == pytest.approx([1_777_897_800.5, 1_777_897_800.515625])
+
+
+STARTS = {
+    "2026-05-04T12:30": 1_777_897_800,
+    "2026-05-04T14:30+0200": 1_777_897_800,
+    "2026-05-04T12:30:00.5": 1_777_897_800.5,
+    "1970-01-01T02:00:00+02:00": 0,
+    "2262-04-11T23:47:16": 9_223_372_036,
+}
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_start_is_told_to_the_minute_or_better(tmp_path, start):
+    write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
+    (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
+    command("import", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "--start", start)
+    with open_recording(tmp_path / "a.h5") as recording:
+        assert recording[0].stamp.timestamp_ns == 10**9 * STARTS[start]
+
+
+@pytest.mark.parametrize("start", ["2300-01-01T00:00:00", "1970-01-01T00:00:00+02:00", "1969-12-31T23:59"])
+def test_starts_that_no_recording_can_hold(tmp_path, start):
+    write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
+    (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
+    arguments = ["import", str(tmp_path / "a.wav"), "--settings", str(tmp_path / "ring.toml"), "--start", start]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 2
+    assert f"'--start': {start[:16]}" in done.stderr
+    assert "is no time from 1970 to 2262, which a recording can hold; give another" in done.stderr
+
+
+def test_a_recording_needs_another_name_than_its_file(tmp_path):
+    path = write_acoular(tmp_path / "ac.h5", numbers().astype(np.float32), RATE_HZ)
+    done = CliRunner().invoke(cli, ["import", str(path)])
+    assert done.exit_code == 2
+    assert f"{path} cannot become a recording of the same name; give another one (--output)" in done.stderr
 
 
 def test_options_of_pcm_are_refused_for_words(tmp_path):

@@ -139,6 +139,18 @@ def test_journal_is_sealed_to_the_same(tmp_path, measurement):
         assert np.array_equal(recording[0].words, measurement.words)
 
 
+def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
+    settings = PCM.replace(recording=PCM.recording.replace(encoding="float32"))
+    words = np.zeros((3_000, 8), np.float32)
+    words[17, 3] = np.nan
+    path = tmp_path / "run.h5.journal"
+    with Journal.create(path, target=tmp_path / "run.h5") as journal:
+        journal.add_sensor("sensor", settings)
+        journal.append([ertis.Entry(ertis.Measurement(words, settings), 0)])
+    with open_recording(seal(path).recording) as recording:
+        assert np.array_equal(recording[0].words, words, equal_nan=True)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -1,6 +1,7 @@
 """Recordings and energyscapes survive the way to the disk and back, and other programs can read them."""
 
 import tracemalloc
+from collections.abc import Sequence
 
 import h5py
 import numpy as np
@@ -46,6 +47,18 @@ def test_recording_comes_back(tmp_path, settings):
         changed = recording.settings.replace(array=settings.array)
         assert changed == settings
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
+
+
+def test_readers_are_sequences(tmp_path):
+    given = noise(count=5)
+    with open_recording(write_recording(tmp_path / "rec.h5", given)) as recording:
+        assert isinstance(recording, Sequence)
+        for part in (slice(0, 3), slice(None), slice(None, None, -2), slice(-2, 99), slice(4, 2)):
+            assert [item.stamp for item in recording[part]] == [item.stamp for item in given[part]]
+        assert [item.stamp for item in reversed(recording)] == [item.stamp for item in given[::-1]]
+    with open_energyscapes(write_energyscapes(tmp_path / "img.h5", [image()] * 3)) as images:
+        assert isinstance(images, Sequence)
+        assert [np.array_equal(each.energy, image().energy) for each in images[1:]] == [True, True]
 
 
 def test_recording_depends_on_no_other_file(tmp_path):
@@ -279,7 +292,10 @@ def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
         (Stamp(sequence=2**63), "sequence is 9223372036854775808; give a whole number from 0"),
         (Stamp(sequence=-1), "sequence is -1; give a whole number from 0"),
         (Stamp(sequence=1.0), "sequence is 1.0; give a whole number"),
-        (Stamp(timestamp_ns=2**63), "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808"),
+        (
+            Stamp(timestamp_ns=2**63),
+            "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808",
+        ),
         (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; give"),
         (Stamp(epoch=2**63), "epoch is 9223372036854775808; give"),
     ],

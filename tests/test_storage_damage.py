@@ -76,6 +76,48 @@ def test_cut_short(path, kept):
         open_recording(path)
 
 
+HOLDING = """
+import h5py, sys
+with h5py.File(sys.argv[1], "r+"):
+    print("open", flush=True)
+    sys.stdin.read()
+"""
+
+
+def held_open(path, **more):
+    """A process that has a file open for writing, once it has."""
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | more,
+        text=True,
+    )
+    assert holder.stdout.readline() == "open\n"
+    return holder
+
+
+def test_a_file_that_another_program_writes_is_not_called_damaged(path):
+    with held_open(path) as holder:
+        for read in (open_recording, file_kind):
+            with pytest.raises(
+                DataError, match=r"rec.h5 is in use by another program, which writes it; close it there"
+            ):
+                read(path)
+        holder.stdin.close()
+    with open_recording(path) as recording:
+        assert len(recording) == 3
+
+
+def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
+    with held_open(path) as holder:
+        holder.kill()
+    with pytest.raises(
+        DataError, match=r"rec.h5 is in use .*, or was when that was killed; close it there, or copy it"
+    ):
+        open_recording(path)
+
+
 def test_newer_version(path):
     with h5py.File(path, "r+") as file:
         file.attrs["ertis_format_version"] = 2
@@ -223,7 +265,9 @@ def test_settings_that_were_changed(path):
 def test_no_room(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
     monkeypatch.setattr(atomic, "SPARE_BYTES", 2 * free)
-    with pytest.raises(DataError, match=r"MB free, wanted [\d.]+ MB for what is next, \d+ MB of it to spare; free some"):
+    with pytest.raises(
+        DataError, match=r"MB free, wanted [\d.]+ MB for what is next, \d+ MB of it to spare; free some"
+    ):
         write_recording(tmp_path / "rec.h5", noise())
     assert not list(tmp_path.iterdir())
 

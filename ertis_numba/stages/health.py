@@ -5,6 +5,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,8 @@ class ChannelHealth:
         Of the sound in the call's band while it is loud, the noise taken off and the calibrated gain, beside the
         median of all channels.
     noise_dbfs : float or None
-        In the call's band while it is quiet: mean square of the signal, full scale 1.
+        In the call's band while it is quiet: mean square of the signal, full scale 1; of float32 beyond that, the
+        highest amplitude of the record.
     tone_hz, tone_db : float or None
         By how much the highest line stands out of its surroundings, in the mean over time and without lines that
         most channels hear; and where it is, if it counts as a tone.
@@ -157,10 +159,11 @@ def health(measurement: Measurement) -> Health:
         signal_of = functools.partial(_bits.signal_of, octets)
         told = _by_bits(octets, enabled)
     else:
-        scale = np.float32(1 / settings.recording.full_scale)
-        signal_of = lambda channel: np.multiply(words[:, channel], scale, dtype=np.float32)  # noqa: E731
-        is_float = settings.recording.encoding == "float32"
-        told = [_by_numbers(channel, signal_of(channel), is_float=is_float) for channel in enabled.tolist()]
+        full, is_float = settings.recording.full_scale, settings.recording.encoding == "float32"
+        told = [_by_numbers(i, _scaled(words, full, i), is_float=is_float) for i in enabled.tolist()]
+        if is_float:  # of which the amplitudes may be pascals
+            full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
+        signal_of = functools.partial(_scaled, words, full)
     found = {item.channel: item for item in told}
     moving = [item for item in told if not any(name.startswith("stuck") for name in item.faults)]
     told, tones_hz, unknown = _by_spectra(signal_of, len(words), moving, settings)
@@ -224,6 +227,11 @@ def _by_bits(octets: NDArray[np.uint8], enabled: NDArray[np.int64]) -> list[Chan
             )
         )
     return told
+
+
+def _scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32]:
+    """Return a channel of PCM whose full scale becomes 1."""
+    return np.asarray(np.multiply(words[:, channel], np.float32(1 / full), dtype=np.float32))
 
 
 def _by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:

@@ -103,6 +103,9 @@ class _Sealer(RecordingWriter):
         """Say what happened to the measurements."""
         self._attributes["history"] = history
 
+    def _require_words(self, item: Measurement) -> None:
+        """Take what came: the journal has looked at its type, and what is no number must not keep the rest from it."""
+
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
         """Take what is known of sensors of which nothing comes: the history tells of them."""
 
