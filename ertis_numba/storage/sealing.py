@@ -98,6 +98,7 @@ def _made_of(path: Path, recording: Path) -> bool:
 
 class _Sealer(RecordingWriter):
     _part_token: ClassVar[str | None] = TOKEN
+    _numbered: ClassVar[bool] = False  # the journal's index keeps numbers apart, and nothing must keep the rest from it
 
     def say(self, history: str) -> None:
         """Say what happened to the measurements."""
