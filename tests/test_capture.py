@@ -217,6 +217,7 @@ def test_gaps_and_measurements_come_in_order(captures):
     assert len(sink.numbers["two"]) >= 4
 
 
+@pytest.mark.alone  # on a busy machine the other misses a pulse more
 def test_a_sensor_may_hear_pulses_before_the_first_one_does(captures):
     capture = captures(trigger="sync", names=("one", "two"), n=8, dropped={"one": range(4)})
     with SyncChain(capture.emulators, rate_hz=20.0):
