@@ -1,6 +1,7 @@
 """Times that are promised, on machines as quick as those they were promised for, and on slower ones.
 
-They were promised for one that imports what all commands need in 0.4 s. Where that takes longer, so may all else.
+They were promised for one that imports what all commands need in some 0.4 s, which is an estimate: on that machine
+nobody measured it. Where that takes longer, so may all else.
 """
 
 import functools
