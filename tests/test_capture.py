@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.capture import Session
+from ertis_numba.capture.gap_reasons import DROPPED, NOT_TRIGGERED
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.emulator.faults import Fault, Faults, Spoilt
 from ertis_numba.devices.setup import Setup
@@ -183,6 +184,26 @@ def test_a_capture_by_pulses_ends_though_the_last_is_lost(captures):
         assert [stamp.sequence for stamp in recording.stamps()] == [0, 1, 3, 4]
         assert [(gap.first, gap.last) for gap in recording.gaps] == [(2, 2), (5, 5)]
     assert capture.session.counts["one"].lost == 2
+
+
+class Deaf:
+    """An emulated sensor that the SYNC pulses with some numbers do not trigger."""
+
+    def __init__(self, emulator, pulses):
+        self._emulator, self._pulses = emulator, pulses
+
+    def trigger(self, pulse, *, at_ns):
+        return pulse not in self._pulses and self._emulator.trigger(pulse, at_ns=at_ns)
+
+
+def test_gap_reasons_tell_dropped_measurements_from_missed_pulses(captures):
+    capture = captures(trigger="sync", names=("one", "two"), n=10, dropped={"two": (4,)})
+    one, two = capture.emulators
+    with SyncChain([one, Deaf(two, {6})], rate_hz=10.0):
+        capture.session.run(capture.journal)
+    with capture.recording("two") as recording:
+        reasons = {gap.reason for gap in recording.gaps}
+    assert reasons == {DROPPED, NOT_TRIGGERED}
 
 
 class Ordered:

@@ -14,7 +14,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli import options
+from ertis_cli import _signals, options
 from ertis_cli.main import COMMANDS, cli
 
 from ertis_numba.frames import Measurement, Stamp
@@ -327,7 +327,7 @@ def test_ended_from_outside(tmp_path, number, code):
 def test_a_signal_in_a_callback_is_obeyed(number, code):
     """Python itself prints what is raised in the callback of a weak reference, and goes on."""
     program = (
-        "import signal, sys, weakref; from ertis_cli import main; main.obey_signals()\n"
+        "import signal, sys, weakref; from ertis_cli import _signals; _signals.obey_signals()\n"
         "class Dropped: pass\n"
         "item = Dropped()\n"
         f"reference = weakref.ref(item, lambda _: signal.raise_signal({number.value}))\n"
@@ -342,7 +342,7 @@ def test_interrupt_waits_for_the_compiler():
     done = []
 
     def work():
-        with options.interrupt_later():
+        with _signals.interrupt_later():
             signal.raise_signal(signal.SIGINT)
             done.append(True)
 

@@ -22,7 +22,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.storage import open_recording, sensor_names
 
-__all__ = ["chain", "disk_full", "emulated", "kills", "platform", "sent_by_emulators", "sustained", "unplugs"]
+__all__ = ["chain", "disk_full", "emulated", "ertis", "kills", "platform", "sent_by_emulators", "sustained", "unplugs"]
 
 _ERTIS = (sys.executable, "-m", "ertis_cli")
 _WAIT_S = 120.0  # for anything that ought to end by itself
@@ -147,10 +147,10 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
     """Capture to a small disk until it is full, and tell what the command said and what is there."""
     target = disk / "full.h5"
     with emulated(source, folder) as ports:
-        done = _run("capture", *_ports(ports), "-o", str(target), "--rate", "20", "--duration", "60", "--json")
+        done = ertis("capture", *_ports(ports), "-o", str(target), "--rate", "20", "--duration", "60", "--json")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     stored = [line for line in lines if line["event"] == "stored"]
-    _run("recover", str(disk), "--quiet")
+    ertis("recover", str(disk), "--quiet")
     found = _checked(target, stored, sent_by_emulators(folder))
     return {
         "exit code": done.returncode,
@@ -185,14 +185,15 @@ def _ports(ports: list[str]) -> list[str]:
     return [word for port in ports for word in ("--port", port)]
 
 
-def _run(*arguments: str) -> "subprocess.CompletedProcess[str]":
+def ertis(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command to its end."""
     command = [*_ERTIS, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=_SEALED_S)  # noqa: S603
 
 
 def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
     """Capture to the end, and return all lines that were printed."""
-    done = _run("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options)
+    done = ertis("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options)
     if done.returncode:
         raise DataError(f"ertis capture ended with {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -217,7 +218,7 @@ def _recover(folder: Path) -> None:
     """Recover until no journal is left: a process that seals one may have outlived the capture."""
     end_s = time.monotonic() + _WAIT_S
     while list(folder.glob("*.journal")) and time.monotonic() < end_s:
-        _run("recover", str(folder), "--quiet")
+        ertis("recover", str(folder), "--quiet")
 
 
 def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:

@@ -14,7 +14,7 @@ import click
 
 from ertis_cli import options
 from ertis_cli._lines import Lines
-from ertis_cli._watch import stopped_by_signals
+from ertis_cli._signals import stopped_by_signals
 
 if TYPE_CHECKING:
     from types import TracebackType

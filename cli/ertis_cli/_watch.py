@@ -1,14 +1,11 @@
 """What is told while measurements are captured, and what ends that."""
 
-import math
-import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,87 +17,10 @@ if TYPE_CHECKING:
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.journal import Entry
 
-__all__ = ["Signals", "Watch", "broken_off_by_signals", "report", "stopped_by_signals"]
+__all__ = ["Watch", "report"]
 
 _REFRESH_S = 0.25
 _ALIVE = 0.05  # share of ones, and of zeros, of a microphone that is
-_TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
-
-
-class Signals:
-    """What asked this program to end, and what is to be done about it.
-
-    A signal never breaks into what runs: libraries that are being loaded would swallow it, or break over it. What was
-    asked for is done by `obey`, or by what is to be called from then on.
-    """
-
-    def __init__(self) -> None:
-        self.came: list[int] = []
-        self._stop: Callable[[], None] | None = None
-        self._first_s = math.inf
-
-    def __call__(self, number: int, _: object) -> None:
-        self.came.append(number)
-        now_s = time.monotonic()
-        if self._stop is None:
-            return
-        if now_s - self._first_s > _TWICE_S:  # who asks again means it
-            self.end()
-        self._first_s = min(self._first_s, now_s)
-        self._stop()
-
-    def obey(self, stop: Callable[[], None]) -> None:
-        """End if that was asked for meanwhile; call ``stop`` where it is from now on.
-
-        Raises
-        ------
-        KeyboardInterrupt, SystemExit
-            It was.
-        """
-        self._stop = stop
-        if self.came:
-            self.end()
-
-    def end(self) -> NoReturn:
-        """End as the first signal asked."""
-        if self.came[0] == signal.SIGINT:
-            raise KeyboardInterrupt
-        sys.exit(128 + self.came[0])
-
-
-@contextmanager
-def stopped_by_signals() -> Iterator[Signals]:
-    """Yield what remembers the signals that ask this program to end."""
-    asked = Signals()
-    with _handled_by(asked):
-        yield asked
-
-
-@contextmanager
-def broken_off_by_signals() -> Iterator[None]:
-    """Have signals that ask this program to end break into the block, so that it clears up.
-
-    Also those that it was begun with ignoring, as a shell's script begins its background jobs.
-    """
-
-    def end(number: int, _: object) -> NoReturn:
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        sys.exit(128 + number)
-
-    with _handled_by(end):
-        yield
-
-
-@contextmanager
-def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
-    before = {name: signal.signal(getattr(signal, name), handler) for name in _SIGNALS if hasattr(signal, name)}
-    try:
-        yield
-    finally:
-        for name, earlier in before.items():
-            signal.signal(getattr(signal, name), earlier)
 
 
 class Watch:

@@ -12,7 +12,8 @@ import click
 from ertis_cli import _network, options
 from ertis_cli._saving import taken_back
 from ertis_cli._sending import Sending
-from ertis_cli._watch import Signals, Watch, report, stopped_by_signals
+from ertis_cli._signals import Signals, stopped_by_signals
+from ertis_cli._watch import Watch, report
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from ertis_cli import options
-from ertis_cli._watch import broken_off_by_signals
+from ertis_cli._signals import broken_off_by_signals, interrupt_later
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -177,7 +177,7 @@ def _rendered(path: Path, names: "Sequence[str]", *, count: int | None, seed: in
     silent = scene.replace(
         sensors=tuple(each.replace(emitter=each.emitter.replace(silent=True)) for each in scene.sensors)
     )
-    with options.note_when_slow(options.PREPARING, quiet=quiet), options.interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 

@@ -14,7 +14,7 @@ from ertis_cli import _network, options
 from ertis_cli._heard import Heard
 from ertis_cli._saving import PRODUCTS as FILED
 from ertis_cli._saving import saving
-from ertis_cli._watch import stopped_by_signals
+from ertis_cli._signals import stopped_by_signals
 
 if TYPE_CHECKING:
     from ertis_cli._saving import Write

@@ -3,16 +3,14 @@
 import errno
 import gc
 import importlib
-import os
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from typing import Any, NoReturn, cast
 
 import click
 
 from ertis_cli import _config, _naming
+from ertis_cli._signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
 
@@ -46,8 +44,6 @@ COMMANDS = {
 """Where each command is, and what its help says first: commands are imported when they are run."""
 
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
-_ENDED = 128  # and the number of the signal
-_CALLBACK_S = 0.01  # until a callback is over
 
 
 class _Commands(click.Group):
@@ -92,6 +88,8 @@ class _Commands(click.Group):
         except Exception as error:
             if not standalone_mode:
                 raise
+            if interruption.caused(error) and interruption.code != _INTERRUPTED:
+                sys.exit(interruption.code)
             _leave(*_told(error))
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -103,7 +101,7 @@ def _told(error: Exception) -> tuple[int, str]:
         return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
     if isinstance(error, click.ClickException):
         return _FAILED, error.format_message()
-    if isinstance(error, click.Abort):
+    if isinstance(error, click.Abort) or interruption.caused(error):
         return _INTERRUPTED, "interrupted"
     if _is_expected(error):
         return _FAILED, _of_system(error) or str(error) or type(error).__name__
@@ -168,34 +166,10 @@ def main() -> None:
     obey_signals()
     # Libraries make a hundred thousand objects that stay: to look through them is a twentieth of a command's time.
     gc.set_threshold(100_000)
-    cli.main()
-
-
-def obey_signals() -> None:
-    """Let a polite end unwind like Ctrl-C does, so that no half-written file is left behind."""
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), _end)
-    sys.unraisablehook = _end_again
-
-
-def _end(number: int, _: object) -> NoReturn:
-    sys.exit(_ENDED + number)
-
-
-def _end_again(swallowed: "sys.UnraisableHookArgs") -> None:
-    """Send a signal again that came in a callback, such as those of h5py: Python drops what is raised there."""
-    code = getattr(swallowed.exc_value, "code", None)
-    if isinstance(swallowed.exc_value, KeyboardInterrupt):
-        number = signal.SIGINT
-    elif isinstance(swallowed.exc_value, SystemExit) and isinstance(code, int) and code > _ENDED:
-        number = signal.Signals(code - _ENDED)
-    else:
-        sys.__unraisablehook__(swallowed)
-        return
-    again = threading.Timer(_CALLBACK_S, os.kill, (os.getpid(), number))
-    again.daemon = True
-    again.start()
+    try:
+        cli.main()
+    finally:
+        interruption.end()
 
 
 if __name__ == "__main__":

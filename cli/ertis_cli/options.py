@@ -1,7 +1,6 @@
 """Options and reports that several commands share."""
 
 import json
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +12,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
+from ertis_cli._signals import interrupt_later
 
 if TYPE_CHECKING:
     from ertis_numba.pipeline import Pipeline
@@ -33,7 +33,6 @@ __all__ = [
     "device",
     "force",
     "input_file",
-    "interrupt_later",
     "measurement",
     "min_level",
     "note_untold_directions",
@@ -267,19 +266,6 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
     if quiet or not _progress.is_drawn_on(sys.stderr):
         return nullcontext(items)
     return _progress.bar(items, length=length, label=label)
-
-
-@contextmanager
-def interrupt_later() -> Iterator[None]:
-    """Keep Ctrl-C until the block ends: the compiler's callbacks would swallow it, or break over it."""
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
-        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._signals import interrupt_later
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -68,7 +69,7 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
-    with options.note_when_slow(options.PREPARING, quiet=quiet), options.interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 

@@ -18,7 +18,7 @@ import click
 from click.core import ParameterSource
 
 from ertis_cli import _network, options
-from ertis_cli._watch import Signals, stopped_by_signals
+from ertis_cli._signals import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
     from ertis_numba.viewer import Film, Live, View

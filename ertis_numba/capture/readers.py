@@ -26,15 +26,21 @@ class Arrived:
         counted itself, from 0 and without end.
     tick : int or None
         Of the command, which all sensors share; None where SYNC pulses trigger.
+    skipped : int
+        Numbers that the sensor counted since the block before, and whose blocks did not come.
     damaged : bool
         Whether blocks were rejected since the one before.
+    waited_s : float
+        Time since the block before in which nothing was read from the sensor, as the disk was busy.
     """
 
     sensor: str
     block: Block
     count: int
     tick: int | None
-    damaged: bool
+    skipped: int = 0
+    damaged: bool = False
+    waited_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +138,7 @@ class Reader(threading.Thread):
         self._counter: int | None = None  # of the latest block
         self._count = 0
         self._rejected = 0
+        self._waited_s = 0.0  # for room in the queue, since the latest block
 
     def stop(self) -> None:
         """Take the measurement that has begun, and no more."""
@@ -158,8 +165,19 @@ class Reader(threading.Thread):
         while not self._stop_asked.is_set():
             try:
                 for block in self._sonar.listen(stop=self._may_stop, timeout_s=self._patience_s):
-                    self._count_on(block)
-                    self._put(Arrived(self._sensor, block, self._count, None, self._was_damaged()))
+                    skipped = self._count_on(block)
+                    waited_s, self._waited_s = self._waited_s, 0.0
+                    self._put(
+                        Arrived(
+                            self._sensor,
+                            block,
+                            self._count,
+                            None,
+                            skipped=skipped,
+                            damaged=self._was_damaged(),
+                            waited_s=waited_s,
+                        )
+                    )
             except SonarGoneError as error:
                 self._put(Note(self._sensor, str(error)))
                 self._come_back()
@@ -189,13 +207,14 @@ class Reader(threading.Thread):
                     raise
             else:
                 latest_s, taken = time.monotonic(), taken + 1
-                self._put(Arrived(self._sensor, block, self._count, tick, self._was_damaged()))
+                self._put(Arrived(self._sensor, block, self._count, tick))
             self._count += 1
             late = math.ceil((time.monotonic() - pace.start_s) * pace.rate_hz - 1e-3)
             tick = max(tick + 1, late)
 
-    def _count_on(self, block: Block) -> None:
-        """Follow the sensor's own count."""
+    def _count_on(self, block: Block) -> int:
+        """Follow the sensor's own count, and return how many numbers it skipped."""
+        step = 1
         if self._counter is not None:
             step = (block.counter - self._counter) % COUNTERS
             if step >= COUNTERS // 2:
@@ -203,6 +222,7 @@ class Reader(threading.Thread):
                 step = 1
             self._count += step
         self._counter = block.counter
+        return max(0, step - 1)
 
     def _was_damaged(self) -> bool:
         before, self._rejected = self._rejected, sum(self._sonar.receiver.rejected_blocks.values())
@@ -215,9 +235,11 @@ class Reader(threading.Thread):
             self._put(Returned(self._sensor, time.monotonic() - gone_s))
 
     def _put(self, event: Event) -> None:
+        begin_s = time.monotonic()
         while not self._abandoned.is_set():
             try:
                 self._events.put(event, timeout=0.2)
             except queue.Full:
                 continue
-            return
+            break
+        self._waited_s += time.monotonic() - begin_s

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from ertis_numba import checks
+from ertis_numba.capture.gap_reasons import gap_reason
 from ertis_numba.capture.readers import Arrived, Ended, Event, Failed, Note, Pace, Reader, Restarted, Returned
 from ertis_numba.capture.sync_counts import SyncCounts
 from ertis_numba.devices.sonar import Sonar
@@ -326,8 +327,7 @@ class Session:
             sequence = number - track.first_pulse
             end = sequence + 1 if self._n is None else self._n - track.first_pulse
             track.passed = self._n is not None and sequence >= end - 1
-            why = track.why or ("it was damaged on the wire" if event.damaged else "it never arrived")
-            self._miss_until(sink, event.sensor, min(sequence, end), why)
+            self._miss_until(sink, event.sensor, min(sequence, end), track.why or gap_reason(event))
             if sequence >= end:
                 return None
         if track.sequence is not None:

@@ -1,0 +1,159 @@
+"""Signals at random moments of every command: each ends soon, with its documented exit code and without a traceback.
+
+Commands run as real processes. A signal comes at a moment drawn evenly between the start of the process and the end
+of an undisturbed run.
+"""
+
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench import captures
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.storage import open_recording
+
+__all__ = ["COMMANDS", "MAX_END_S", "send"]
+
+MAX_END_S: Final = 1.0
+"""Longest time from a signal to the end of the process."""
+
+_SCENE = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_INTERPRETER_S = 0.1  # in which Python itself starts, and answers signals with its own defaults
+_UNDISTURBED_S = 8.0
+_TIMEOUT_S = 30.0
+_LINES_OF_AN_END = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
+
+COMMANDS: Final[dict[str, Sequence[str]]] = {
+    "bench": ("scaling", "--count", "1", "--quiet"),
+    "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
+    "compare": ("{images}",),
+    "completion": ("bash",),
+    "devices": (),
+    "doctor": (),
+    "emulate": ("{recording}",),
+    "export": ("{images}", "-o", "{out}/cloud.ply"),
+    "import": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
+    "info": ("--health", "{recording}"),
+    "keys": ("new", "fresh", "--dir", "{out}/keys"),
+    "listen": ("tcp://127.0.0.1:1",),
+    "peaks": ("{images}",),
+    "plot": ("{recording}", "-o", "{out}/picture.png"),
+    "process": ("{recording}", "-o", "{out}/images.h5"),
+    "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
+    "recover": ("{out}/crashed",),
+    "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
+    "simulate": ("{scene}", "-o", "{out}/simulated.h5"),
+    "status": ("tcp://127.0.0.1:1",),
+    "verify": ("{recording}",),
+    "view": ("{recording}", "--port", "0", "--no-open"),
+}
+"""Arguments of each command; a test compares the names with those of the command line."""
+
+_UNTIL_INTERRUPTED = {"capture", "listen", "record", "serve", "status", "view"}  # for which Ctrl-C is success
+
+
+def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[str] = ()) -> dict[str, Any]:
+    """Send ``count`` signals to each command, or to some of them only.
+
+    Returns
+    -------
+    dict of str to dict
+        By command: ``signals``; of them ``late``, after which the process took longer than `MAX_END_S`; with a wrong
+        exit ``code``; and with a ``traceback``. ``slowest_s`` is the longest time, and ``examples`` say more.
+    """
+    rng = random.Random(seed)  # noqa: S311  nothing is secret
+    report: dict[str, Any] = {}
+    with captures.emulated(source, folder) as ports:
+        paths = _files(folder, source) | {"port": ports[0]}
+        for command in only or COMMANDS:
+            report[command] = _to_command(command, paths, folder / "out", rng, count)
+    return report
+
+
+def _files(folder: Path, source: Path) -> dict[str, str]:
+    """Make the files that commands read, and return the names by which `COMMANDS` refers to them."""
+    raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
+    with open_recording(source) as recording:
+        measurement = recording[0]
+        raw.write_bytes(measurement.words.tobytes())
+        made = folder / "journal"
+        made.mkdir()
+        with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
+            journal.add_sensor(measurement.stamp.sensor, measurement.settings)
+            journal.append([Entry(measurement, monotonic_ns=0)])
+            shutil.copytree(made, crashed)  # as a killed process leaves it
+    done = captures.ertis("process", str(source), "-o", str(images), "--quiet")
+    done.check_returncode()
+    return {
+        "recording": str(source),
+        "scene": str(_SCENE),
+        "raw": str(raw),
+        "images": str(images),
+        "crashed": str(crashed),
+    }
+
+
+def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
+    lasts_s, _, _, _ = _one(command, paths, out, None, _UNDISTURBED_S)
+    found: dict[str, Any] = {"signals": count, "late": 0, "code": 0, "traceback": 0, "slowest_s": 0.0}
+    examples: Counter[str] = Counter()
+    for _ in range(count):
+        number = rng.choice(_SIGNALS)
+        at_s = rng.uniform(_INTERPRETER_S, max(lasts_s, 2 * _INTERPRETER_S))
+        _, took_s, code, errors = _one(command, paths, out, number, at_s)
+        documented = {128 + number, -number, 0}
+        faults = {
+            "late": took_s > MAX_END_S,
+            "code": code not in documented,
+            "traceback": _LINES_OF_AN_END.search(errors) is not None,
+        }
+        for name, is_so in faults.items():
+            found[name] += is_so
+        if any(faults.values()):
+            examples[f"{number.name} after {at_s:.2f} s: {took_s:.2f} s, {code}: {errors.strip()[-300:]}"] += 1
+        found["slowest_s"] = max(found["slowest_s"], took_s)
+    found["slowest_s"] = round(found["slowest_s"], 3)
+    return found | ({"examples": list(examples)[:5]} if examples else {})
+
+
+def _one(
+    command: str, paths: dict[str, str], out: Path, number: signal.Signals | None, at_s: float
+) -> tuple[float, float, int, str]:
+    """Run a command, send it a signal at a time, and return how long it ran, the time to its end, its code and stderr.
+
+    Without a signal it is killed at that time, if it still runs.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(paths["crashed"], out / "crashed")
+    arguments = [each.format(out=out, **paths) for each in COMMANDS[command]]
+    begin_s = time.monotonic()
+    with subprocess.Popen(  # noqa: S603
+        [sys.executable, "-m", "ertis_cli", command, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            _, errors = process.communicate(timeout=at_s)
+            return time.monotonic() - begin_s, 0.0, process.returncode, errors
+        except subprocess.TimeoutExpired:
+            pass
+        sent_s = time.monotonic()
+        process.send_signal(number or signal.SIGKILL)
+        try:
+            process.wait(_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        ended_s = time.monotonic()
+        _, errors = process.communicate()
+        return ended_s - begin_s, ended_s - sent_s, process.returncode, errors

@@ -1,0 +1,23 @@
+"""Reasons of gaps in captures that SYNC pulses trigger."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.capture.gap_reasons import DAMAGED, DISK_BUSY, DROPPED, NOT_TRIGGERED, gap_reason
+from ertis_numba.capture.readers import Arrived
+from ertis_numba.devices.blocks import Block, Instant
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ({}, NOT_TRIGGERED),
+        ({"skipped": 2}, DROPPED),
+        ({"skipped": 2, "waited_s": 1.0}, DISK_BUSY),
+        ({"waited_s": 1.0}, NOT_TRIGGERED),
+        ({"skipped": 2, "damaged": True}, DAMAGED),
+    ],
+)
+def test_gap_reason_names_the_place_of_the_loss(what, reason):
+    block = Block(5, np.zeros(8, np.uint32), Instant(0, 0, 0))
+    assert gap_reason(Arrived("one", block, 5, None, **what)) == reason
