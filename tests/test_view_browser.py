@@ -34,6 +34,7 @@ from ertis_numba.storage import open_recording, write_energyscapes
 from ertis_numba.viewer import Polar
 from ertis_numba.viewer._choices import colour_table
 from tests.test_serve import LOOPBACK, serving
+from tests.views import stamped
 
 REFLECTORS = Path("data/synthetic/reflectors.h5")
 TABLE = colour_table("inferno").astype(int)
@@ -63,7 +64,7 @@ class Page:
 
     @staticmethod
     def is_here(asked, url):
-        here = url if url.startswith("file:") else re.escape(url.removeprefix("http:").rstrip("/"))
+        here = url if url.startswith("file:") else re.escape(url.removeprefix("http:").partition("?")[0].rstrip("/"))
         if url.startswith("file:"):
             return asked == here or asked.startswith(("blob:", "data:"))
         return re.match(rf"(blob:http|http|ws):?{here}(/|$)".replace(":?//", "://"), asked) or asked.startswith("data:")
@@ -372,3 +373,16 @@ def test_each_browser_has_a_recording_of_its_own(film, browser):
     film.page.get_by_role("button", name="Begin HTML recording", exact=True).wait_for()
     assert end.count() == 1
     other.close()
+
+
+def test_page_that_other_machines_reach_opens_with_its_token_alone(browser, tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    with viewing(path, "--host", "0.0.0.0") as (_, url):
+        page = Page(browser, url)
+        page.wait_until("state", "text !== ''")
+        page.page.goto(url.partition("?")[0])  # the cookie keeps the token
+        page.wait_until("state", "text !== ''")
+        page.close()
+        other = browser.new_context()
+        assert other.new_page().goto(url.partition("?")[0]).status == 403
+        other.close()

@@ -6,6 +6,7 @@ import re
 import socket
 from contextlib import closing
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import msgspec
 import pytest
@@ -33,34 +34,70 @@ def test_a_port_that_is_taken_is_refused(tmp_path):
         View(film, host="203.0.113.1", port=0)
 
 
-def answer(port, origin, host):
+def answer(port, origin, host, *, path="/", cookie=None):
     """What the server says to a browser that connects: 101 lets it in."""
     key = base64.b64encode(bytes(16)).decode()
     headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key}
     headers |= {"Host": host, "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)) as connection:
-        connection.request("GET", "/", headers=headers | ({} if origin is None else {"Origin": origin}))
+        headers |= {} if origin is None else {"Origin": origin}
+        connection.request("GET", path, headers=headers | ({} if cookie is None else {"Cookie": cookie}))
         return connection.getresponse().status
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST", "0.0.0.0"])
 def test_pages_of_other_sites_are_refused(host):
     with View(Source(), host=host, port=0) as view:
-        port = int(view.url.rstrip("/").rpartition(":")[2])
+        url = urlsplit(view.url)
+        port, path = url.port, f"/?{url.query}"
         assert view.is_local == (host != "0.0.0.0")
         here = f"127.0.0.1:{port}"
         for origin in (None, f"http://{here}"):
-            assert answer(port, origin, here) == 101
+            assert answer(port, origin, here, path=path) == 101
         # Through ssh -L, a browser knows the page by another port.
-        assert answer(port, "http://LocalHost:9999", "localhost:9999") == 101
-        assert answer(port, "http://[::1]", "[::1]:80") == 101
+        assert answer(port, "http://LocalHost:9999", "localhost:9999", path=path) == 101
+        assert answer(port, "http://[::1]", "[::1]:80", path=path) == 101
         for origin in ("http://example.org", f"http://{here}.example.org", "http://127.0.0.1", "http://127.0.0.1:9"):
-            assert answer(port, origin, here) == 403, origin
+            assert answer(port, origin, here, path=path) == 403, origin
         for origin in ("null", "file://", f"ftp://{here}", "http://[", f"http://{here}x", ""):
-            assert answer(port, origin, here) == 403, origin
+            assert answer(port, origin, here, path=path) == 403, origin
         # The name of another site may lead to this machine; nobody opens a page on loopback by it.
         alias = f"example.org:{port}"
-        assert answer(port, f"http://{alias}", alias) == (403 if view.is_local else 101)
+        assert answer(port, f"http://{alias}", alias, path=path) == (403 if view.is_local else 101)
+
+
+def get(url, **headers):
+    """The status of a page, and the cookie that it sets."""
+    parts = urlsplit(url)
+    with closing(http.client.HTTPConnection("127.0.0.1", parts.port, timeout=PATIENCE_S)) as connection:
+        connection.request("GET", f"{parts.path}?{parts.query}", headers=headers)
+        response = connection.getresponse()
+        return response.status, response.getheader("Set-Cookie"), response.read()
+
+
+def test_page_that_other_machines_reach_needs_its_token():
+    with View(Source(), host="0.0.0.0", port=0) as view:
+        url = urlsplit(view.url)
+        here, bare = f"127.0.0.1:{url.port}", f"http://{url.netloc}/"
+        for wrong in ("", "?token=", "?token=x", f"?{url.query[:-1]}", "?token=%C3%A9", "assets"):
+            status, cookie, text = get(bare + wrong)
+            assert (status, cookie) == (403, None), wrong
+            assert b"Open the address that 'ertis view' printed" in text
+        status, cookie, _ = get(view.url)
+        assert status == 200
+        assert {"HttpOnly", "SameSite=Strict"} <= set(cookie.split("; "))
+        kept = cookie.split(";")[0]
+        assert get(bare, Cookie=kept)[0] == 200
+        assert answer(url.port, f"http://{here}", here, cookie=kept) == 101
+        for stolen in (None, kept[:-1], kept.partition("=")[0] + "=", "ertis_view=x", "=;;=", kept + "x"):
+            assert answer(url.port, f"http://{here}", here, cookie=stolen) == 403, stolen
+        assert answer(url.port, "http://example.org", here, cookie=kept) == 403
+
+
+def test_page_on_loopback_needs_no_token():
+    with View(Source(), port=0) as view:
+        assert "token" not in view.url
+        assert get(view.url)[0] == 200
 
 
 def test_other_addresses_of_this_machine_are_loopback():

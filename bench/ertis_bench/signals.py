@@ -12,7 +12,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -58,8 +59,6 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
 }
 """Arguments of each command; a test compares the names with those of the command line."""
 
-_UNTIL_INTERRUPTED = {"capture", "listen", "record", "serve", "status", "view"}  # for which Ctrl-C is success
-
 
 def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[str] = ()) -> dict[str, Any]:
     """Send ``count`` signals to each command, or to some of them only.
@@ -72,11 +71,21 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     report: dict[str, Any] = {}
-    with captures.emulated(source, folder) as ports:
+    with _default_interrupt(), captures.emulated(source, folder) as ports:
         paths = _files(folder, source) | {"port": ports[0]}
         for command in only or COMMANDS:
             report[command] = _to_command(command, paths, folder / "out", rng, count)
     return report
+
+
+@contextmanager
+def _default_interrupt() -> Iterator[None]:
+    """Have processes begin with Ctrl-C obeyed, also where a script started this one in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _files(folder: Path, source: Path) -> dict[str, str]:

@@ -1,7 +1,9 @@
 """Whom a page is served to: browsers that have it from here, not pages of other sites in the same browser."""
 
 import contextlib
+import hmac
 import http
+import http.cookies
 import urllib.parse
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
 __all__ = ["is_loopback", "own_pages"]
 
 _PORTS = {"http": 80, "https": 443}
+_COOKIE = "ertis_view"  # and the port, as cookies do not tell the ports of a host apart
+_REFUSAL = "Open the address that 'ertis view' printed, with its token.\n"
 
 
 def is_loopback(host: str) -> bool:
@@ -26,8 +30,10 @@ def is_loopback(host: str) -> bool:
 
 
 @contextlib.contextmanager
-def own_pages(host: str) -> Iterator[None]:
+def own_pages(host: str, token: str | None = None) -> Iterator[None]:
     """Let a server that is made in this block refuse pages of other sites, which a browser lets connect to any host.
+
+    With a token it also refuses browsers that have not opened an address with ``?token=``; a cookie keeps the token.
 
     A browser says of what site a page is (Origin, RFC 6454) and where it connects to (Host). Of a page from here, both
     are the same. On loopback it is the name of a loopback host, too: another site may let its own name lead there.
@@ -41,7 +47,14 @@ def own_pages(host: str) -> Iterator[None]:
             origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
             if not _is_own(origins, hosts, local=local):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is for those who have it from here.\n")
+            given = None if token is None else _token_of(request)
+            if token is not None and not hmac.compare_digest(given or "", token):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSAL)
             answer: Response | None = process_request(connection, request)
+            if token is not None and answer is not None:
+                name = _cookie_of(request)
+                answer.headers["Set-Cookie"] = f"{name}={token}; HttpOnly; SameSite=Strict; Path=/"
+                answer.headers["Referrer-Policy"] = "no-referrer"  # the address has the token
             return answer
 
         return serve(*arguments, process_request=refuse_others, **options)
@@ -51,6 +64,25 @@ def own_pages(host: str) -> Iterator[None]:
         yield
     finally:
         setattr(websockets.asyncio.server, "serve", serve)  # noqa: B010  as above
+
+
+def _token_of(request: "Request") -> str | None:
+    """Return the token that a browser sends: in the address at first, and in a cookie from then on."""
+    query = urllib.parse.parse_qs(urllib.parse.urlsplit(request.path).query)
+    if "token" in query:
+        return query["token"][-1].encode("ascii", "replace").decode()
+    cookies: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
+    with contextlib.suppress(http.cookies.CookieError):
+        for header in request.headers.get_all("Cookie"):
+            cookies.load(header)
+    kept = cookies.get(_cookie_of(request))
+    return None if kept is None else kept.value.encode("ascii", "replace").decode()
+
+
+def _cookie_of(request: "Request") -> str:
+    host = request.headers.get_all("Host")[:1] or [""]
+    port = host[0].rpartition(":")[2]
+    return f"{_COOKIE}_{port}" if port.isdigit() else _COOKIE
 
 
 def _is_own(origins: list[str], hosts: list[str], *, local: bool) -> bool:

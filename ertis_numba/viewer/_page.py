@@ -4,6 +4,7 @@ import contextlib
 import html
 import io
 import math
+import secrets
 import socket
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import viser
 
 from ertis_numba.errors import NetworkError
 from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MOST_DECAY_S, Choices
-from ertis_numba.viewer._origins import own_pages
+from ertis_numba.viewer._origins import is_loopback, own_pages
 from ertis_numba.viewer._recordings import MOST_BYTES
 from ertis_numba.viewer._shapes import Frame
 from ertis_numba.viewer._space import Space, round_step
@@ -26,6 +27,7 @@ __all__ = ["Order", "Page"]
 _PANEL_PX, _PICTURES_PX = 330, 560  # the latter such that pictures are shown pixel by pixel
 _SMALL: Final = "<div style='margin:0 0.8em 0.6em;font-size:0.85em;color:#9aa0b0'>{}</div>"
 _RANGE: Final = "Range"
+_TOKEN_BYTES: Final = 24
 _STEPS: Final = 100  # of the window of ranges
 
 
@@ -74,7 +76,8 @@ class Page:
         _require_free(host, port)
         self._orders, self.is_seen = orders, False
         self._chosen: dict[str, Any] = {}  # the controls of what is chosen, by its name
-        with _silence(), own_pages(host):
+        self._token = None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES)
+        with _silence(), own_pages(host, self._token):
             self._server = _Server(host=host, port=port, label=f"ertis view: {title}", verbose=False)
         if port and self._server.get_port() != port:  # viser goes on to the next that is free
             self.close()
@@ -105,10 +108,11 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where a browser finds the page."""
+        """Where a browser finds the page, with the token that other machines need."""
         host = self._server.get_host()
         shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
-        return f"http://{shown}:{self._server.get_port()}/"
+        token = "" if self._token is None else f"?token={self._token}"
+        return f"http://{shown}:{self._server.get_port()}/{token}"
 
     def show(self, frame: Frame, place: int = 0) -> None:
         """Draw a frame, and where it is on the time line."""

@@ -42,7 +42,7 @@ class View:
     ----------
     source : Live or Film
     host : str
-        Loopback by default: there is no password, who reaches the page sees and steers it.
+        Loopback by default. On any other host the page asks for the token that `url` has.
     port : int
         0 for any that is free.
     choices : Choices, optional
