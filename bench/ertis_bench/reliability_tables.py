@@ -60,7 +60,11 @@ _FULL = (
     "an error; nothing reported that is not stored",
     "exit code {exit code}: “{said}”; {reported} reported, {lost} lost, {wrong} wrong",
 )
-
+_SIGNALS = (
+    "{signals:,} signals at random moments of {commands} commands",
+    "each ends within 1 s with its documented exit code",
+    "{late} later, {slowest_s:.2f} s at most (`ertis {slowest}`); {codes} other codes; {tracebacks} tracebacks",
+)
 
 _ROWS = (
     ("sustained", _ONE),
@@ -73,6 +77,7 @@ _ROWS = (
     ("journals", _JOURNALS),
     ("seals", _SEALS),
     ("disk_full", _FULL),
+    ("signals", _SIGNALS),
 )
 
 

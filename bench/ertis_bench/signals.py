@@ -31,7 +31,8 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _INTERPRETER_S = 0.1  # in which Python itself starts, and answers signals with its own defaults
 _UNDISTURBED_S = 8.0
 _TIMEOUT_S = 30.0
-_LINES_OF_AN_END = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
+_FAULTS = ("late", "codes", "tracebacks")
+_UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
     "bench": ("scaling", "--count", "1", "--quiet"),
@@ -65,17 +66,26 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
 
     Returns
     -------
-    dict of str to dict
-        By command: ``signals``; of them ``late``, after which the process took longer than `MAX_END_S`; with a wrong
-        exit ``code``; and with a ``traceback``. ``slowest_s`` is the longest time, and ``examples`` say more.
+    dict
+        ``signals`` of all commands; of them ``late``, after which the process took longer than `MAX_END_S`;
+        ``codes``, after which its exit code was not the documented one; and ``tracebacks``. ``slowest_s`` is the
+        longest time, and ``slowest`` its command. ``by_command`` has the same of each command, with examples.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
-    report: dict[str, Any] = {}
+    found: dict[str, dict[str, Any]] = {}
     with _default_interrupt(), captures.emulated(source, folder) as ports:
         paths = _files(folder, source) | {"port": ports[0]}
         for command in only or COMMANDS:
-            report[command] = _to_command(command, paths, folder / "out", rng, count)
-    return report
+            found[command] = _to_command(command, paths, folder / "out", rng, count)
+    slowest = max(found, key=lambda command: float(found[command]["slowest_s"]))
+    total = {name: sum(each[name] for each in found.values()) for name in ("signals", *_FAULTS)}
+    return {
+        "commands": len(found),
+        **total,
+        "slowest": slowest,
+        "slowest_s": found[slowest]["slowest_s"],
+        "by_command": found,
+    }
 
 
 @contextmanager
@@ -113,7 +123,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
 
 def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
     lasts_s, _, _, _ = _one(command, paths, out, None, _UNDISTURBED_S)
-    found: dict[str, Any] = {"signals": count, "late": 0, "code": 0, "traceback": 0, "slowest_s": 0.0}
+    found: dict[str, Any] = {"signals": count, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
     for _ in range(count):
         number = rng.choice(_SIGNALS)
@@ -122,8 +132,8 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
         documented = {128 + number, -number, 0}
         faults = {
             "late": took_s > MAX_END_S,
-            "code": code not in documented,
-            "traceback": _LINES_OF_AN_END.search(errors) is not None,
+            "codes": code not in documented,
+            "tracebacks": _UNCAUGHT.search(errors) is not None,
         }
         for name, is_so in faults.items():
             found[name] += is_so

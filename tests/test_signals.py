@@ -1,0 +1,74 @@
+"""Signals to commands: the short form of what `ertis bench reliability --long` tries."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from ertis_bench import signals
+from ertis_bench.reliability import ONE_SENSOR
+from ertis_cli.main import COMMANDS
+
+SEED = 1
+
+
+def test_signals_are_tried_on_every_command():
+    assert list(signals.COMMANDS) == list(COMMANDS)
+
+
+def test_signals_end_commands_while_they_start(tmp_path):
+    found = signals.send(tmp_path, ONE_SENSOR, seed=SEED, count=3, only=("listen", "peaks", "doctor"))
+    assert (found["codes"], found["tracebacks"]) == (0, 0), found["by_command"]
+
+
+def run(program):
+    text = "from ertis_cli import _signals; _signals.obey_signals()\nimport signal, sys, time\n" + textwrap.dedent(
+        program
+    )
+    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_signal_is_sent_again_where_a_library_swallows_it(number, code):
+    done = run(f"""
+        try:
+            signal.raise_signal(signal.{number})
+        except BaseException:
+            pass  # as some libraries do
+        try:
+            time.sleep(20)
+        except KeyboardInterrupt:
+            sys.exit(130)
+        """)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_signal_is_not_sent_again_while_a_command_clears_up():
+    done = run("""
+        try:
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                time.sleep(0.3)  # longer than a few intervals after which the signal would come again
+                print("cleared up")
+        finally:
+            _signals.interruption.end()
+        """)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "cleared up\n", "")
+
+
+def test_signal_that_is_ignored_from_the_start_stays_ignored():
+    """As `nohup` has it."""
+    program = """
+        signal.raise_signal(signal.SIGHUP)
+        with _signals.stopped_by_signals() as asked:
+            signal.raise_signal(signal.SIGHUP)
+        print(asked.came)
+        """
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        done = run(program)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert (done.returncode, done.stdout) == (0, "[]\n")
