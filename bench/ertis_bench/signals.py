@@ -28,7 +28,7 @@ MAX_END_S: Final = 1.0
 
 _SCENE = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_INTERPRETER_S = 0.1  # in which Python itself starts, and answers signals with its own defaults
+_INTERPRETER_S = 0.2  # in which Python itself starts, and answers signals with its own defaults
 _UNDISTURBED_S = 8.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")

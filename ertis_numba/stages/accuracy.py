@@ -44,6 +44,7 @@ _ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
+_ECHO_CREST = 10 ** (16 / 10)  # one echo in a tile of 96 ranges
 _SAFE_LEVEL = 10 ** (-24 / 10)  # as quiet as a room that eRTIS was tried in
 _UNLIKE = 1.3  # for what differs between images: 1 dB, found over the scenes of tests/test_accuracy.py
 _NOISE_CORNER_HZ = 500e3  # of the shaped noise of eRTIS at 4.5 MHz
@@ -98,6 +99,13 @@ class Texture:
         corner_hz = _NOISE_CORNER_HZ * settings.recording.sample_rate_hz / _NOISE_RATE_HZ
         noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
         return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
+
+    @classmethod
+    def echo(cls, settings: Settings, n_mics: int) -> "Texture":
+        """Return the texture of a single echo, whose image is as bright as microphones in phase make it."""
+        _, shares = matched_spectrum(settings.call, n_waves=WAVES)
+        power = shares**2  # that of the echo, beside that of the filter
+        return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
 
 
 class ErrorModel:

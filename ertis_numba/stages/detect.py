@@ -7,25 +7,20 @@ import scipy.spatial
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, Peak
-from ertis_numba.geometry import microphones, unit_vectors
-from ertis_numba.settings import Settings
-from ertis_numba.waveform import matched_filter
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.stages.peak_interpolation import PeakInterpolator
+from ertis_numba.stages.point_spread import PointSpread
 
-__all__ = ["ONE_SIDED", "PULSE_M", "SIDE_LOBE_DB", "find_peaks", "neighbours_of"]
+__all__ = ["SIDE_LOBE_DB", "find_peaks", "neighbours_of", "spacing_of"]
 
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
 _MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
-PULSE_M = 0.04
-"""How far off a compressed pulse of 25 kHz bandwidth is 26 dB down, and 40 dB at 2.5 times as far."""
 SIDE_LOBE_DB = 10.0
 """Below the strongest of the same range, from which on side lobes are expected.
 
-Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `PULSE_M`.
+Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `point_spread.PULSE_M`.
 """
-ONE_SIDED = 0.25
-"""Mean offset of neighbours, by their reach, that tells the edge of a grid."""
 
 
 def find_peaks(
@@ -40,7 +35,7 @@ def find_peaks(
     A reflector is a local maximum over directions and ranges that rises above what the side lobes of
     all stronger reflectors add up to there, as predicted from array and call. So each gives one
     entry, not one per bin of its main lobe nor one per side lobe. Direction, range and level are
-    interpolated by parabolas through the logarithm of the energy.
+    interpolated: see `ertis_numba.stages.peak_interpolation.PeakInterpolator`.
 
     Parameters
     ----------
@@ -66,7 +61,8 @@ def find_peaks(
         checks.shape("where", where.shape, image.energy.shape)
     places = _local_maxima(image.energy, neighbours, floor, where)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
-    spread = _PointSpread(image.settings)
+    spread = PointSpread(image.settings)
+    interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
     for k in np.argsort(-levels, kind="stable"):
         if len(found) == top:
@@ -80,7 +76,8 @@ def find_peaks(
             masked = float(amplitudes @ spread(direction - sources, range_m - ranges_m))
             if levels[k] <= masked * 10 ** (_MARGIN_DB / 20):
                 continue
-        found.append(_interpolate(image, directions, neighbours, *places[k]))
+        tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
+        found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
     found.sort(key=lambda entry: -entry[2])
     return [
         Peak(
@@ -113,6 +110,16 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)
 
 
+def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the distance from each direction to the nearest other, in radians: (direction,) float64.
+
+    Infinite where there is no other. Neighbours are those of `neighbours_of`.
+    """
+    if neighbours.shape[1] < 2:
+        return np.full(len(directions), np.inf)
+    return np.asarray(np.linalg.norm(directions[neighbours[:, 1]] - directions, axis=1))
+
+
 def _local_maxima(
     energy: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float, where: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
@@ -137,100 +144,3 @@ def _local_maxima(
     equal = (around == energy[directions, ranges][:, None]) & (neighbours[directions] < directions[:, None])
     keep = highest & ~equal.any(axis=1)
     return np.stack([directions[keep], ranges[keep]], axis=1)
-
-
-class _PointSpread:
-    """How much of a reflector's amplitude shows up elsewhere in the image.
-
-    Attributes
-    ----------
-    reach_m : float
-        Range beyond which nothing does: a side lobe moves by half of the difference of two paths, so
-        by the aperture's radius at most, and is as long as the pulse.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
-        self._positions_m = microphones(settings.array).enabled_positions_m
-        self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
-        # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
-        spacing_hz = speed_m_s / (6 * self.reach_m)
-        n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
-        matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
-        thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
-        bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]
-        self._wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / speed_m_s
-        self._power = np.abs(matched.values[thinned]) ** 2
-        self._power /= self._power.sum()
-
-    def __call__(
-        self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the amplitude, 1 at no offset: (place,) float64.
-
-        ``|Σ_f P(f) Σ_mic exp(j k(f) (2 Δr − p·Δu))| / n_mics``, P being the power of the call.
-
-        Parameters
-        ----------
-        direction_offset : (place, axis) float64
-            Difference of the unit vectors.
-        range_offset_m : (place,) float64
-        """
-        path_m = 2 * range_offset_m[:, None] - direction_offset @ self._positions_m.T
-        waves = np.exp(1j * self._wave_1_m[:, None, None] * path_m)  # (bin, place, mic)
-        return np.asarray(np.abs(np.tensordot(self._power, waves.mean(axis=2), axes=1)))
-
-
-def _interpolate(
-    image: Energyscape,
-    directions: NDArray[np.float64],
-    neighbours: NDArray[np.int64],
-    direction: int,
-    range_index: int,
-) -> tuple[NDArray[np.float64], float, float]:
-    """Return unit vector, range and amplitude of the maximum near one bin."""
-    tiny = np.finfo(np.float32).tiny
-    logs = np.log(np.maximum(image.energy[:, range_index].astype(np.float64), tiny))
-    level = logs[direction]
-    range_m = float(image.range_m[range_index])
-    if 0 < range_index < len(image.range_m) - 1:
-        row = np.log(np.maximum(image.energy[direction, range_index - 1 : range_index + 2].astype(np.float64), tiny))
-        bend = row[0] - 2 * row[1] + row[2]
-        shift = 0.5 * (row[0] - row[2]) / bend if bend < 0 else 0.0
-        range_m += float(shift) * float(image.range_m[1] - image.range_m[0])
-        level += 0.25 * (row[2] - row[0]) * shift
-    around = neighbours[direction]
-    offset, rise = _quadric_top(directions[around] - directions[direction], logs[around] - logs[direction])
-    top = directions[direction] + offset
-    return top / np.linalg.norm(top), range_m, math.exp(level + rise)
-
-
-def _quadric_top(offsets: NDArray[np.float64], rises: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return where a quadric through samples around 0 is highest, and by how much it rises there.
-
-    The quadric is fitted over the plane, or the line, in which the offsets mainly lie. The place itself
-    is kept where there is no maximum within the samples, and at the edge of a grid, whose samples lie
-    to one side.
-    """
-    none = np.zeros(3), 0.0
-    reach = np.max(np.linalg.norm(offsets, axis=1))
-    if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > ONE_SIDED * reach:
-        return none
-    _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
-    n_axes = 2 if sizes[1] > 0.2 * sizes[0] else 1
-    x = offsets @ axes[:n_axes].T
-    columns = [x[:, i] for i in range(n_axes)] + [x[:, i] * x[:, j] for i in range(n_axes) for j in range(i, n_axes)]
-    matrix = np.stack(columns, axis=1)
-    if len(matrix) <= matrix.shape[1]:
-        return none
-    fit = np.linalg.lstsq(matrix, rises, rcond=None)[0]
-    slope = fit[:n_axes]
-    curve = np.zeros((n_axes, n_axes))
-    curve[np.triu_indices(n_axes)] = fit[n_axes:]
-    curve = curve + curve.T
-    if np.max(np.linalg.eigvalsh(curve)) >= 0:
-        return none
-    top = np.linalg.solve(curve, -slope)
-    if np.linalg.norm(top) > reach:
-        return none
-    return top @ axes[:n_axes], float(0.5 * slope @ top)

@@ -188,20 +188,14 @@ class Planner:
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
         """Return what is expected of a complete plan."""
-        plan = _Plan(
-            accuracy.precision,
-            accuracy.oversampling or 1,
-            accuracy.interpolation,
-            accuracy.delay_taps or 1,
-            accuracy.beam_taps or 0,
-            accuracy.beam_density or 2.0,
-            accuracy.stop_band_db or 60.0,
-            accuracy.zones or 1,
-        )
-        with one_thread():
-            parts = self._parts(plan)
+        parts, plan = self.parts(accuracy), _plan_of(accuracy)
         costs = costs_of(self._kernels, self._threads)
         return Chosen(self._settings.replace(accuracy=accuracy), parts, costs.stages_ms(self._work(plan)))
+
+    def parts(self, accuracy: Accuracy) -> dict[str, float]:
+        """Return the power of each part of the error of a complete plan, relative to that of the exact image."""
+        with one_thread():
+            return self._parts(_plan_of(accuracy))
 
     def _accuracy(self, plan: _Plan) -> Accuracy:
         return self._settings.accuracy.replace(
@@ -435,6 +429,20 @@ def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) 
     """Return a fit and the magnitudes of its weights; kept, as most of a planner's time would go into them."""
     fit = DelayFit(interpolation, n_taps, step_s, spectrum)
     return fit, np.abs(fit.weights(fit.fractions))
+
+
+def _plan_of(accuracy: Accuracy) -> _Plan:
+    """Return a complete plan."""
+    return _Plan(
+        accuracy.precision,
+        accuracy.oversampling or 1,
+        accuracy.interpolation,
+        accuracy.delay_taps or 1,
+        accuracy.beam_taps or 0,
+        accuracy.beam_density or 2.0,
+        accuracy.stop_band_db or 60.0,
+        accuracy.zones or 1,
+    )
 
 
 def _worst(chosen: Chosen) -> str:

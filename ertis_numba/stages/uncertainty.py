@@ -1,0 +1,152 @@
+"""Standard deviations of the positions of points."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.settings import Settings
+from ertis_numba.stages.accuracy import Texture
+from ertis_numba.stages.planner import Planner
+from ertis_numba.waveform import matched_spectrum
+
+__all__ = ["PositionUncertainty"]
+
+_WAVES = 64  # of the call's band, which its widths are told from
+_THINNED = 16  # ranges of which one tells the noise
+_SAMPLE = 16_384  # bins that tell the noise, to a hundredth
+_FLAT = 1e-12  # of the variance of an array, below which it has none
+_UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
+
+# An error of a plan is alike in neighbouring bins, so it moves a maximum by less than noise of the same power does. The
+# shares are measured: tests/test_uncertainty.py holds them to a coverage, over grids and budgets.
+_OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
+_OF_BEAMS = {(False, 2): 0.9, (True, 2): 0.55}  # in a plane or not, by taps
+_OF_BEAMS_OF_MANY_TAPS = 0.3
+
+
+class _PlanError(NamedTuple):
+    """Errors of a plan as noise relative to an echo, root mean square."""
+
+    along: float
+    across: float
+
+
+class PositionUncertainty:
+    """Estimates how far off the positions of points are: by noise, by the plan, and by a coarse grid.
+
+    Noise contributes the Cramér-Rao bounds of a single echo in white noise
+
+    ``σ_range = c / (4π β √(2ρ))`` and ``σ_across = r / (k √(λ 2ρ))``,
+
+    ρ being the power of the point relative to the mean power of the noise; β the root-mean-square width of the call's
+    spectrum about its centre (P. M. Woodward, Probability and Information Theory, 1953, for the range ``cτ / 2``); k
+    the root mean square of its wave numbers; and λ the variance of the microphones' positions along the direction,
+    across the line of sight, in which it is least (H. L. Van Trees, Optimum Array Processing, 2002, section 8.4). An
+    image of one elevation has the azimuth to go across only. The noise is estimated from the median of the
+    image, which of a Rayleigh variable is √ln 2 of the root mean square; where echoes fill an image, they count as
+    noise.
+
+    The plan of the image, if its settings carry a complete one, contributes its predicted errors for a single echo, as
+    noise of the same power times a measured share. A direction that could not be interpolated, as at the edge of a
+    grid, contributes the spacing of the grid.
+
+    Infinite is what the array cannot tell. NaN is where the noise is not known: in images of other beamformers than
+    delay-and-sum, whose noise is no Rayleigh variable, and where half of the image or more is 0, as `clean` leaves
+    it. Errors of layout, temperature and near-field curvature come on top, and so does what echoes at the same place
+    do to each other.
+
+    Parameters
+    ----------
+    settings : Settings
+        The air may be another with each image.
+    is_planar : bool
+        Whether all directions have one elevation.
+    """
+
+    def __init__(self, settings: Settings, *, is_planar: bool) -> None:
+        frequency_hz, power = matched_spectrum(settings.call, n_waves=_WAVES)
+        mean_square = float(power @ frequency_hz**2)
+        positions_m = microphones(settings.array).enabled_positions_m
+        self._settings, self._is_planar = settings, is_planar
+        self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
+        self._frequency_hz = math.sqrt(mean_square)
+        self._covariance_m2 = positions_m.T @ positions_m / len(positions_m)
+
+    def __call__(
+        self,
+        image: Energyscape,
+        position_m: NDArray[np.float32],
+        amplitude: NDArray[np.float32],
+        resolution_rad: NDArray[np.float64],
+    ) -> NDArray[np.float32]:
+        """Return standard deviations along range and across: (point, 2) float32, in metres; NaN if they are unknown.
+
+        Parameters
+        ----------
+        image : Energyscape
+        position_m : (point, axis) float32
+        amplitude : (point,) float32
+        resolution_rad : (point,) float64
+            Spacing of the directions around points whose direction is not interpolated, 0 for others.
+        """
+        noise = _noise(image) if len(amplitude) else 0.0
+        if not noise:
+            return np.full((len(amplitude), 2), np.nan, dtype=np.float32)
+        plan = self._plan_error
+        relative = noise / amplitude.astype(np.float64)
+        speed_m_s = sound_speed_m_s(image.settings.air)
+        along_m = speed_m_s / (4 * math.pi * self._width_hz) * np.hypot(relative, plan.along) / math.sqrt(2)
+        reach_m = np.sqrt(self._least_variance_m2(position_m.astype(np.float64)))
+        wave_1_m = 2 * math.pi * self._frequency_hz / speed_m_s
+        range_m = np.linalg.norm(position_m, axis=1)
+        across_m = np.full(len(amplitude), np.inf)
+        spread_m2 = range_m * np.hypot(relative, plan.across) / math.sqrt(2) / wave_1_m
+        np.divide(spread_m2, reach_m, out=across_m, where=reach_m > 0)
+        across_m = np.hypot(across_m, _UNIFORM * resolution_rad * range_m)
+        return np.stack([along_m, across_m], axis=1).astype(np.float32)
+
+    @functools.cached_property
+    def _plan_error(self) -> _PlanError:
+        accuracy = self._settings.accuracy
+        plan = (accuracy.oversampling, accuracy.delay_taps, accuracy.beam_taps)
+        if self._settings.processing.method != "fast" or None in plan or accuracy.precision == "auto":
+            return _PlanError(0.0, 0.0)
+        n_mics = int(microphones(self._settings.array).enabled.sum())
+        echo = Texture.echo(self._settings, n_mics)
+        parts = Planner(self._settings, kernels.load("numpy"), threads=1, texture=echo).parts(accuracy)
+        # Half of an error's power changes a magnitude, and so does half of the noise's.
+        delays = (_OF_ONE_TAP if accuracy.delay_taps == 1 else _OF_DELAYS) * math.sqrt(2 * parts["delays"])
+        share = _OF_BEAMS.get((self._is_planar, accuracy.beam_taps or 0), _OF_BEAMS_OF_MANY_TAPS)
+        return _PlanError(along=delays, across=math.hypot(delays, share * math.sqrt(2 * parts["beams"])))
+
+    def _least_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least variance of the array across the lines of sight: (point,) float64."""
+        azimuth_rad = np.arctan2(position_m[:, 1], position_m[:, 0])
+        level_m = np.hypot(position_m[:, 0], position_m[:, 1])
+        elevation_rad = np.arctan2(position_m[:, 2], level_m)
+        sideways = unit_vectors(azimuth_rad + math.pi / 2, np.zeros_like(azimuth_rad))
+        aa: NDArray[np.float64] = np.einsum("pi,ij,pj->p", sideways, self._covariance_m2, sideways)
+        if self._is_planar:
+            return np.maximum(aa, 0.0)
+        upwards = unit_vectors(azimuth_rad, elevation_rad + math.pi / 2)
+        ab = np.einsum("pi,ij,pj->p", sideways, self._covariance_m2, upwards)
+        bb = np.einsum("pi,ij,pj->p", upwards, self._covariance_m2, upwards)
+        least = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
+        # What is left of rounding is no aperture.
+        return np.asarray(np.where(least > _FLAT * (aa + bb), least, 0.0))
+
+
+def _noise(image: Energyscape) -> float:
+    """Return the root mean square of the noise of an image; 0 if it is not known."""
+    if image.settings.processing.beamformer != "delay_and_sum":
+        return 0.0
+    some = image.energy[:, ::_THINNED]
+    some = some[:: max(1, some.size // _SAMPLE)]
+    return float(np.median(some)) / math.sqrt(math.log(2))
