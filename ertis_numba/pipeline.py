@@ -119,10 +119,10 @@ class Pipeline:
         ArgumentError
             ``out`` has another shape or type, or there are fewer threads.
         """
-        words = self._words_of(measurement)
+        words, exponent = self._words_of(measurement)
         energy = self._chain.new_image() if out is None else self._checked_out(out)
         self._chain.process(words, energy, threads=threads)
-        return self._energyscape(energy, measurement)
+        return self._energyscape(_rescaled(energy, exponent), measurement)
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, bit by bit as `process` gives them.
@@ -144,8 +144,11 @@ class Pipeline:
         batch = list(measurements)
         words = [self._words_of(measurement) for measurement in batch]
         energies = [self._chain.new_image() for _ in batch]
-        self._chain.process_batch(words, energies)
-        return [self._energyscape(energy, measurement) for energy, measurement in zip(energies, batch, strict=True)]
+        self._chain.process_batch([each for each, _ in words], energies)
+        return [
+            self._energyscape(_rescaled(energy, exponent), measurement)
+            for energy, (_, exponent), measurement in zip(energies, words, batch, strict=True)
+        ]
 
     def close(self) -> None:
         """Give back the memory of the device, when threads that are processing are done. Images that were made stay."""
@@ -187,10 +190,11 @@ class Pipeline:
             stamp=measurement.stamp,
         )
 
-    def _words_of(self, measurement: Measurement) -> NDArray[np.unsignedinteger[Any]]:
+    def _words_of(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
+        """Return the words, and the exponent of two that they were divided by."""
         self._require_open()
         self._require_same_sensor(measurement.settings)
-        return self._format.checked(measurement.words)
+        return self._format.normalised(self._format.checked(measurement.words))
 
     def _require_same_sensor(self, settings: Settings) -> None:
         """Refuse what the tables were not made for: only how to process may differ."""
@@ -212,6 +216,25 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
         return out
+
+
+def _rescaled(energy: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:
+    """Return an image multiplied by a power of two, in place.
+
+    Raises
+    ------
+    DataError
+        The image would not fit single precision.
+    """
+    if exponent:
+        with np.errstate(over="ignore"):
+            np.ldexp(energy, exponent, out=energy)
+        if not np.isfinite(energy).all():
+            raise DataError(
+                f"the measurement's samples reach 2^{exponent}, so its image exceeds the largest float32, 3.4e38; "
+                "divide the samples by their full scale"
+            )
+    return energy
 
 
 def _device_for(settings: Settings, device: str) -> str:

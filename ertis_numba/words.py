@@ -1,5 +1,6 @@
 """What the words of a measurement look like: bits of all microphones at a tick of the PDM clock, or PCM numbers."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 
 __all__ = ["WordFormat", "word_format"]
+
+_MAX_EXPONENT = 20  # of two: samples from 1e-6 to 1e6 leave single precision room for squares, products and sums
 
 
 class WordFormat(NamedTuple):
@@ -69,6 +72,25 @@ class WordFormat(NamedTuple):
             raise DataError(f"measurement holds {came} at sample {sample} of channel {channel}; give finite numbers")
         # Read-only or unaligned arrays would each be a type of their own to compile the kernels for.
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
+
+    def normalised(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
+        """Return words that single precision has room for, and the exponent of two that they were divided by.
+
+        Images are linear in the words, so that theirs are to be multiplied by the same power. Only numbers of
+        floating point whose largest magnitude is far from 1 are changed.
+
+        Parameters
+        ----------
+        words : array
+            As `checked` returns them.
+        """
+        if self.dtype.kind != "f" or not words.size:
+            return words, 0
+        largest = max(float(words.max()), -float(words.min()))
+        exponent = math.frexp(largest)[1] if largest else 0
+        if abs(exponent) <= _MAX_EXPONENT:
+            return words, 0
+        return np.ldexp(words.astype(np.float64), -exponent).astype(self.dtype), exponent
 
 
 def word_format(settings: Settings) -> WordFormat:

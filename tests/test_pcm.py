@@ -11,7 +11,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Call, Recording, Settings
+from ertis_numba.settings import Accuracy, Call, Recording, Settings
 from ertis_numba.simulation import Electronics, Point, Scene
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import RecordingWriter, open_recording, write_recording
@@ -202,3 +202,33 @@ def test_faults_are_found_in_numbers():
     assert report.channels[6].faults == ("idle tone",)
     assert report.channels[6].tone_hz == pytest.approx(31e3, abs=2 * RATE_HZ / 2**11)
     assert report.channels[7].faults == ()
+
+
+@pytest.mark.parametrize("beamformer", ["delay_and_sum", "coherence_factor", "dmas", "capon"])
+@pytest.mark.parametrize("exponent", [-126, -60, 40, 100])
+def test_image_is_linear_in_samples_of_any_magnitude(beamformer, exponent):
+    settings = PCM.replace(
+        recording=PCM.recording.replace(encoding="float32"),
+        processing=PCM.processing.replace(beamformer=beamformer),
+        accuracy=Accuracy(max_error_db=-20.0),
+    )
+    given = heard(settings)
+    scaled = dataclasses.replace(given, words=np.ldexp(given.words, exponent))
+    with Pipeline(settings, device="numpy") as pipeline:
+        wanted, found = (pipeline.process(each).energy.astype(np.float64) for each in (given, scaled))
+        (again,) = pipeline.process_batch([scaled])
+    np.testing.assert_allclose(np.ldexp(found, -exponent), wanted, rtol=1e-3, atol=1e-6 * wanted.max())
+    np.testing.assert_array_equal(again.energy, found)
+    assert len(ertis.find_peaks(again, top=2)) == 2
+
+
+def test_image_that_float32_cannot_hold_is_refused():
+    given = heard(PCM.replace(recording=PCM.recording.replace(encoding="float32")))
+    loudest = np.where(given.words >= 0, np.float32(3.4e38), np.float32(-3.4e38))  # square waves exceed their own peak
+    with (
+        Pipeline(given.settings, device="numpy") as pipeline,
+        pytest.raises(
+            DataError, match=r"reach 2\^128, so its image exceeds the largest float32, .* divide the samples"
+        ),
+    ):
+        pipeline.process(dataclasses.replace(given, words=loudest))
