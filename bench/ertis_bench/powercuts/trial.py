@@ -1,0 +1,140 @@
+"""Power cuts at random moments of commands, and what becomes of what they had acknowledged."""
+
+import random
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from ertis_bench.powercuts import log as logs
+from ertis_bench.powercuts import scenarios
+from ertis_bench.powercuts.disk import Disk
+from ertis_bench.powercuts.recovery import Found, recover_archive, recover_capture, recover_spool
+from ertis_bench.powercuts.scenarios import Acknowledged, Setting, Trace
+from ertis_numba.errors import DataError
+
+__all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
+
+SCENARIOS: Final = ("capture", "record", "serve", "spool")
+_SOURCE: Final = Path(__file__).parents[3] / "data" / "synthetic" / "reflectors.h5"
+_STATES_OF_A_RUN: Final = 100
+_AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
+_BY_COMMAND: Final = 0.005  # share of states that the true command recovers
+_LAST_SYNC: Final = 60  # the first sync to fail is one before
+
+
+def reason_not_to_try(folder: Path) -> str:
+    """Return why power cuts cannot be tried on this machine; empty where they can."""
+    try:
+        logs.build(folder)
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+def try_cuts(
+    folder: Path,
+    *,
+    seed: int,
+    count: int,
+    only: Sequence[str] = SCENARIOS,
+    n_measurements: int = 40,
+    states_of_a_run: int = _STATES_OF_A_RUN,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, int | str]:
+    """Cut the power ``count`` times, in equal shares over scenarios, with and without failing syncs.
+
+    Returns
+    -------
+    dict
+        ``states`` of disks and runs of commands; what was ``lost`` of that which was acknowledged, stored ``twice``, or
+        is ``wrong``; recoveries that ``failed``; files ``left_over``. All of these for each scenario, too. Or
+        ``reason``, where it cannot be tried.
+    """
+    reason = reason_not_to_try(folder)
+    if reason:
+        return {"reason": reason}
+    library = folder / "disklog.so"
+    rng = random.Random(seed)  # noqa: S311  a seed is to give the same cuts again
+    found: Counter[str] = Counter()
+    kinds = [(name, fails) for name in only for fails in (False, True)]
+    for number, (name, fails) in enumerate(kinds):
+        wanted = count * (number + 1) // len(kinds) - count * number // len(kinds)
+        of_kind: Counter[str] = Counter()
+        while of_kind["states"] < wanted:
+            place = folder / "run"
+            place.mkdir()
+            fail = (rng.randrange(5, _LAST_SYNC), rng.randint(1, 6), rng.getrandbits(16)) if fails else None
+            setting = Setting(
+                folder=place, library=library, seed=rng.getrandbits(31), count=n_measurements, fail=fail
+            )
+            trace = _run(name, setting)
+            of_kind["runs"] += 1
+            _cut(name, trace, rng, min(states_of_a_run, wanted - of_kind["states"]), of_kind, say)
+            shutil.rmtree(place)
+        say(f"{name}{', syncs fail' if fails else ''}: {dict(of_kind)}")
+        found.update(of_kind)
+        found.update({f"{name}{' with failing syncs' if fails else ''} {what}": n for what, n in of_kind.items()})
+    return {"lost": 0, "twice": 0, "wrong": 0, "failed": 0, "left_over": 0} | dict(found)
+
+
+def _run(name: str, setting: Setting) -> Trace:
+    if name == "capture":
+        return scenarios.capture(setting, _SOURCE)
+    if name == "spool":
+        return scenarios.spool(setting)
+    return scenarios.central(setting, name)
+
+
+def _cut(
+    name: str, trace: Trace, rng: random.Random, count: int, found: Counter[str], say: Callable[[str], None]
+) -> None:
+    """Cut the power at moments of a run, recover, and count what is wrong."""
+    records = list(logs.read(trace.setting.log))
+    acks = [place for place, record in enumerate(records) if record.kind is logs.Kind.ACK]
+    moments: Counter[int] = Counter()
+    for _ in range(count):
+        after_ack = acks and rng.random() < _AFTER_ACK
+        moments[rng.choice(acks) if after_ack else rng.randrange(len(records))] += 1
+    disk, acknowledged = Disk(trace.setting.disk), Acknowledged()
+    state = trace.setting.folder / "state"
+    for place, record in enumerate(records):
+        disk.take(record)
+        acknowledged.take(record)
+        for _ in range(moments[place]):
+            disk.cut(state, rng)
+            kept = shutil.copytree(state, state.with_name("before"))
+            one = _recover(name, trace, state, acknowledged, rng)
+            found["states"] += 1
+            found["acknowledged"] += len(acknowledged.sent.kept if name != "record" else acknowledged.sent.acked())
+            found.update(one)
+            if any(one.values()):
+                say(f"{name} {trace.setting.fail} at {place} of {len(records)}: {one}; {sorted(map(str, kept.iterdir()))}")
+            shutil.rmtree(state)
+            shutil.rmtree(kept)
+
+
+def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, rng: random.Random) -> Found:
+    by_command = rng.random() < _BY_COMMAND
+    if name == "capture":
+        return recover_capture(state, acknowledged.sent, trace.sent_crc32, by_command=by_command)
+    if name == "spool":
+        return recover_spool(state, acknowledged.sent)
+    return recover_archive(state, acknowledged.sent, rng, by_command=by_command)
+
+
+if __name__ == "__main__":
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as place:
+        print(  # noqa: T201
+            try_cuts(
+                Path(place),
+                seed=int(sys.argv[1]),
+                count=int(sys.argv[2]),
+                only=sys.argv[3:] or SCENARIOS,
+                say=lambda text: print(text, flush=True),  # noqa: T201
+            )
+        )
