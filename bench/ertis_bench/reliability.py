@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import captures, kills, wire_faults
+from ertis_bench import captures, kills, powercuts, wire_faults
 from ertis_bench.trials import Parts, try_parts
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
@@ -41,6 +41,8 @@ class Extent:
     n_kills : int
         Of captures, and as many of processes that do nothing but write a journal.
     n_seal_kills : int
+    n_power_cuts : int
+        States of a disk after a power cut.
     """
 
     duration_s: float
@@ -49,10 +51,16 @@ class Extent:
     n_unplugs: int
     n_kills: int
     n_seal_kills: int
+    n_power_cuts: int
 
 
-SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5)
-LONG = Extent(duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200)
+SHORT = Extent(
+    duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5, n_power_cuts=40
+)  # fmt: skip
+LONG = Extent(
+    duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200,
+    n_power_cuts=1_500,
+)  # fmt: skip
 
 
 def run(
@@ -129,5 +137,11 @@ PARTS: Parts[Extent] = {
         lambda extent, folder, seed: kills.sealing(folder, seed=seed, count=extent.n_seal_kills),
     ),
     "disk_full": ("a small disk", _disk_full),
+    "power_cuts": (
+        "{n_power_cuts} power cuts",
+        lambda extent, folder, seed: powercuts.try_cuts(
+            folder, seed=seed, count=extent.n_power_cuts, only=("capture",)
+        ),
+    ),
 }
 """What is tried: what to say of it, and how."""

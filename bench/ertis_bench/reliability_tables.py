@@ -60,6 +60,11 @@ _FULL = (
     "an error; nothing reported that is not stored",
     "exit code {exit code}: “{said}”; {reported} reported, {lost} lost, {wrong} wrong",
 )
+_POWER_CUTS = (
+    "power cuts of captures, with and without failing syncs",
+    "0 lost of what was reported, 0 twice",
+    "{states:,} states of the disk: {acknowledged:,} reported, {lost} lost, {twice} twice, {wrong} wrong",
+)
 
 
 _ROWS = (
@@ -73,6 +78,7 @@ _ROWS = (
     ("journals", _JOURNALS),
     ("seals", _SEALS),
     ("disk_full", _FULL),
+    ("power_cuts", _POWER_CUTS),
 )
 
 
@@ -88,6 +94,8 @@ def _row(texts: tuple[str, str, str], found: dict[str, Any] | None) -> tuple[str
     tried, wanted, became = texts
     if found is None:
         return tried, wanted, "not tried: only root may mount a small disk"
+    if "reason" in found:
+        return tried, wanted, f"not tried: {found['reason']}"
     if "wrong_counter" in found:
         found = found | {"false_accepts": found["mixed"] + found["wrong_counter"] + found["twice"]}
     return tried.format(**found), wanted, became.format(**found)

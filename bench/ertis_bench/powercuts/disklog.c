@@ -5,8 +5,8 @@
      POWERCUT_LOG     file to which records are appended
      POWERCUT_ACKS    absolute path of a file; what is written to it is logged as acknowledged
      POWERCUT_STDOUT  if set, what is written to descriptor 1 is logged as acknowledged
-     POWERCUT_FAIL    "FIRST COUNT SEED": of the syncs from number FIRST on, COUNT fail with EIO, each with
-                      probability 1/2; every process counts its own
+     POWERCUT_FAIL    "FIRST COUNT SEED": from number FIRST on, COUNT syncs fail with EIO: one after the other where
+                      SEED is even, or else each with probability 1/2; every process counts its own
 
    A record is a struct entry, the path, a second path or the data. One writev per record: with O_APPEND, records of
    several processes do not mix, and their order is that of the events.
@@ -193,7 +193,7 @@ static int synced(int fd, int (*sync)(int)) {
   put(SYNC_BEGIN, status.st_ino, S_ISDIR(status.st_mode), path, NULL, 0);
   unsigned number = __atomic_fetch_add(&n_syncs, 1, __ATOMIC_SEQ_CST);
   uint32_t mixed = (number + 1 + fail_seed) * 2654435761u;
-  if (number >= fail_first && n_failed < fail_count && (mixed >> 16 & 1)) {
+  if (number >= fail_first && n_failed < fail_count && (!(fail_seed & 1) || (mixed >> 16 & 1))) {
     __atomic_fetch_add(&n_failed, 1, __ATOMIC_SEQ_CST);
     put(SYNC_FAIL, status.st_ino, S_ISDIR(status.st_mode), path, NULL, 0);
     errno = EIO;

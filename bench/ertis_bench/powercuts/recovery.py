@@ -27,7 +27,7 @@ _SPOOL_RING_BYTES = 1  # everything is read from the disk
 def recover_capture(disk: Path, sent: Sent, sent_crc32: frozenset[int], *, by_command: bool) -> Found:
     """Recover a capture by what ``ertis recover`` does."""
     failed = _recover(disk, by_command=by_command)
-    archived = read_folder(disk)
+    archived = _read(disk)
     found = compare(sent, archived, sent.kept)
     strange = sum(row.crc32 not in sent_crc32 for rows in archived.rows.values() for row in rows)
     return _found(found, failed=failed, unexpected=strange)
@@ -43,7 +43,7 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
         failed = _recover(folder, by_command=by_command)
     else:
         failed, settled = _start(folder)
-    archived = read_folder(folder)
+    archived = _read(folder)
     found = compare(sent, archived, sent.acked())
     # What a node is told to be stored it discards.
     claimed = {
@@ -52,6 +52,13 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
     lost = sum(key not in archived.rows and archived.reason(key) is None for key in claimed - sent.acked())
     found["lost"] += lost
     return _found(found, failed=failed)
+
+
+def _read(folder: Path) -> Archived:
+    """Read recordings; a part of a file that was being written is no journal that ought to be gone."""
+    archived = read_folder(folder)
+    archived.left_over = [name for name in archived.left_over if not name.endswith(".part")]
+    return archived
 
 
 def _start(folder: Path) -> tuple[int, dict[Run, int]]:

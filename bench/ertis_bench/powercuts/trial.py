@@ -2,7 +2,6 @@
 
 import random
 import shutil
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,9 +18,11 @@ __all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
 
 SCENARIOS: Final = ("capture", "record", "serve", "spool")
 _SOURCE: Final = Path(__file__).parents[3] / "data" / "synthetic" / "reflectors.h5"
+_ACKED: Final = ("record", "serve")  # where what counts is that the central node has acknowledged it
 _STATES_OF_A_RUN: Final = 100
 _AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
 _BY_COMMAND: Final = 0.005  # share of states that the true command recovers
+_MAX_FAILING: Final = 12  # syncs of a process
 _LAST_SYNC: Final = 60  # the first sync to fail is one before
 
 
@@ -40,16 +41,33 @@ def try_cuts(
     seed: int,
     count: int,
     only: Sequence[str] = SCENARIOS,
-    n_measurements: int = 40,
+    n_measurements: int = 24,
     states_of_a_run: int = _STATES_OF_A_RUN,
     say: Callable[[str], None] = lambda _: None,
+    keep: Path | None = None,
 ) -> dict[str, int | str]:
     """Cut the power ``count`` times, in equal shares over scenarios, with and without failing syncs.
+
+    Parameters
+    ----------
+    folder : Path
+        Empty.
+    seed, count : int
+    only : sequence of str
+        Of `SCENARIOS`.
+    n_measurements : int
+        Of each sensor in a run.
+    states_of_a_run : int
+        Power cuts tried with the log of one run.
+    say : callable
+        Called with lines about what is wrong.
+    keep : Path, optional
+        Folder for states of which recovery is wrong.
 
     Returns
     -------
     dict
-        ``states`` of disks and runs of commands; what was ``lost`` of that which was acknowledged, stored ``twice``, or
+        ``states`` of disks, ``runs`` of commands and ``failed_syncs`` of these; what was ``lost`` of that which was acknowledged, stored ``twice``, or
         is ``wrong``; recoveries that ``failed``; files ``left_over``. All of these for each scenario, too. Or
         ``reason``, where it cannot be tried.
     """
@@ -66,13 +84,13 @@ def try_cuts(
         while of_kind["states"] < wanted:
             place = folder / "run"
             place.mkdir()
-            fail = (rng.randrange(5, _LAST_SYNC), rng.randint(1, 6), rng.getrandbits(16)) if fails else None
+            fail = (rng.randrange(5, _LAST_SYNC), rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
             setting = Setting(
                 folder=place, library=library, seed=rng.getrandbits(31), count=n_measurements, fail=fail
             )
             trace = _run(name, setting)
             of_kind["runs"] += 1
-            _cut(name, trace, rng, min(states_of_a_run, wanted - of_kind["states"]), of_kind, say)
+            _cut(name, trace, rng, min(states_of_a_run, wanted - of_kind["states"]), of_kind, say=say, keep=keep)
             shutil.rmtree(place)
         say(f"{name}{', syncs fail' if fails else ''}: {dict(of_kind)}")
         found.update(of_kind)
@@ -89,11 +107,19 @@ def _run(name: str, setting: Setting) -> Trace:
 
 
 def _cut(
-    name: str, trace: Trace, rng: random.Random, count: int, found: Counter[str], say: Callable[[str], None]
+    name: str,
+    trace: Trace,
+    rng: random.Random,
+    count: int,
+    found: Counter[str],
+    *,
+    say: Callable[[str], None],
+    keep: Path | None,
 ) -> None:
     """Cut the power at moments of a run, recover, and count what is wrong."""
     records = list(logs.read(trace.setting.log))
     acks = [place for place, record in enumerate(records) if record.kind is logs.Kind.ACK]
+    found["failed_syncs"] += sum(record.kind is logs.Kind.SYNC_FAIL for record in records)
     moments: Counter[int] = Counter()
     for _ in range(count):
         after_ack = acks and rng.random() < _AFTER_ACK
@@ -105,15 +131,17 @@ def _cut(
         acknowledged.take(record)
         for _ in range(moments[place]):
             disk.cut(state, rng)
-            kept = shutil.copytree(state, state.with_name("before"))
+            if keep is not None:
+                kept = shutil.copytree(state, keep / f"{name}-{keep.stat().st_nlink}-{place}-{found['states']}")
             one = _recover(name, trace, state, acknowledged, rng)
             found["states"] += 1
-            found["acknowledged"] += len(acknowledged.sent.kept if name != "record" else acknowledged.sent.acked())
+            found["acknowledged"] += len(acknowledged.sent.acked() if name in _ACKED else acknowledged.sent.kept)
             found.update(one)
             if any(one.values()):
-                say(f"{name} {trace.setting.fail} at {place} of {len(records)}: {one}; {sorted(map(str, kept.iterdir()))}")
+                say(f"{name} {trace.setting.fail} at record {place} of {len(records)}: {one}")
+            elif keep is not None:
+                shutil.rmtree(kept)
             shutil.rmtree(state)
-            shutil.rmtree(kept)
 
 
 def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, rng: random.Random) -> Found:
@@ -124,17 +152,3 @@ def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, r
         return recover_spool(state, acknowledged.sent)
     return recover_archive(state, acknowledged.sent, rng, by_command=by_command)
 
-
-if __name__ == "__main__":
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as place:
-        print(  # noqa: T201
-            try_cuts(
-                Path(place),
-                seed=int(sys.argv[1]),
-                count=int(sys.argv[2]),
-                only=sys.argv[3:] or SCENARIOS,
-                say=lambda text: print(text, flush=True),  # noqa: T201
-            )
-        )
