@@ -150,9 +150,7 @@ os.unlink(f"{folder}/b")
     seen = set()
     for seed in range(3):
         (tmp_path / "log").unlink(missing_ok=True)
-        environment = logs.environment(
-            tmp_path / "disklog.so", tmp_path / "disk", tmp_path / "log", fail=(1, 99, seed)
-        )
+        environment = logs.environment(tmp_path / "disklog.so", tmp_path / "disk", tmp_path / "log", fail=(1, 99, seed))
         command = [sys.executable, "-c", code, tmp_path / "disk"]
         subprocess.run(command, env=environment, check=True, capture_output=True)
         *first, sync, ack, renamed, unlinked = logs.read(tmp_path / "log")

@@ -34,7 +34,7 @@ def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     OSError, DataError
         The file cannot be written.
     """
-    runs = [[sensor, epoch, last] for (sensor, epoch), last in acked.items()]
+    runs: list[list[str | int]] = [[sensor, epoch, last] for (sensor, epoch), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})
     with replacing(_beside(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
         part.write_text(text, "utf-8")
@@ -54,18 +54,20 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
     try:
         content = json.loads(place.read_bytes())
         runs = content["runs"]
-        if content["crc32"] != _check(runs):
-            raise ValueError("its checksum is wrong")
-        return {(sensor, epoch): last for sensor, epoch, last in runs}
+        limit = {(sensor, epoch): last for sensor, epoch, last in runs}
+        is_sound = content["crc32"] == _check(runs)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise DataError(f"{place}: {error.strerror}; allow reading it") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError):
+        is_sound = False
+    if not is_sound:
         raise DamagedError(
-            f"{place} is damaged ({error}); remove it to seal all that {path.name} shows, of which another recording "
-            "may hold some, too"
-        ) from error
+            f"{place} is damaged; remove it to seal all that {path.name} shows, of which another recording may hold "
+            "some, too"
+        )
+    return limit
 
 
 def _check(runs: list[list[str | int]]) -> int:

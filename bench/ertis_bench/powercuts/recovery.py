@@ -46,23 +46,21 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
     archived = _read(folder)
     found = compare(sent, archived, sent.acked())
     # What a node is told to be stored it discards.
-    claimed = {
-        Key(run.sensor, run.epoch, sequence) for run, last in settled.items() for sequence in range(last + 1)
-    }
+    claimed = {Key(run.sensor, run.epoch, sequence) for run, last in settled.items() for sequence in range(last + 1)}
     lost = sum(key not in archived.rows and archived.reason(key) is None for key in claimed - sent.acked())
     found["lost"] += lost
     return _found(found, failed=failed)
 
 
 def _read(folder: Path) -> Archived:
-    """Read recordings; a part of a file that was being written is no journal that ought to be gone."""
+    """Read recordings; of what else is there, only a journal ought to be gone."""
     archived = read_folder(folder)
-    archived.left_over = [name for name in archived.left_over if not name.endswith(".part")]
+    archived.left_over = [name for name in archived.left_over if name.endswith(SUFFIX)]
     return archived
 
 
 def _start(folder: Path) -> tuple[int, dict[Run, int]]:
-    """Take a folder up as a central node does when it starts, and return how many errors there were and what it knows."""
+    """Take a folder up as a central node does, and return how many errors there were and what it knows of runs."""
     try:
         shelf = Shelf(folder, "recording", Ledger(folder), lambda _: None)
         settled = dict(shelf.settled)

@@ -143,7 +143,7 @@ def central(setting: Setting, command: str) -> Trace:
         node.signal(signal.SIGTERM)
         code = node.wait()
     if setting.fail is None and (code or not flushed):
-        raise DataError(f"ertis {command} ended with {code}, and the sender has {'' if flushed else 'not '}got rid of all")
+        raise DataError(f"ertis {command} ended with {code}; all measurements acknowledged: {flushed}")
     return Trace(setting=setting)
 
 
@@ -170,4 +170,3 @@ def spool(setting: Setting) -> Trace:
             node.signal(signal.SIGTERM)
             node.wait()
     return Trace(setting=setting)
-

@@ -5,7 +5,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from ertis_bench.powercuts import log as logs
 from ertis_bench.powercuts import scenarios
@@ -45,7 +45,7 @@ def try_cuts(
     states_of_a_run: int = _STATES_OF_A_RUN,
     say: Callable[[str], None] = lambda _: None,
     keep: Path | None = None,
-) -> dict[str, int | str]:
+) -> dict[str, Any]:
     """Cut the power ``count`` times, in equal shares over scenarios, with and without failing syncs.
 
     Parameters
@@ -56,7 +56,7 @@ def try_cuts(
     only : sequence of str
         Of `SCENARIOS`.
     n_measurements : int
-        Of each sensor in a run.
+        Of each sensor in a run, at most.
     states_of_a_run : int
         Power cuts tried with the log of one run.
     say : callable
@@ -67,9 +67,9 @@ def try_cuts(
     Returns
     -------
     dict
-        ``states`` of disks, ``runs`` of commands and ``failed_syncs`` of these; what was ``lost`` of that which was acknowledged, stored ``twice``, or
-        is ``wrong``; recoveries that ``failed``; files ``left_over``. All of these for each scenario, too. Or
-        ``reason``, where it cannot be tried.
+        ``states`` of disks, ``runs`` of commands and ``failed_syncs`` in them; measurements that were ``acknowledged``
+        before the cuts; of these ``lost`` or stored ``twice``; ``wrong`` ones; recoveries that ``failed``; journals
+        ``left_over``. All of them for each scenario, too. Or only a ``reason`` why none can be tried.
     """
     reason = reason_not_to_try(folder)
     if reason:
@@ -85,9 +85,8 @@ def try_cuts(
             place = folder / "run"
             place.mkdir()
             fail = (rng.randrange(5, _LAST_SYNC), rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
-            setting = Setting(
-                folder=place, library=library, seed=rng.getrandbits(31), count=n_measurements, fail=fail
-            )
+            n_sent = rng.randint(min(4, n_measurements), n_measurements)
+            setting = Setting(folder=place, library=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
             trace = _run(name, setting)
             of_kind["runs"] += 1
             _cut(name, trace, rng, min(states_of_a_run, wanted - of_kind["states"]), of_kind, say=say, keep=keep)
@@ -151,4 +150,3 @@ def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, r
     if name == "spool":
         return recover_spool(state, acknowledged.sent)
     return recover_archive(state, acknowledged.sent, rng, by_command=by_command)
-

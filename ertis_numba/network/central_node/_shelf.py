@@ -277,7 +277,8 @@ class Shelf:
         while self._failed:
             volume = self._failed[0]
             if volume.path.exists():
-                Journal.give_up(volume.path, volume.acked)
+                acked = {(run.sensor, run.epoch): last for run, last in volume.acked.items()}
+                Journal.give_up(volume.path, acked)
                 if volume.acked:
                     self._retire(volume.path)
             else:  # somebody took it away, or has sealed it
