@@ -140,7 +140,7 @@ PARTS: Parts[Extent] = {
     "power_cuts": (
         "{n_power_cuts} power cuts",
         lambda extent, folder, seed: powercuts.try_cuts(
-            folder, seed=seed, count=extent.n_power_cuts, only=("capture",)
+            folder, seed=seed, count=extent.n_power_cuts, only=("capture", "journal")
         ),
     ),
 }

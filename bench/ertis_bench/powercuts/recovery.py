@@ -3,6 +3,7 @@
 import random
 import zlib
 from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from ertis_bench.network.diary import Key, Row
@@ -24,12 +25,14 @@ Found = dict[str, int]
 _SPOOL_RING_BYTES = 1  # everything is read from the disk
 
 
-def recover_capture(disk: Path, sent: Sent, sent_crc32: frozenset[int], *, by_command: bool) -> Found:
+def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None, *, by_command: bool) -> Found:
     """Recover a capture by what ``ertis recover`` does."""
     failed = _recover(disk, by_command=by_command)
     archived = _read(disk)
     found = compare(sent, archived, sent.kept)
-    strange = sum(row.crc32 not in sent_crc32 for rows in archived.rows.values() for row in rows)
+    strange = sum(
+        sent_crc32 is not None and row.crc32 not in sent_crc32 for rows in archived.rows.values() for row in rows
+    )
     return _found(found, failed=failed, unexpected=strange)
 
 

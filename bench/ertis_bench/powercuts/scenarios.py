@@ -3,6 +3,8 @@
 import json
 import random
 import signal
+import sys
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +17,7 @@ from ertis_bench.network.sender import Job
 from ertis_bench.powercuts.log import Kind, Record, environment
 from ertis_numba.errors import DataError
 
-__all__ = ["Acknowledged", "Fail", "Setting", "Trace", "capture", "central", "spool"]
+__all__ = ["Acknowledged", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
 
 Fail = tuple[int, int, int] | None
 """Syncs that fail: the first, how many, and a seed."""
@@ -89,6 +91,8 @@ class Acknowledged:
                 key = Key(told["sensor"], told["epoch"], told["sequence"])
                 self.sent.offered[key] = Row(told["crc32"], told["sync_count"], told["timestamp_ns"])
                 self.sent.kept.add(key)
+            elif told.get("event") == "discarded":  # from now on, what is left of it need not be there
+                self.sent.kept = {key for key in self.sent.kept if key.sequence > told["sequence"]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,12 +102,12 @@ class Trace:
     Attributes
     ----------
     setting : Setting
-    sent_crc32 : frozenset of int
-        Words that sensors have sent, where the log does not have them all.
+    sent_crc32 : set of int, optional
+        Words that were measured; where None, they are not compared.
     """
 
     setting: Setting
-    sent_crc32: frozenset[int] = frozenset()
+    sent_crc32: AbstractSet[int] | None = None
 
 
 def capture(setting: Setting, source: Path) -> Trace:
@@ -118,6 +122,18 @@ def capture(setting: Setting, source: Path) -> Trace:
                 raise DataError(f"ertis capture ended with {code}; {process.last_words()}")
     sent = captures.sent_by_emulators(setting.folder)
     return Trace(setting=setting, sent_crc32=frozenset(crc32 for _, crc32 in sent))
+
+
+def journal(setting: Setting) -> Trace:
+    """Run a process that does nothing but append to a journal."""
+    setting.disk.mkdir()
+    command = [sys.executable, "-m", "ertis_bench.powercuts.writer", str(setting.disk), str(setting.seed)]
+    command = setting.preloaded([*command, str(setting.count)], fail=setting.fail)
+    with _process(setting, command) as process:
+        code = process.wait()
+        if code and setting.fail is None:
+            raise DataError(f"the writer of a journal ended with {code}; {process.last_words()}")
+    return Trace(setting=setting)
 
 
 def _process(setting: Setting, command: list[str], name: str = "said") -> Process:

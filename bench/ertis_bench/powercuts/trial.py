@@ -16,7 +16,7 @@ from ertis_numba.errors import DataError
 
 __all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
 
-SCENARIOS: Final = ("capture", "record", "serve", "spool")
+SCENARIOS: Final = ("capture", "journal", "record", "serve", "spool")
 _SOURCE: Final = Path(__file__).parents[3] / "data" / "synthetic" / "reflectors.h5"
 _ACKED: Final = ("record", "serve")  # where what counts is that the central node has acknowledged it
 _STATES_OF_A_RUN: Final = 100
@@ -100,6 +100,8 @@ def try_cuts(
 def _run(name: str, setting: Setting) -> Trace:
     if name == "capture":
         return scenarios.capture(setting, _SOURCE)
+    if name == "journal":
+        return scenarios.journal(setting)
     if name == "spool":
         return scenarios.spool(setting)
     return scenarios.central(setting, name)
@@ -145,7 +147,7 @@ def _cut(
 
 def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, rng: random.Random) -> Found:
     by_command = rng.random() < _BY_COMMAND
-    if name == "capture":
+    if name in ("capture", "journal"):
         return recover_capture(state, acknowledged.sent, trace.sent_crc32, by_command=by_command)
     if name == "spool":
         return recover_spool(state, acknowledged.sent)
