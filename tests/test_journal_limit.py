@@ -145,3 +145,11 @@ def test_append_fails_where_the_old_log_may_come_back(tmp_path, monkeypatch):
             journal.append(more)
         assert numbers(journal) == [10, 11, 12]
         journal.append(more)
+
+
+def test_create_leaves_nothing_where_it_fails(tmp_path, monkeypatch):
+    failing_sync(monkeypatch, folders=True)
+    with pytest.raises(DataError, match="Input/output error"):
+        create(tmp_path, [])
+    assert not list(tmp_path.iterdir())
+    create(tmp_path).close()

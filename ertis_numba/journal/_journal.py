@@ -81,7 +81,7 @@ class Journal(Contents):
                 made.close()
                 raise
         except BaseException:
-            path.unlink(missing_ok=True)
+            _unlink(path)
             raise
         return made
 
@@ -135,8 +135,7 @@ class Journal(Contents):
         if acked:
             note_limit(path, acked)
             return
-        for end in ("", *_BESIDE):
-            path.with_name(f"{path.name}{end}").unlink(missing_ok=True)
+        _unlink(path)
         sync(path.parent)
 
     def _obey_limit(self) -> None:
@@ -359,10 +358,7 @@ class Journal(Contents):
             try:
                 with suppress(DataError):
                     self._release()
-                self.path.unlink(missing_ok=True)
-                # Only where the disk was too full to take the log in; without the main file it means nothing.
-                for end in _BESIDE:
-                    self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+                _unlink(self.path)  # the log is there where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
             sync(self.path.parent)
@@ -394,6 +390,12 @@ class Journal(Contents):
             self.close()
         else:
             self._database.leave_log()
+
+
+def _unlink(path: Path) -> None:
+    """Remove a journal that is closed, and what lies beside it."""
+    for end in ("", *_BESIDE):
+        path.with_name(f"{path.name}{end}").unlink(missing_ok=True)
 
 
 _INSERTION: Final = insertion("measurements")

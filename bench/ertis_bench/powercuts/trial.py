@@ -23,7 +23,7 @@ _STATES_OF_A_RUN: Final = 100
 _AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
 _BY_COMMAND: Final = 0.005  # share of states that the true command recovers
 _MAX_FAILING: Final = 12  # syncs of a process
-_LAST_SYNC: Final = 60  # the first sync to fail is one before
+_LAST_SYNC: Final = 30  # of a process, before which the first one fails
 
 
 def reason_not_to_try(folder: Path) -> str:
