@@ -23,7 +23,7 @@ _STATES_OF_A_RUN: Final = 100
 _AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
 _BY_COMMAND: Final = 0.005  # share of states that the true command recovers
 _MAX_FAILING: Final = 12  # syncs of a process
-_LAST_SYNC: Final = 30  # of a process, before which the first one fails
+_FIRST_SYNC: Final = 5  # that may fail: by then a node listens
 
 
 def reason_not_to_try(folder: Path) -> str:
@@ -84,8 +84,9 @@ def try_cuts(
         while of_kind["states"] < wanted:
             place = folder / "run"
             place.mkdir()
-            fail = (rng.randrange(5, _LAST_SYNC), rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
             n_sent = rng.randint(min(4, n_measurements), n_measurements)
+            first = _FIRST_SYNC + rng.randint(0, n_sent)  # about one sync for each measurement
+            fail = (first, rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
             setting = Setting(folder=place, library=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
             trace = _run(name, setting)
             of_kind["runs"] += 1
