@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["SPARE_BYTES", "check_target", "part_of", "remedy", "replacing", "require_room", "sync"]
+__all__ = ["SPARE_BYTES", "check_target", "make_folder", "part_of", "remedy", "replacing", "require_room", "sync"]
 
 # HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
 # 914), so writing stops while there is still room for its tables.
@@ -129,6 +129,31 @@ def replacing(path: Path, *, overwrite: bool = False, token: str | None = None) 
 def _tells_no_name(error: OSError) -> bool:
     """Whether an error says that a disk is full, but not which file it was that had no room."""
     return error.filename is None and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def make_folder(path: Path, *, parents: bool = False) -> None:
+    """Make a folder whose name is durable when this returns, even if it was there before.
+
+    Parameters
+    ----------
+    path : Path
+    parents : bool
+        Make missing parents, too.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+    missing = [each for each in path.parents if not each.exists()] if parents else []
+    for each in (*reversed(missing), path):
+        was_there = each.is_dir()
+        each.mkdir(exist_ok=True)
+        try:
+            sync(each.parent)
+        except PermissionError:
+            if not was_there:
+                raise
 
 
 def sync(path: Path) -> None:

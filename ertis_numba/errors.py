@@ -8,7 +8,8 @@
     ├── DataError (ValueError)           a file or measurement does not hold what it should
     │   ├── DamagedError                 it is not what was written, and never will be
     │   ├── FormatVersionError           a file was written by a newer version
-    │   └── InUseError                   a journal belongs to another process
+    │   ├── InUseError                   a journal belongs to another process
+    │   └── NoRoomError                  a disk is too full, and nothing was written
     ├── DeviceError (RuntimeError)       the compute device asked for is not there
     ├── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
     │   └── SonarGoneError               it was unplugged
@@ -27,6 +28,7 @@ __all__ = [
     "FormatVersionError",
     "InUseError",
     "NetworkError",
+    "NoRoomError",
     "RefusedError",
     "SettingsError",
     "SonarError",
@@ -60,6 +62,10 @@ class FormatVersionError(DataError):
 
 class InUseError(DataError):
     """A journal belongs to another process: a capture that runs, or what seals it."""
+
+
+class NoRoomError(DataError):
+    """A disk is too full for what is to be written; nothing was written."""
 
 
 class DeviceError(ErtisError, RuntimeError):

@@ -8,7 +8,7 @@ from datetime import datetime
 
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.errors import ArgumentError, DataError, InUseError, NoRoomError
 from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor, seal_apart
 from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._items import (
@@ -262,26 +262,45 @@ def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypat
     assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
 
 
-def test_a_journal_that_cannot_be_read_again_is_set_aside(tmp_path, monkeypatch):
-    failing(monkeypatch, times=1)
-    opens = Journal.open
-
-    def broken(path):
-        if path.name == first[0]:
-            raise DataError("unreadable")
-        return opens(path)
-
-    first = [""]
+def test_a_journal_that_has_failed_is_not_believed_and_stored_again_elsewhere(tmp_path, monkeypatch):
+    """After a failed sync a journal shows what never reaches the disk."""
+    given = from_zero(3)
     with Opened(tmp_path) as opened:
-        monkeypatch.setattr(Journal, "open", broken)
-        opened.give(gap_of(0, 0))
+        opened.give(item_of(given[0]))
         opened.until_stored(0)
-        first[0] = next(tmp_path.glob(f"*{SUFFIX}")).name
-        opened.give(item_of(from_zero(1, 1)[0]))
+        failing(monkeypatch, times=1, before=False)
+        opened.give(item_of(given[1]))
         opened.until_stored(1)
-        monkeypatch.undo()
-    assert len(list(tmp_path.glob("*.damaged"))) == 1
-    assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
+        opened.give(item_of(given[2]))
+        opened.until_stored(2)
+        paths = sorted(tmp_path.glob(f"*{SUFFIX}"))
+        with Journal.open(paths[0]) as failed:
+            assert [key.sequence for key in failed.index()] == [0]
+    with Journal.open(paths[1]) as follower:
+        assert [key.sequence for key in follower.index()] == [1, 2]
+    assert told(opened) == [0, 1, 2]
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+def test_a_journal_that_fails_before_anything_is_acknowledged_is_removed(tmp_path, monkeypatch):
+    failing(monkeypatch, times=3, before=False)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+        assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 1
+    assert stored(tmp_path)[0] == wanted(from_zero(1))
+
+
+def test_a_disk_without_room_keeps_its_journal(tmp_path, monkeypatch):
+    given = from_zero(2)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(given[0]))
+        opened.until_stored(0)
+        failing(monkeypatch, times=3, error=NoRoomError("the disk is full"))
+        opened.give(item_of(given[1]))
+        opened.until_stored(1)
+    assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 1
+    assert stored(tmp_path)[0] == wanted(given)
 
 
 def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):

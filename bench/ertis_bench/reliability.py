@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import captures, kills, signals, wire_faults
+from ertis_bench import captures, kills, powercuts, signals, wire_faults
 from ertis_bench.trials import Parts, try_parts
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
@@ -43,6 +43,8 @@ class Extent:
     n_seal_kills : int
     n_signals : int
         To each command.
+    n_power_cuts : int
+        States of a disk after a power cut.
     """
 
     duration_s: float
@@ -52,11 +54,28 @@ class Extent:
     n_kills: int
     n_seal_kills: int
     n_signals: int
+    n_power_cuts: int
 
 
-SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5, n_signals=2)
+SHORT = Extent(
+    duration_s=5.0,
+    n_groups=12,
+    n_blocks=3_000,
+    n_unplugs=1,
+    n_kills=3,
+    n_seal_kills=5,
+    n_signals=2,
+    n_power_cuts=40,
+)
 LONG = Extent(
-    duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200, n_signals=200
+    duration_s=600.0,
+    n_groups=1_200,
+    n_blocks=100_000,
+    n_unplugs=20,
+    n_kills=500,
+    n_seal_kills=200,
+    n_signals=200,
+    n_power_cuts=1_500,
 )
 
 
@@ -137,6 +156,12 @@ PARTS: Parts[Extent] = {
     "signals": (
         "{n_signals} signals to each command",
         lambda extent, folder, seed: signals.send(folder, ONE_SENSOR, seed=seed, count=extent.n_signals),
+    ),
+    "power_cuts": (
+        "{n_power_cuts} power cuts",
+        lambda extent, folder, seed: powercuts.try_cuts(
+            folder, seed=seed, count=extent.n_power_cuts, only=("capture", "journal")
+        ),
     ),
 }
 """What is tried: what to say of it, and how."""

@@ -65,6 +65,12 @@ _SIGNALS = (
     "each ends within 1 s with its documented exit code",
     "{late} later, {slowest_s:.2f} s at most (`ertis {slowest}`); {codes} other codes; {tracebacks} tracebacks",
 )
+_POWER_CUTS = (
+    "power cuts of captures, with and without failing syncs",
+    "0 lost of what was reported, 0 twice",
+    "{states:,} states of the disk: {acknowledged:,} reported, {lost} lost, {twice} twice, {wrong} wrong",
+)
+
 
 _ROWS = (
     ("sustained", _ONE),
@@ -78,6 +84,7 @@ _ROWS = (
     ("seals", _SEALS),
     ("disk_full", _FULL),
     ("signals", _SIGNALS),
+    ("power_cuts", _POWER_CUTS),
 )
 
 
@@ -93,6 +100,8 @@ def _row(texts: tuple[str, str, str], found: dict[str, Any] | None) -> tuple[str
     tried, wanted, became = texts
     if found is None:
         return tried, wanted, "not tried: only root may mount a small disk"
+    if "reason" in found:
+        return tried, wanted, f"not tried: {found['reason']}"
     if "wrong_counter" in found:
         found = found | {"false_accepts": found["mixed"] + found["wrong_counter"] + found["twice"]}
     return tried.format(**found), wanted, became.format(**found)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
+from ertis_numba.atomic import sync
 from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
 from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
 
@@ -18,6 +19,7 @@ PAGE_BYTES: Final = 32_768  # of 4 to 64 KiB, it takes the least time for measur
 LOG_BYTES: Final = 4_194_304  # of the write-ahead log; then what is in it moves to the main file
 _CACHE_KIB: Final = 4096
 _HEADER: Final = struct.Struct(">8s5I")  # of the rollback journal, see https://sqlite.org/fileformat.html
+_CHUNK_BYTES: Final = 1_048_576
 _MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 
 _SETUP: Final = (
@@ -61,6 +63,8 @@ class Database:
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
         self._writes_once = False  # as far as is known
+        self._is_log_named = False  # whether the folder durably has the name of the log that is written
+        self._is_folder_synced = True
         self._ends: dict[str, int] = {}  # of the tables before a commit, until it is known to be one
         with self._told():
             self._file = before = path.stat()
@@ -90,6 +94,7 @@ class Database:
         self.execute("BEGIN EXCLUSIVE")
         self.execute("COMMIT")
         self._require_there(before)
+        self._bring_logs_to_disk()
         ((application,),), ((version,),), ((n_tables,),) = map(
             self.execute, ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_schema")
         )
@@ -106,6 +111,34 @@ class Database:
             self.execute("PRAGMA journal_mode = WAL")
         return is_new
 
+    def _bring_logs_to_disk(self) -> None:
+        """Write the logs that an earlier process has left again, in place, and sync them.
+
+        That process may have ended before its sync, or its sync may have failed. Then the system shows content that it
+        never writes: it marks pages whose writing has failed as written. Content that is written again is dirty again.
+        """
+        for log in (_beside(self._path, "-wal"), _beside(self._path, "-journal")):
+            if log.exists() and log.stat().st_size:
+                with log.open("r+b", buffering=0) as file:
+                    while chunk := file.read(_CHUNK_BYTES):
+                        file.seek(-len(chunk), os.SEEK_CUR)
+                        file.write(chunk)
+                    os.fsync(file.fileno())
+                self._is_folder_synced = False
+        self._sync_folder()
+
+    def _sync_folder(self) -> None:
+        """Make the names of the logs durable: SQLite syncs the folder too, but ignores an error of that."""
+        if self._is_folder_synced:
+            return
+        try:
+            sync(self._path.parent)
+        except OSError as error:
+            raise DataError(
+                f"{self._path.parent}: {error.strerror}; check the disk: what was committed before is safe"
+            ) from error
+        self._is_folder_synced = True
+
     def write_once(self) -> None:
         """Have commits write to the main file at once, from now on, and for ever.
 
@@ -121,6 +154,7 @@ class Database:
         if not self._writes_once:
             self._roll_back_by("DELETE")
             self._writes_once = True
+            self._is_folder_synced = self._is_log_named = False  # the old log must not come back, the new one stay
 
     def _roll_back_by(self, mode: str) -> None:
         """Go over to a rollback journal, which commits leave with a void header, as nobody else can have the file.
@@ -164,10 +198,15 @@ class Database:
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Make what happens in the block durable when it ends, all or nothing; when it raises, no row was added."""
+        self._sync_folder()
         self._take_back()
         with self._all_or_nothing():
             self._ends = self._find_ends()
             yield
+        if not self._is_log_named:  # the first commit has made the log
+            self._is_folder_synced = False
+            self._sync_folder()
+            self._is_log_named = True
         self._ends = {}
 
     @contextmanager

@@ -1,7 +1,7 @@
 """Journals: measurements as they arrive, durable one commit at a time."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import _room
 from ertis_numba.journal._contents import Contents
 from ertis_numba.journal._database import LOG_BYTES, Database
+from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
 from ertis_numba.settings import Settings
@@ -21,7 +22,7 @@ __all__ = ["SUFFIX", "Journal"]
 SUFFIX: Final = ".journal"
 """End of the name of a journal, after that of its recording."""
 
-_BESIDE: Final = ("-wal", "-shm", "-journal")  # what SQLite may leave when it is killed
+_BESIDE: Final = ("-wal", "-shm", "-journal", LIMIT)  # what SQLite may leave when it is killed, and the limit
 
 
 class Journal(Contents):
@@ -80,7 +81,7 @@ class Journal(Contents):
                 made.close()
                 raise
         except BaseException:
-            path.unlink(missing_ok=True)
+            _unlink(path)
             raise
         return made
 
@@ -105,17 +106,62 @@ class Journal(Contents):
                 opened._begin(Path(path.name.removesuffix(SUFFIX)), "")
             else:
                 opened._load()
+                opened._obey_limit()
         except BaseException:
             opened.close()
             raise
         return opened
+
+    @staticmethod
+    def give_up(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
+        """Note durably that only acknowledged measurements of a closed journal are to be believed.
+
+        After a failed sync a journal may show rows that never reach the disk. Close it, give it up, store the rows that
+        were not acknowledged in another journal. Whoever opens this one deletes them first, so that none is stored
+        twice. A journal of which nothing was acknowledged is removed.
+
+        Parameters
+        ----------
+        path : str or Path
+        acked : mapping of (sensor, epoch) to int
+            Highest acknowledged number of each run that has one.
+
+        Raises
+        ------
+        OSError, DataError
+            The disk is full or fails. Call this again.
+        """
+        path = Path(path)
+        if acked:
+            note_limit(path, acked)
+            return
+        _unlink(path)
+        sync(path.parent)
+
+    def _obey_limit(self) -> None:
+        """Delete rows that were given up."""
+        acked = limit_of(self.path)
+        if acked is None:
+            return
+        runs = {(key.sensor, key.epoch) for key in self.index()} | {(gap.sensor, gap.epoch) for gap in self.gaps}
+        with self._database.transaction():
+            self._database.execute(f"PRAGMA user_version = {VERSION}")  # numbers of rows may have holes now
+            for sensor, epoch in sorted(runs):
+                above = self._ids[sensor], epoch, acked.get((sensor, epoch), -1)
+                self._database.execute(
+                    "DELETE FROM measurements WHERE sensor = ? AND epoch = ? AND sequence > ?", above
+                )
+                self._database.execute("DELETE FROM gaps WHERE sensor = ? AND epoch = ? AND last > ?", above)
+        self._last.clear()
+        self._n_entries = self._held_bytes = 0
+        self._load()
+        self.path.with_name(f"{self.path.name}{LIMIT}").unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with self._database.transaction():
             self._database.lay_out()
             self._insert("journal", (os.fsencode(target), source, now))
-        sync(self.path.parent)
         self._load()
 
     def add_sensor(
@@ -168,9 +214,10 @@ class Journal(Contents):
         ------
         ArgumentError
             A measurement does not fit to its sensor, or its number does not rise.
+        NoRoomError
+            The disk is full, or nearly so, and nothing was written. More can be appended once there is room.
         DataError
-            The disk is full, nearly so, or fails. What was appended before is still there, and more can be
-            appended once there is room.
+            The disk is full or fails. What was appended before is still there.
         InUseError
             Somebody has removed the journal, or put another in its place.
         """
@@ -311,10 +358,7 @@ class Journal(Contents):
             try:
                 with suppress(DataError):
                     self._release()
-                self.path.unlink(missing_ok=True)
-                # Only where the disk was too full to take the log in; without the main file it means nothing.
-                for end in _BESIDE:
-                    self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+                _unlink(self.path)  # the log is there where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
             sync(self.path.parent)
@@ -346,6 +390,12 @@ class Journal(Contents):
             self.close()
         else:
             self._database.leave_log()
+
+
+def _unlink(path: Path) -> None:
+    """Remove a journal that is closed, and what lies beside it."""
+    for end in ("", *_BESIDE):
+        path.with_name(f"{path.name}{end}").unlink(missing_ok=True)
 
 
 _INSERTION: Final = insertion("measurements")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.atomic import SPARE_BYTES
-from ertis_numba.errors import DataError
+from ertis_numba.errors import DataError, NoRoomError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
 __all__ = ["left", "recording_bytes", "require"]
@@ -40,7 +40,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
 
     Raises
     ------
-    DataError
+    NoRoomError
         There is too little room.
     """
     log = path.with_name(f"{path.name}-wal")
@@ -52,7 +52,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
     for folder, wanted_bytes in _wanted(path, target, journal_bytes, seals_bytes).items():
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
-            raise DataError(
+            raise NoRoomError(
                 f"{folder} has {free_bytes / 1e6:.1f} MB free, wanted {wanted_bytes / 1e6:.1f} MB so that {path.name} "
                 "can be sealed with more in it; what it holds is safe: end the capture, or free some space"
             )

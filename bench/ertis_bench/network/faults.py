@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ertis_bench import powercuts
 from ertis_bench.network import (
     faults_hosts,
     faults_keys,
@@ -43,6 +44,8 @@ class Extent:
         How long there is too much to do, and how long there are slow applications.
     n_pulses : int
         Of a SYNC chain.
+    n_power_cuts : int
+        States of a disk after a power cut.
     """
 
     n_kills: int
@@ -58,15 +61,17 @@ class Extent:
     overload_s: float
     slow_s: float
     n_pulses: int
+    n_power_cuts: int
 
 
 SHORT = Extent(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
-    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40,
+    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
 )  # fmt: skip
 LONG = Extent(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
     n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
+    n_power_cuts=4_500,
 )  # fmt: skip
 
 
@@ -148,6 +153,12 @@ PARTS: Parts[Extent] = {
     "groups": (
         "{n_pulses} pulses, lost, double, and with a wrong clock",
         lambda extent, folder, seed: faults_processing.groups(folder, seed=seed, count=extent.n_pulses),
+    ),
+    "power_cuts": (
+        "{n_power_cuts} power cuts",
+        lambda extent, folder, seed: powercuts.try_cuts(
+            folder, seed=seed, count=extent.n_power_cuts, only=("record", "serve", "spool")
+        ),
     ),
 }
 """What is tried: what to say of it, and how."""

@@ -18,7 +18,7 @@ from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import Gap, open_recording, sensor_names
 
-__all__ = ["Archived", "Sent", "compare", "read_diaries", "read_folder"]
+__all__ = ["Archived", "Sent", "compare", "note", "read_diaries", "read_folder"]
 
 _UNTOLD: Final = "not among the measurements given"  # what a recording says of numbers that nobody has explained
 
@@ -67,11 +67,12 @@ def read_diaries(paths: Iterable[Path]) -> Sent:
     for path in paths:
         for line in path.read_bytes().splitlines(keepends=True):
             if line.endswith(b"\n"):
-                _note(sent, *json.loads(line))
+                note(sent, *json.loads(line))
     return sent
 
 
-def _note(sent: Sent, what: str, sensor: str, epoch: int, number: int, *rest: int | str) -> None:
+def note(sent: Sent, what: str, sensor: str, epoch: int, number: int, *rest: int | str) -> None:
+    """Take note of one line of a diary."""
     key = Key(sensor, epoch, number)
     match what, rest:
         case "offered", (int(crc32), int(sync_count), int(timestamp_ns), int(monotonic_ns)):

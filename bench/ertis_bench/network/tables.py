@@ -119,6 +119,11 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
             "{clock flags after} of {complete after} for the clock after its step, {clock flags before} before"
         ),
     ),
+    "power_cuts": (
+        "power cuts of central nodes and of sensor nodes with a spool, with and without failing syncs",
+        "0 acked lost, 0 twice",
+        "{states:,} states of the disk: {acknowledged:,} acked or kept, {lost} lost, {twice} twice, {wrong} wrong",
+    ),
 }
 
 
@@ -135,6 +140,8 @@ def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
     tried, wanted, became = ROWS[name]
     if found is None:
         return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
+    if "reason" in found:
+        return tried, wanted, f"not tried: {found['reason']}"
     values = dict(found)
     values["faults"] = sum(found.get("meddled", {}).values())
     for field in ("dropped", "refused", "let in"):

@@ -12,6 +12,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from ertis_numba import checks
+from ertis_numba.atomic import make_folder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import SUFFIX, Sealed
 from ertis_numba.network.central_node._items import Event, Failed, Fault, Item, Resumed, Run, SealedOne
@@ -92,7 +93,7 @@ class Archive:
             It cannot be written, or what is in it not be read.
         """
         try:
-            self.folder.mkdir(exist_ok=True)
+            make_folder(self.folder)
         except OSError as error:
             raise DataError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
         self._lock = Lock(self.folder)

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba.errors import ArgumentError, DataError, NoRoomError
 from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.network.central_node._items import Event, Forgotten, Item, Run, Stored, Twin
 from ertis_numba.network.central_node._ledger import Ledger, look
@@ -16,7 +16,6 @@ from ertis_numba.network.central_node._volumes import Volume, journal_name, runs
 
 __all__ = ["Shelf"]
 
-_TRIES: Final = 5  # to open a journal again that has failed
 _TWINS_KEPT: Final = 4096
 
 
@@ -61,8 +60,7 @@ class Shelf:
         self._known_twins: dict[tuple[Run, int, int], None] = {}
         self._unsealed: set[str] = set(ledger.unsealed)
         self._untold = Untold(ledger.gaps)
-        self._doubtful: Path | None = None
-        self._failures = 0
+        self._failed: list[Volume] = []  # closed, and not yet given up durably
         self._is_saved = False  # whether the ledger has what journals hold that are to be handed on
         self.to_hand_on: list[Path] = []
         self._take_up()
@@ -103,12 +101,13 @@ class Shelf:
             The disk fails. What was told of is durable, and the rest of the items is not lost.
         """
         try:
-            self._mend(sum(item.n_bytes for item in items))
+            self._give_up_failed()
             self._store(items)
-        except Exception:
-            self._doubt()
+        except NoRoomError:  # nothing was written, so the journals are sound
             raise
-        self._failures = 0
+        except Exception:
+            self._fail()
+            raise
 
     def _store(self, items: list[Item]) -> None:
         batch: list[Item] = []
@@ -175,7 +174,7 @@ class Shelf:
         if isinstance(batch[0].what, Entry):
             untold = self._untold.of(item.run.sensor for item in batch)
             if untold:
-                self.volume.journal.note_gaps(untold)
+                self.volume.note_gaps(untold)
                 self._untold.told(untold)
 
     def _tell_stored(self, items: list[Item], took_ms: float) -> None:
@@ -209,8 +208,8 @@ class Shelf:
     @property
     def _open(self) -> list[str]:
         """Names of journals that hold more than the ledger says."""
-        paths = (None if self.volume is None else self.volume.path, self._doubtful)
-        return [path.name for path in paths if path is not None]
+        volumes = [*self._failed, *([] if self.volume is None else [self.volume])]
+        return [volume.path.name for volume in volumes]
 
     def _save(self, *, open_: list[str], also: Iterable[str] = ()) -> None:
         self._unsealed = {name for name in self._unsealed if (self._folder / name).exists()}
@@ -227,7 +226,7 @@ class Shelf:
         Exception
             A journal that has failed still does; it is taken up at the next start.
         """
-        self._mend(0)
+        self._give_up_failed()
         volumes, self.volume, self._twins = (self.volume, self._twins), None, None
         for volume in volumes:
             if volume is not None:
@@ -258,56 +257,33 @@ class Shelf:
         found, self.to_hand_on = self.to_hand_on, []
         return found
 
-    def _doubt(self) -> None:
-        """Close what has failed: only when it is opened again, it shows what it holds."""
-        self._failures += 1
-        if self.volume is not None:
-            self._doubtful = self.volume.path
-            with suppress(Exception):
-                self.volume.close()
-            self.volume = None
-        if self._twins is not None:
-            self._retire_volume(self._twins)
-            self._twins = None
+    def _fail(self) -> None:
+        """Close the journals that are written: after a failed sync, what they show may never reach the disk."""
+        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        for volume in volumes:
+            if volume is not None:
+                self._failed.append(volume)
+                with suppress(Exception):
+                    volume.close()
 
-    def _mend(self, n_bytes: int) -> None:
-        """Open a journal again that has failed, and learn what it holds."""
-        path = self._doubtful
-        if path is None:
-            return
-        if not path.exists():  # somebody took it away, or has sealed it
-            self._learn(path)
-            self._doubtful = None
-            return
-        try:
-            journal = Journal.open(path)
-            try:
-                self._settle(runs_of(journal))
-                volume = Volume(journal)
-                useless = self._failures > 1 and len(volume) > 0 and journal.room() > n_bytes
-            except BaseException:
-                journal.close()
-                raise
-        except InUseError:
-            raise
-        except (DataError, OSError):
-            if self._failures < _TRIES:
-                raise
-            self._set_aside(path)
-            self._doubtful = None
-            return
-        self._doubtful = None
-        if useless:  # there is room, and still it fails
-            self._retire_volume(volume)
-        else:
-            self.volume = volume
+    def _give_up_failed(self) -> None:
+        """Let nobody believe more of journals that have failed than was acknowledged, and have them sealed.
 
-    def _set_aside(self, path: Path) -> None:
-        """Give a journal that cannot be read another name: nothing that it may hold in secret is sealed twice."""
-        for end in ("-wal", "-journal", ""):
-            part = path.with_name(path.name + end)
-            if part.exists():
-                part.rename(path.with_name(f"{path.name}.damaged{end}"))
+        Raises
+        ------
+        Exception
+            The disk still fails; call this again.
+        """
+        while self._failed:
+            volume = self._failed[0]
+            if volume.path.exists():
+                acked = {(run.sensor, run.epoch): last for run, last in volume.acked.items()}
+                Journal.give_up(volume.path, acked)
+                if volume.acked:
+                    self._retire(volume.path)
+            else:  # somebody took it away, or has sealed it
+                self._learn(volume.path)
+            del self._failed[0]
 
     def close(self) -> None:
         """Close all journals."""

@@ -50,6 +50,8 @@ class Volume:
 
     Attributes
     ----------
+    acked : dict of Run to int
+        Highest number of each run that `append` or `note_gaps` has stored.
     n_bytes : int
         Words that it holds.
     begun_s : float
@@ -61,6 +63,7 @@ class Volume:
         self._known: dict[str, Sensor] = dict(journal.sensors)
         self._counted = {Run(key.sensor, key.epoch): key.sequence for key in journal.index()}
         self.n_bytes = sum(journal.sensors[key.sensor].n_bytes for key in journal.index())
+        self.acked = runs_of(journal)
         self.begun_s = time.monotonic()
 
     @classmethod
@@ -99,12 +102,19 @@ class Volume:
             self._add(item.source)
         entries = [item.what for item in items if isinstance(item.what, Entry)]
         if not entries:
-            self.journal.note_gaps([item.what for item in items if isinstance(item.what, Gap)])
+            self.note_gaps([item.what for item in items if isinstance(item.what, Gap)])
             return
         self.journal.append(entries)
         for item in items:
-            self._counted[item.run] = item.last
+            self._counted[item.run] = self.acked[item.run] = item.last
             self.n_bytes += item.source.n_bytes
+
+    def note_gaps(self, gaps: list[Gap]) -> None:
+        """Make durable what is missing; see `Journal.note_gaps`."""
+        self.journal.note_gaps(gaps)
+        for gap in gaps:
+            run = Run(gap.sensor, gap.epoch)
+            self.acked[run] = max(gap.last, self.acked.get(run, -1))
 
     def _add(self, source: Sensor) -> None:
         if source.name not in self.journal.sensors:

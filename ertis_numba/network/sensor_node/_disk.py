@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from ertis_numba import checks
+from ertis_numba.atomic import make_folder
 from ertis_numba.errors import DamagedError, DataError, InUseError, NetworkError
 from ertis_numba.journal import SUFFIX, Entry, Gap, Journal
 from ertis_numba.network.messages import MOST_SEQUENCE
@@ -63,7 +64,7 @@ class DiskSpool(Spool):
     def open(self) -> None:
         """Take up the journals that earlier nodes have left, oldest first."""
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder, parents=True)
             with tempfile.TemporaryFile(dir=self._folder):  # root may write whatever its mode says
                 pass
         except OSError as error:

@@ -1,0 +1,126 @@
+"""Recovery of a disk after a power cut, by what the commands call, and a comparison with what was acknowledged."""
+
+import random
+import zlib
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+
+from ertis_bench.network.diary import Key, Row
+from ertis_bench.network.oracle import Archived, Sent, compare, read_folder
+from ertis_bench.network.processes import ask
+from ertis_numba.errors import ErtisError
+from ertis_numba.journal import SUFFIX
+from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.central_node._ledger import Ledger
+from ertis_numba.network.central_node._shelf import Shelf
+from ertis_numba.network.sensor_node._disk import DiskSpool
+from ertis_numba.storage.sealing import seal
+
+__all__ = ["Found", "recover_archive", "recover_capture", "recover_spool"]
+
+Found = dict[str, int]
+"""What ought to be 0: ``lost``, ``twice``, ``wrong``, and ``failed`` where recovery itself fails."""
+
+_SPOOL_RING_BYTES = 1  # everything is read from the disk
+
+
+def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None, *, by_command: bool) -> Found:
+    """Recover a capture by what ``ertis recover`` does."""
+    failed = _recover(disk, by_command=by_command)
+    archived = _read(disk)
+    found = compare(sent, archived, sent.kept)
+    strange = sum(
+        sent_crc32 is not None and row.crc32 not in sent_crc32 for rows in archived.rows.values() for row in rows
+    )
+    return _found(found, failed=failed, unexpected=strange)
+
+
+def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: bool) -> Found:
+    """Recover the recordings of a central node, by its own start or by ``ertis recover``."""
+    folder = disk / "recordings"
+    if not folder.is_dir():
+        return _found(compare(sent, Archived(), sent.acked()), failed=0)
+    settled: dict[Run, int] = {}
+    if by_command or rng.random() < 0.3:
+        failed = _recover(folder, by_command=by_command)
+    else:
+        failed, settled = _start(folder)
+    archived = _read(folder)
+    found = compare(sent, archived, sent.acked())
+    # What a node is told to be stored it discards.
+    claimed = {Key(run.sensor, run.epoch, sequence) for run, last in settled.items() for sequence in range(last + 1)}
+    lost = sum(key not in archived.rows and archived.reason(key) is None for key in claimed - sent.acked())
+    found["lost"] += lost
+    return _found(found, failed=failed)
+
+
+def _read(folder: Path) -> Archived:
+    """Read recordings; of what else is there, only a journal ought to be gone."""
+    archived = read_folder(folder)
+    archived.left_over = [name for name in archived.left_over if name.endswith(SUFFIX)]
+    return archived
+
+
+def _start(folder: Path) -> tuple[int, dict[Run, int]]:
+    """Take a folder up as a central node does, and return how many errors there were and what it knows of runs."""
+    try:
+        shelf = Shelf(folder, "recording", Ledger(folder), lambda _: None)
+        settled = dict(shelf.settled)
+        journals = shelf.hand_on()
+        shelf.close()
+    except (ErtisError, OSError):
+        return 1, {}
+    return sum(_fails(seal, path) for path in journals), settled
+
+
+def _recover(folder: Path, *, by_command: bool) -> int:
+    """Seal all journals of a folder, and return how many errors there were."""
+    if by_command:
+        return int(ask("recover", str(folder), "--quiet").returncode != 0)
+    return sum(_fails(seal, path) for path in sorted(folder.glob(f"*{SUFFIX}")))
+
+
+def _fails(act: Callable[[Path], object], path: Path) -> bool:
+    try:
+        act(path)
+    except (ErtisError, OSError):
+        return True
+    return False
+
+
+def recover_spool(disk: Path, sent: Sent) -> Found:
+    """Take a spool up as a sensor node does when it starts, and look for all that the central node does not have."""
+    notes: list[str] = []
+    held: dict[Key, list[Row]] = {}
+    folder = disk / "spool"
+    if folder.is_dir():
+        spool = DiskSpool(folder, _SPOOL_RING_BYTES, None, on_note=notes.append)
+        spool.open()
+        try:
+            for run in spool.runs.values():
+                for item in list(run.items):
+                    entry = spool.entry(item, run)
+                    if entry is not None:
+                        stamp, words = entry.measurement.stamp, entry.measurement.words
+                        key = Key(stamp.sensor, stamp.epoch, stamp.sequence)
+                        held.setdefault(key, []).append(
+                            Row(zlib.crc32(words.data), stamp.sync_count, stamp.timestamp_ns)
+                        )
+        finally:
+            spool.close()
+    promised = sent.kept - sent.acked()
+    found = compare(sent, Archived(rows=held), promised)
+    found["silent"] = 0  # numbers that the central node has are gone from the spool
+    return _found(found, failed=len(notes))
+
+
+def _found(found: dict[str, int], *, failed: int, unexpected: int | None = None) -> Found:
+    wrong = found["wrong"] + found["broken"] + (found["unexpected"] if unexpected is None else unexpected)
+    return {
+        "lost": found["lost"] + found["missing"],
+        "twice": found["twice"],
+        "wrong": wrong,
+        "failed": failed,
+        "left_over": found["left_over"],
+    }

@@ -1,0 +1,188 @@
+"""Commands that run on a disk of which everything is logged."""
+
+import json
+import random
+import signal
+import sys
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench import captures
+from ertis_bench.network.diary import Key, Row
+from ertis_bench.network.oracle import Sent, note
+from ertis_bench.network.processes import ERTIS, Process, free_address
+from ertis_bench.network.sender import Job
+from ertis_bench.powercuts.log import Kind, Record, environment
+from ertis_numba.errors import DataError
+
+__all__ = ["Acknowledged", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
+
+Fail = tuple[int, int, int] | None
+"""Syncs that fail: the first, how many, and a seed."""
+
+_PATIENCE_S: Final = 30.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """Where and how a command runs.
+
+    Attributes
+    ----------
+    folder : Path
+        Empty; of this run alone.
+    library : Path
+    seed : int
+    count : int
+        Measurements of each sensor.
+    fail : Fail
+    """
+
+    folder: Path
+    library: Path
+    seed: int
+    count: int
+    fail: Fail = None
+
+    @property
+    def disk(self) -> Path:
+        """Folder that is logged."""
+        return self.folder / "disk"
+
+    @property
+    def log(self) -> Path:
+        """File of the log."""
+        return self.folder / "log"
+
+    def preloaded(self, command: list[str], *, acks: Path | None = None, fail: Fail = None) -> list[str]:
+        """Return a command that runs with the log."""
+        chosen = environment(self.library, self.disk, self.log, acks=acks, fail=fail)
+        names = [name for name in chosen if name.startswith(("POWERCUT_", "LD_PRELOAD"))]
+        return ["env", *(f"{name}={chosen[name]}" for name in names), *command]
+
+
+@dataclass(slots=True)
+class Acknowledged:
+    """Measurements that were acknowledged up to some record of a log.
+
+    Attributes
+    ----------
+    sent : Sent
+    """
+
+    sent: Sent = field(default_factory=Sent)
+    _lines: dict[int, bytes] = field(default_factory=dict)
+
+    def take(self, record: Record) -> None:
+        """Take note of the next record."""
+        if record.kind is not Kind.ACK:
+            return
+        *lines, self._lines[record.pid] = (self._lines.get(record.pid, b"") + record.data).split(b"\n")
+        for line in lines:
+            try:
+                told = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(told, list):
+                note(self.sent, *told)
+            elif told.get("event") == "stored" and "crc32" in told:
+                key = Key(told["sensor"], told["epoch"], told["sequence"])
+                self.sent.offered[key] = Row(told["crc32"], told["sync_count"], told["timestamp_ns"])
+                self.sent.kept.add(key)
+            elif told.get("event") == "discarded":  # from now on, what is left of it need not be there
+                self.sent.kept = {key for key in self.sent.kept if key.sequence > told["sequence"]}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trace:
+    """A command that has run.
+
+    Attributes
+    ----------
+    setting : Setting
+    sent_crc32 : set of int, optional
+        Words that were measured; where None, they are not compared.
+    """
+
+    setting: Setting
+    sent_crc32: AbstractSet[int] | None = None
+
+
+def capture(setting: Setting, source: Path) -> Trace:
+    """Run ``ertis capture -o`` from an emulated sensor."""
+    setting.disk.mkdir()
+    with captures.emulated(source, setting.folder) as ports:
+        command = [*ERTIS, "capture", "--port", ports[0], "-o", str(setting.disk / "rec.h5"), "--json", "--quiet"]
+        command += ["--rate", "20", "-n", str(setting.count)]
+        with _process(setting, setting.preloaded(command, fail=setting.fail)) as process:
+            code = process.wait()
+            if code and setting.fail is None:
+                raise DataError(f"ertis capture ended with {code}; {process.last_words()}")
+    sent = captures.sent_by_emulators(setting.folder)
+    return Trace(setting=setting, sent_crc32=frozenset(crc32 for _, crc32 in sent))
+
+
+def journal(setting: Setting) -> Trace:
+    """Run a process that does nothing but append to a journal."""
+    setting.disk.mkdir()
+    command = [sys.executable, "-m", "ertis_bench.powercuts.writer", str(setting.disk), str(setting.seed)]
+    command = setting.preloaded([*command, str(setting.count)], fail=setting.fail)
+    with _process(setting, command) as process:
+        code = process.wait()
+        if code and setting.fail is None:
+            raise DataError(f"the writer of a journal ended with {code}; {process.last_words()}")
+    return Trace(setting=setting)
+
+
+def _process(setting: Setting, command: list[str], name: str = "said") -> Process:
+    return Process(command, said=setting.folder / f"{name}.txt")
+
+
+def central(setting: Setting, command: str) -> Trace:
+    """Run ``ertis record`` or ``ertis serve --record`` while two sensors send to it."""
+    setting.disk.mkdir()
+    address = free_address()
+    diary = setting.folder / "sender.ndjson"
+    option = "-o" if command == "record" else "--record"
+    line = [*ERTIS, command, "--listen", address, option, str(setting.disk / "recordings"), "--rotate-size", "4"]
+    if command == "serve":
+        line += ["--publish", "tcp://127.0.0.1:*", "--workers", "1"]
+    line = setting.preloaded([*line, "--json", "--quiet"], acks=setting.folder / "none", fail=setting.fail)
+    job = _job(setting, address, diary, sensors=("left", "right"))
+    with _process(setting, line, "central") as node:
+        node.wait_for("listening")
+        with _process(setting, setting.preloaded(job.command(), acks=diary), "sender") as sender:
+            flushed = sender.wait_for("sent")["flushed"]
+            sender.wait()
+        node.signal(signal.SIGTERM)
+        code = node.wait()
+    if setting.fail is None and (code or not flushed):
+        raise DataError(f"ertis {command} ended with {code}; all measurements acknowledged: {flushed}")
+    return Trace(setting=setting)
+
+
+def _job(setting: Setting, address: str, diary: Path, **options: Any) -> Job:
+    rate_hz = random.Random(setting.seed).choice((20.0, 50.0, 200.0))  # noqa: S311  nothing is secret
+    chosen = {"seed": setting.seed, "count": setting.count, "rate_hz": rate_hz, "patience_s": _PATIENCE_S}
+    return Job(address=address, diary=str(diary), **chosen | options)
+
+
+def spool(setting: Setting) -> Trace:
+    """Run a sensor node with a spool, first without a central node and then with one."""
+    setting.disk.mkdir()
+    address = free_address()
+    diary = setting.folder / "sender.ndjson"
+    job = _job(setting, address, diary, spool=str(setting.disk / "spool"))
+    recordings = setting.folder / "recordings"
+    record = [*ERTIS, "record", "--listen", address, "-o", str(recordings), "--json", "--quiet"]
+    with _process(setting, setting.preloaded(job.command(), acks=diary, fail=setting.fail), "sender") as sender:
+        sender.wait_for("begun")
+        with _process(setting, record, "central") as node:
+            node.wait_for("listening")
+            sender.wait_for("sent")
+            sender.wait()
+            node.signal(signal.SIGTERM)
+            node.wait()
+    return Trace(setting=setting)

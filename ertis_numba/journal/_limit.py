@@ -1,0 +1,78 @@
+"""Limit of a journal that has failed: the numbers up to which its measurements were acknowledged.
+
+After a failed sync, the system may show rows that never reach the disk. Whoever wrote them stores them again in
+another journal. The limit, a small file beside the journal, keeps them from being stored twice.
+"""
+
+import json
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.atomic import replacing
+from ertis_numba.errors import DamagedError, DataError
+
+__all__ = ["LIMIT", "limit_of", "note_limit"]
+
+LIMIT: Final = "-limit"
+"""End of the name of the file, after that of the journal."""
+
+
+def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
+    """Write the limit of a journal; when this returns, it is durable.
+
+    Parameters
+    ----------
+    path : Path
+        Of the journal.
+    acked : mapping of (sensor, epoch) to int
+        Highest acknowledged number of each run; of other runs, nothing was acknowledged.
+
+    Raises
+    ------
+    OSError, DataError
+        The file cannot be written.
+    """
+    runs: list[list[str | int]] = [[sensor, epoch, last] for (sensor, epoch), last in acked.items()]
+    text = json.dumps({"runs": runs, "crc32": _check(runs)})
+    with replacing(_beside(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
+        part.write_text(text, "utf-8")
+
+
+def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
+    """Return the limit of a journal, or None where there is none.
+
+    Raises
+    ------
+    DamagedError
+        The file is not what was written.
+    DataError
+        The file cannot be read.
+    """
+    place = _beside(path)
+    try:
+        content = json.loads(place.read_bytes())
+        runs = content["runs"]
+        limit = {(sensor, epoch): last for sensor, epoch, last in runs}
+        is_sound = content["crc32"] == _check(runs)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DataError(f"{place}: {error.strerror}; allow reading it") from error
+    except (ValueError, KeyError, TypeError):
+        is_sound = False
+    if not is_sound:
+        raise DamagedError(
+            f"{place} is damaged; remove it to seal all that {path.name} shows, of which another recording may hold "
+            "some, too"
+        )
+    return limit
+
+
+def _check(runs: list[list[str | int]]) -> int:
+    return zlib.crc32(json.dumps(runs).encode())
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f"{path.name}{LIMIT}")

@@ -1,0 +1,162 @@
+"""Disks after a power cut: nothing that was acknowledged is lost, or stored twice; the short form of two benchmarks."""
+
+import random
+import shutil
+import subprocess
+import sys
+
+import pytest
+from ertis_bench import powercuts, reliability_tables
+from ertis_bench.network import tables
+from ertis_bench.powercuts import log as logs
+from ertis_bench.powercuts.disk import Disk
+from ertis_bench.powercuts.log import Kind, Record
+
+SEED = 1
+N_STATES = {"capture": 24, "record": 40, "spool": 36}
+N_MEASUREMENTS = 8
+NOTHING_WRONG = dict.fromkeys(("lost", "twice", "wrong", "failed", "left_over"), 0)
+
+
+@pytest.mark.parametrize("name", N_STATES)
+def test_power_cuts_lose_and_repeat_nothing(tmp_path, name):
+    """Half of the commands run with syncs that fail."""
+    reason = powercuts.reason_not_to_try(tmp_path)
+    if reason:
+        pytest.skip(reason)
+    told = []
+    found = powercuts.try_cuts(
+        tmp_path, seed=SEED, count=N_STATES[name], only=(name,), n_measurements=N_MEASUREMENTS, say=told.append
+    )
+    assert {what: found[what] for what in NOTHING_WRONG} == NOTHING_WRONG, told
+    assert found["states"] == N_STATES[name]
+    assert found["acknowledged"] > N_STATES[name]
+    assert found["failed_syncs"] > 0
+
+
+def test_power_cuts_without_a_compiler_are_reported_as_not_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    found = powercuts.try_cuts(tmp_path, seed=SEED, count=1)
+    assert found == {"reason": "power cuts need Linux and a C compiler; install gcc"}
+    told = f"not tried: {found['reason']}"
+    assert tables.row("power_cuts", found)[2] == told
+    report = {"power_cuts": found, "machine": {}, "seed": SEED, "long": False, "only": []}
+    monkeypatch.setattr(reliability_tables, "sentence", lambda _: "")
+    assert told in reliability_tables.reliability(report)
+
+
+class Happening:
+    """Records of one process on a disk."""
+
+    def __init__(self, folder):
+        self.folder, self.disk = folder, Disk(folder)
+
+    def __call__(self, kind, name="", data=b"", *, inode=1, offset=0):
+        path = str(self.folder / name) if name else str(self.folder)
+        self.disk.take(Record(kind, 1, inode, offset, path, data))
+
+    def sync(self, name, *, inode=1, ends=Kind.SYNC_END):
+        is_folder = int(not name)
+        self(Kind.SYNC_BEGIN, name, inode=inode, offset=is_folder)
+        self(ends, name, inode=inode, offset=is_folder)
+
+    def states(self, target, count=60):
+        """Content by name of each of some disks after a power cut."""
+        found = []
+        rng = random.Random(SEED)
+        for number in range(count):
+            place = target / str(number)
+            self.disk.cut(place, rng)
+            found.append({path.name: path.read_bytes() for path in place.iterdir()})
+        return found
+
+
+@pytest.fixture
+def happens(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    return Happening(folder)
+
+
+@pytest.fixture
+def after(tmp_path):
+    folder = tmp_path / "after"
+    folder.mkdir()
+    return folder
+
+
+def test_disk_keeps_what_was_synced(happens, after):
+    happens(Kind.CREATE, "a")
+    happens(Kind.WRITE, "a", b"x" * 5000)
+    happens.sync("a")
+    happens.sync("")
+    assert happens.states(after, 9) == 9 * [{"a": b"x" * 5000}]
+
+
+def test_disk_loses_and_tears_what_was_not_synced(happens, after):
+    happens(Kind.CREATE, "a")
+    happens.sync("")
+    happens(Kind.WRITE, "a", b"x" * 4096)
+    contents = [state["a"] for state in happens.states(after)]
+    assert {b"", b"x" * 4096} < set(contents)
+    assert any(content[:512] == bytes(512) and b"x" in content for content in contents)
+
+
+def test_disk_never_has_what_a_failed_sync_was_to_write(happens, after):
+    happens(Kind.CREATE, "a")
+    happens(Kind.WRITE, "a", b"x" * 512)
+    happens.sync("a", ends=Kind.SYNC_FAIL)
+    happens.sync("a")
+    happens.sync("")
+    assert happens.states(after, 9) == 9 * [{"a": b""}]
+    happens(Kind.WRITE, "a", b"y" * 512)
+    happens.sync("a")
+    assert {state["a"] for state in happens.states(after / "0")} == {b"y" * 512}
+
+
+def test_disk_may_lose_names_until_their_folder_is_synced(happens, after):
+    happens(Kind.CREATE, "a")
+    happens(Kind.WRITE, "a", b"x")
+    happens.sync("a")
+    happens(Kind.RENAME, "a", str(happens.folder / "b").encode())
+    names = [set(state) for state in happens.states(after)]
+    assert set() in names
+    assert {"a"} in names
+    assert {"b"} in names
+    happens.sync("")
+    assert {frozenset(state) for state in happens.states(after / "0")} == {frozenset({"b"})}
+
+
+def test_log_has_what_a_process_does(tmp_path):
+    reason = powercuts.reason_not_to_try(tmp_path)
+    if reason:
+        pytest.skip(reason)
+    code = """
+import os, sys
+folder = sys.argv[1]
+with open(f"{folder}/a", "wb", buffering=0) as file:
+    file.write(b"one")
+    os.fsync(file.fileno())
+    file.truncate(1)
+    try:
+        os.fdatasync(file.fileno())
+        os.write(1, b"synced")
+    except OSError as error:
+        os.write(1, b"%d" % error.errno)
+os.rename(f"{folder}/a", f"{folder}/b")
+os.unlink(f"{folder}/b")
+"""
+    (tmp_path / "disk").mkdir()
+    seen = set()
+    for seed in range(3):
+        (tmp_path / "log").unlink(missing_ok=True)
+        environment = logs.environment(tmp_path / "disklog.so", tmp_path / "disk", tmp_path / "log", fail=(1, 99, seed))
+        command = [sys.executable, "-c", code, tmp_path / "disk"]
+        subprocess.run(command, env=environment, check=True, capture_output=True)
+        *first, sync, ack, renamed, unlinked = logs.read(tmp_path / "log")
+        assert [record.kind.name for record in first] == [
+            "CREATE", "WRITE", "SYNC_BEGIN", "SYNC_END", "TRUNCATE", "SYNC_BEGIN",
+        ]  # fmt: skip
+        seen.add((sync.kind.name, ack.data))
+        assert (renamed.kind, unlinked.kind) == (Kind.RENAME, Kind.UNLINK)
+    assert seen == {("SYNC_FAIL", b"5"), ("SYNC_END", b"synced")}
