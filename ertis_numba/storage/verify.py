@@ -8,7 +8,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import Gap, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, Gap, open_recording
 
 __all__ = ["Damage", "SensorReport", "verify"]
 
@@ -31,6 +31,8 @@ class SensorReport:
         Places, counted from 0, of measurements whose sequence number is not above the one before of the same epoch.
     fault : str
         Why nothing of this sensor can be read; empty elsewhere.
+    lost : str
+        Losses of the journal, of any sensor, that are not among the gaps; empty in general.
     """
 
     sensor: str
@@ -39,6 +41,7 @@ class SensorReport:
     damaged: tuple[Damage, ...] = ()
     disordered: tuple[int, ...] = ()
     fault: str = ""
+    lost: str = ""
 
     @property
     def missing(self) -> int:
@@ -48,7 +51,7 @@ class SensorReport:
     @property
     def whole(self) -> bool:
         """Whether all is there and as it was written."""
-        return not (self.gaps or self.damaged or self.disordered or self.fault)
+        return not (self.gaps or self.damaged or self.disordered or self.fault or self.lost)
 
 
 def verify(path: str | Path) -> list[SensorReport]:
@@ -65,6 +68,10 @@ def verify(path: str | Path) -> list[SensorReport]:
     path = Path(path)
     if _is_journal(path):
         with Journal.open(path) as journal:
+            if journal.damage and not journal.sensors:
+                raise DataError(
+                    f"{path} has lost measurements, as its log was damaged ({journal.damage}); copy both again"
+                )
             return [_of_journal(journal, name) for name in journal.sensors]
     reports = [_of_recording(path, name) for name in sensor_names(path)]
     if all(report.fault for report in reports):
@@ -99,6 +106,7 @@ def _of_recording(path: Path, sensor: str) -> SensorReport:
             gaps=recording.gaps,
             damaged=tuple(damaged),
             disordered=_disordered((stamp.epoch, stamp.sequence) for stamp in stamps),
+            lost=str(recording.attributes.get(JOURNAL_DAMAGE, "")),
         )
 
 
@@ -123,4 +131,5 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
         gaps=tuple(Gap(*item) for item in rows.missing),
         damaged=tuple(rows.damaged),
         disordered=_disordered((key.epoch, key.sequence) for key in rows.keys),
+        lost=journal.damage,
     )
