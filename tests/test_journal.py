@@ -286,8 +286,8 @@ def test_recording_is_named_after_its_journal_whatever_that_says(tmp_path, targe
 
 @pytest.mark.parametrize("target", ["../b/other.h5", "/tmp/other.h5", "other.h5", "..", "", "a\\other.h5"])
 def test_recording_of_a_renamed_journal_stays_in_its_folder(tmp_path, target):
-    with create(tmp_path, target=target) as journal:
-        renamed = journal.path.rename(tmp_path / "renamed")
+    create(tmp_path, target=target).close()
+    renamed = (tmp_path / "rec.h5.journal").rename(tmp_path / "renamed")
     with Journal.open(renamed) as journal:
         assert journal.target == tmp_path / ("other.h5" if "other" in target else "renamed.h5")
 

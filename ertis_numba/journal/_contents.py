@@ -117,6 +117,15 @@ class Contents:
         names = {number: name for name, number in self._ids.items()}
         return sorted(Key(place, names[number], *rest) for place, number, *rest in rows)
 
+    def newest(self, n_most: int) -> list[tuple[str, int, int, int]]:
+        """Return sensor, epoch, number and CRC-32 of the measurements that came last; their words are not read."""
+        with self._turn:
+            rows = self._database.execute(
+                "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_most,)
+            )
+        names = {number: name for name, number in self._ids.items()}
+        return [(names[number], *rest) for number, *rest in reversed(rows) if number in names]
+
     def find(self, sensor: str, epoch: int, sequence: int) -> Key:
         """Return where a measurement is.
 
