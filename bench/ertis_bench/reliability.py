@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ertis_bench import captures, kills, wire_faults
+from ertis_bench.flips import flips
 from ertis_bench.trials import Parts, try_parts
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
@@ -41,6 +42,8 @@ class Extent:
     n_kills : int
         Of captures, and as many of processes that do nothing but write a journal.
     n_seal_kills : int
+    n_flips : int
+        Files that are damaged.
     """
 
     duration_s: float
@@ -49,10 +52,13 @@ class Extent:
     n_unplugs: int
     n_kills: int
     n_seal_kills: int
+    n_flips: int
 
 
-SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5)
-LONG = Extent(duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200)
+SHORT = Extent(duration_s=5.0, n_groups=12, n_blocks=3_000, n_unplugs=1, n_kills=3, n_seal_kills=5, n_flips=60)
+LONG = Extent(
+    duration_s=600.0, n_groups=1_200, n_blocks=100_000, n_unplugs=20, n_kills=500, n_seal_kills=200, n_flips=2_000
+)
 
 
 def run(
@@ -127,6 +133,10 @@ PARTS: Parts[Extent] = {
     "seals": (
         "{n_seal_kills} sealings killed",
         lambda extent, folder, seed: kills.sealing(folder, seed=seed, count=extent.n_seal_kills),
+    ),
+    "flips": (
+        "{n_flips} damaged files",
+        lambda extent, folder, seed: flips(folder, seed=seed, count=extent.n_flips),
     ),
     "disk_full": ("a small disk", _disk_full),
 }

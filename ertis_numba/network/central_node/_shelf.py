@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, InUseError
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, TALLY, Entry, Journal
 from ertis_numba.network.central_node._checksums import Checksums
 from ertis_numba.network.central_node._items import Event, Forgotten, Item, Remark, Run, Stored, Twin
 from ertis_numba.network.central_node._ledger import Ledger, look
@@ -97,6 +97,8 @@ class Shelf:
                 self._settle(runs_of(journal))
                 self._untold.learn(journal)
                 self._checksums.learn(journal)
+                if journal.damage:
+                    self._tell(Remark(f"the log of {path.name} was damaged; lost: {journal.damage}"))
         elif recording.exists():
             self._settle(look([recording]))
 
@@ -332,7 +334,7 @@ class Shelf:
 
     def _set_aside(self, path: Path) -> None:
         """Give a journal that cannot be read another name: nothing that it may hold in secret is sealed twice."""
-        for end in ("-wal", "-journal", ""):
+        for end in ("-wal", "-journal", TALLY, ""):
             part = path.with_name(path.name + end)
             if part.exists():
                 part.rename(path.with_name(f"{path.name}.damaged{end}"))
