@@ -37,6 +37,7 @@ def flip(path, place):
 
 def stored(path):
     with Journal.open(path) as journal:
+        assert journal.source == "test"
         return [entry.measurement.stamp.sequence for entry in journal.entries()], journal.gaps
 
 
@@ -83,6 +84,15 @@ def test_damaged_last_commit_is_noticed_by_the_tally(tmp_path):
     numbers, gaps = stored(path)
     assert numbers == list(range(10, 9 + COUNT))
     assert [(gap.sensor, gap.first, gap.last, gap.reason) for gap in gaps] == [("left", 9 + COUNT, 9 + COUNT, LOST)]
+
+
+def test_log_damaged_in_its_first_transaction_keeps_the_source(tmp_path):
+    path = crashed(tmp_path, entries(COUNT))
+    flip(log_of(path), 32 + FRAME_BYTES - 3)
+    assert read_log(path).n_read == 0
+    numbers, gaps = stored(path)
+    assert numbers == list(range(10, 10 + COUNT))
+    assert gaps == ()
 
 
 @pytest.mark.parametrize("cut", ["last", "half", "header", "all", "gone"])

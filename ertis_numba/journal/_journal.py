@@ -211,9 +211,11 @@ class Journal(Contents):
             self._last = last
             self._n_entries += len(rows)
             self._held_bytes += sum(sizes_bytes)
-            for entry in entries:
-                stamp = entry.measurement.stamp
-                self.tally.grow(stamp.sensor, stamp.epoch, stamp.sequence, stamp.sequence)
+            first: dict[tuple[str, int], int] = {}
+            for stamp in (entry.measurement.stamp for entry in entries):
+                first.setdefault((stamp.sensor, stamp.epoch), stamp.sequence)
+            for run, number in first.items():
+                self.tally.grow(*run, number, last[run])
 
     def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
         """Return the row of a measurement, whose number is to be above the one in ``last``."""
@@ -314,6 +316,28 @@ class Journal(Contents):
             self._n_entries -= n_deleted
             self._held_bytes -= n_deleted * known.n_bytes
         return int(n_deleted)
+
+    def adopt(self, header: Sequence[Any]) -> None:
+        """Say of what the journal is, as it said before its log was damaged.
+
+        Parameters
+        ----------
+        header : sequence
+            Columns of the table ``journal``, without the first and the last.
+
+        Raises
+        ------
+        DataError
+            The journal cannot be written.
+        """
+        identity = row_crc32(header)
+        with self._turn:
+            if identity != self._identity:
+                with self._database.transaction():
+                    self._database.execute("DELETE FROM journal")
+                    self._insert("journal", tuple(header))
+                self.source, self._identity = header[1], identity
+                self.tally.begin(identity)
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         self._database.execute(insertion(table), (*values, row_crc32(values)))

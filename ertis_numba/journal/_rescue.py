@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
@@ -31,6 +31,7 @@ class _Found:
     damaged.
     """
 
+    header: list[Any] = field(default_factory=list)
     sensors: list[Sensor] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
@@ -136,6 +137,9 @@ def _read_copy(journal: "Journal", database: Database, log: Log) -> _Found:
 
 def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
     found = _Found()
+    with suppress(DamagedError, ValueError):
+        (row,) = repaired.execute(selection("journal"))
+        found.header = checked(journal.path, "the journal", row)
     sensors = {row[0]: Sensor.from_row(journal.path, row) for row in repaired.execute(selection("sensors"))}
     found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
     ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
@@ -160,6 +164,8 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
 
 def _add(journal: "Journal", found: _Found) -> list[str]:
     """Store what was found, and return what cannot be told as a gap."""
+    if found.header:
+        journal.adopt(found.header)
     for sensor in found.sensors:
         with suppress(ArgumentError):
             journal.add_sensor(

@@ -9,7 +9,7 @@ import os
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,6 +40,9 @@ class Mark:
     first: int
     last: int
     discarded: int = -1
+
+
+_FIELDS: Final = tuple(field.name for field in fields(Mark))
 
 
 class Tally:
@@ -115,7 +118,7 @@ class Tally:
         place = self._places.setdefault((mark.sensor, mark.epoch), max(self._places.values(), default=0) + 1)
         if self._descriptor < 0:
             self._begin()
-        self._write(place, asdict(mark))
+        self._write(place, {name: getattr(mark, name) for name in _FIELDS})
 
     def _begin(self) -> None:
         """Open the file and write what it belongs to; what is in it stays only if it was read."""
