@@ -64,9 +64,10 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
     if not n_commits and not missing:
         return ""
     found = None
+    aside = journal.path.with_name(f"{journal.path.name}-wal.damaged")
     if log is not None:
         with suppress(OSError):
-            journal.path.with_name(f"{journal.path.name}-wal.damaged").write_bytes(log.content)
+            aside.write_bytes(log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
     untold = [] if found is None else _add(journal, found)
@@ -77,6 +78,8 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
             journal.note_gaps(list(_holes(journal, gap)))
         else:
             untold.append(f"{gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
+    if not (untold or missing or found is None or found.entries or found.gaps or found.lost):
+        aside.unlink(missing_ok=True)  # only rows that were deleted meanwhile
     return "; ".join(untold)
 
 

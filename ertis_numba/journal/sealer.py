@@ -58,8 +58,7 @@ class Sealed:
             return f"{self.journal}: no measurement was captured"
         told = []
         if self.lost or self.damage:
-            number = "1 stored number" if self.lost == 1 else f"{self.lost} stored numbers"
-            told.append(f"the log of {self.journal.name} was damaged: {number} lost")
+            told.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
         if self.damage:
             told.append(f"also lost: {self.damage}")
         if self.set_aside is not None:

@@ -89,7 +89,7 @@ class DiskSpool(Spool):
         """Report what a damaged log has lost; its gaps go to the central node as well."""
         n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
         if n_lost:
-            self._on_note(f"the log of {journal.path.name} was damaged: {n_lost} stored numbers are lost")
+            self._on_note(f"the log of {journal.path.name} was damaged; stored numbers lost: {n_lost}")
         if journal.damage:
             self._on_note(f"the log of {journal.path.name} was damaged; also lost: {journal.damage}")
 
