@@ -36,9 +36,9 @@ def both():
     return [left[0], right[0], left[1], left[2], right[1]]
 
 
-def create(folder, given=None, *, name="rec.h5", settings=TINY):
+def create(folder, given=None, *, name="rec.h5", target=None, settings=TINY):
     """An open journal of ``rec.h5`` with measurements, each in a commit of its own."""
-    journal = Journal.create(folder / f"{name}{SUFFIX}", target=name, source="test")
+    journal = Journal.create(folder / f"{name}{SUFFIX}", target=name if target is None else target, source="test")
     for entry in entries() if given is None else given:
         sensor = entry.measurement.stamp.sensor
         if sensor not in journal.sensors:

@@ -16,6 +16,7 @@ from ertis_numba.network.central_node._items import (
     Fault,
     Forgotten,
     Item,
+    Remark,
     Resumed,
     Run,
     SealedOne,
@@ -495,3 +496,79 @@ def test_options_that_cannot_be_used_are_refused(options, message, tmp_path):
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     with pytest.raises(DataError, match="give a folder that can be written"):
         Archive(tmp_path / "no" / "folder").open()
+
+
+def test_another_measurement_of_a_number_is_kept_after_its_recording_is_full(tmp_path):
+    given, (other,) = from_zero(3), from_zero(1, 1, seed=2)
+    again = [item_of(entry) for entry in (given[1], other)]
+    for item in again:
+        item.again = True
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(2)
+        opened.archive._shelf.rotate()  # noqa: SLF001  as when it is full
+        opened.give(*again)
+        opened.until(Twin, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted([*given, other]))
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_measurement_that_comes_again_after_a_restart_is_compared(tmp_path, killed):
+    given, (other,) = from_zero(30), from_zero(1, 28, seed=2)
+    again = [item_of(entry) for entry in (given[29], other)]
+    for item in again:
+        item.again = True
+    folder = tmp_path / "a"
+    with Opened(folder) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(29)
+        if killed:
+            shutil.copytree(folder, tmp_path / "b")
+    with Opened(tmp_path / "b" if killed else folder) as opened:
+        opened.give(*again)
+        opened.until(Twin, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
+
+
+def test_measurement_that_cannot_be_compared_any_more_is_kept(tmp_path):
+    given, (other,) = from_zero(30), from_zero(1, 1, seed=2)
+    item = item_of(other)
+    item.again = True
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, given))
+        opened.until_stored(29)
+    with Opened(tmp_path) as opened:
+        opened.give(item)
+        assert opened.until(Twin).differs
+    assert len(list(tmp_path.glob("*_conflicts.h5.journal"))) == 1
+
+
+@pytest.mark.parametrize("place", [3, 30, -10])
+def test_damaged_ledger_is_reported_once_and_made_anew(tmp_path, place):
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, from_zero(6)))
+        opened.until_stored(5)
+    ledger = tmp_path / ".ertis-ledger"
+    content = bytearray(ledger.read_bytes())
+    content[place] ^= 0x80
+    ledger.write_bytes(content)
+    with Opened(tmp_path) as opened:
+        assert opened.archive.settled(RUN) == 5
+        assert ".ertis-ledger is damaged: 1 of " in opened.until(Remark).text
+    with Opened(tmp_path) as opened:
+        assert opened.archive.settled(RUN) == 5
+    assert not any(isinstance(event, Remark) for event in opened.events)
+
+
+def test_flipped_digit_of_a_ledger_throws_nothing_away(tmp_path):
+    with Opened(tmp_path, seal=True) as opened:
+        opened.give(*map(item_of, from_zero(6)))
+        opened.until_stored(5)
+    ledger = tmp_path / ".ertis-ledger"
+    assert b",5]" in ledger.read_bytes()
+    ledger.write_bytes(ledger.read_bytes().replace(b",5]", b",9]"))
+    with Opened(tmp_path) as opened:
+        opened.give(*map(item_of, from_zero(4, 6)))
+        opened.until_stored(9)
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted([*from_zero(6), *from_zero(4, 6)]))

@@ -276,15 +276,20 @@ def written_bytes():
     return int(re.search(r"wchar: (\d+)", COUNTS.read_text())[1])
 
 
-def test_a_target_elsewhere(tmp_path):
-    elsewhere = tmp_path / "b" / "other.h5"
-    with Journal.create(tmp_path / "a", target=elsewhere) as journal:
-        with pytest.raises(DataError, match="b: No such file or directory; make the folder of the recording"):
-            journal.room()
-        elsewhere.parent.mkdir()
-        assert journal.room() > 0
+@pytest.mark.parametrize("target", ["../b/other.h5", "/tmp/other.h5", "other.h5", "..", "", "a/../../other.h5"])
+def test_recording_is_named_after_its_journal_whatever_that_says(tmp_path, target):
+    with create(tmp_path, target=target) as journal:
+        assert journal.target == tmp_path / "rec.h5"
     with Journal.open(journal.path) as journal:
-        assert journal.target == elsewhere
+        assert journal.target == tmp_path / "rec.h5"
+
+
+@pytest.mark.parametrize("target", ["../b/other.h5", "/tmp/other.h5", "other.h5", "..", "", "a\\other.h5"])
+def test_recording_of_a_renamed_journal_stays_in_its_folder(tmp_path, target):
+    create(tmp_path, target=target).close()
+    renamed = (tmp_path / "rec.h5.journal").rename(tmp_path / "renamed")
+    with Journal.open(renamed) as journal:
+        assert journal.target == tmp_path / ("other.h5" if "other" in target else "renamed.h5")
 
 
 def test_an_older_journal_is_never_overwritten(tmp_path):

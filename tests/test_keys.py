@@ -213,6 +213,60 @@ def test_a_secret_is_not_taken_for_a_public_key(folder):
 # The list
 
 
+def _flipped(path):
+    """Write each bit of a file the other way round, in turn."""
+    whole = path.read_bytes()
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        yield
+
+
+def test_no_flipped_bit_of_a_list_changes_who_is_let_in(tmp_path):
+    path = tmp_path / "allow.toml"
+    listed = AllowList().allow(_permission())
+    listed.save(path)
+    n_refused = 0
+    for _ in _flipped(path):
+        try:
+            assert AllowList.load(path) == listed
+        except SettingsError:
+            n_refused += 1
+    assert n_refused > 1000
+
+
+def test_no_flipped_bit_of_a_key_file_changes_the_key(folder):
+    secret, public = PAIR.save(folder)
+    for path, read, wanted in (
+        (secret, KeyPair.load, PAIR),
+        (public, public_key, (PAIR.public, PAIR.name)),
+    ):
+        for _ in _flipped(path):
+            with contextlib.suppress(SettingsError):
+                assert read(path) == wanted
+
+
+def test_list_that_was_cut_short_is_refused(tmp_path):
+    path = tmp_path / "allow.toml"
+    AllowList().allow(_permission()).save(path)
+    whole = path.read_bytes()
+    for n_bytes in range(len(whole) - 1):
+        path.write_bytes(whole[:n_bytes])
+        with pytest.raises(SettingsError):
+            AllowList.load(path)
+
+
+def test_list_that_was_edited_by_hand_says_what_to_do(tmp_path):
+    path = tmp_path / "allow.toml"
+    AllowList().allow(_permission()).save(path)
+    path.write_text(path.read_text().replace('"left"', '"rear"'))
+    with pytest.raises(SettingsError, match="edited by hand; look at what it says, then remove the line that begins"):
+        AllowList.load(path)
+    path.write_text(path.read_text().partition("\n")[2])
+    assert AllowList.load(path).keys[0].serials == ("front", "rear")
+
+
 def test_a_list_is_read_as_it_was_saved(tmp_path):
     other = Permission(name="viewer", public=KeyPair.new("viewer").public, role="application")
     listed = AllowList().allow(_permission()).allow(other)

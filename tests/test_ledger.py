@@ -1,10 +1,12 @@
 """The ledger keeps what a folder holds, and a process of its own reads it from recordings."""
 
 import json
+import re
+import zlib
 
 import pytest
 
-from ertis_numba.errors import DataError, InUseError
+from ertis_numba.errors import DataError, FormatVersionError, InUseError
 from ertis_numba.journal import Gap, seal_apart
 from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.central_node._ledger import Ledger, Lock, look
@@ -31,18 +33,71 @@ def test_a_ledger_of_version_1_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    "content",
     [
-        ("{", "is damaged"),
-        ('{"settled": 1}', "is damaged"),
-        ('{"version": 3, "news": 1}', "has version 3"),
-        ("", "is damaged"),
+        b"{",
+        b'{"settled": 1}',
+        b'{"version": 3, "news": 1}',
+        b"",
+        b"\xff",
+        b'{"settled": {"left": {"x": 1}}}',
+        b'{"settled": {"l\xff": {"1": 1}}}',
+        b'{"gaps": [["left", "1", 5, 4, "x"]]}',
     ],
 )
-def test_a_ledger_that_cannot_be_used_is_refused(content, message, tmp_path):
-    (tmp_path / ".ertis-ledger").write_text(content)
-    with pytest.raises(DataError, match=message):
+def test_ledger_that_cannot_be_read_is_reported_and_left_out(content, tmp_path):
+    (tmp_path / ".ertis-ledger").write_bytes(content)
+    read = Ledger(tmp_path)
+    assert re.fullmatch(r"\S+\.ertis-ledger is damaged: [^\n]*read again from the recordings .*", read.damage)
+    assert (read.is_new, read.settled, read.open, read.unsealed, read.gaps) == (False, {}, [], [], [])
+
+
+def test_ledger_of_a_newer_version_is_refused(tmp_path):
+    text = b'["ertis-ledger",4]'
+    (tmp_path / ".ertis-ledger").write_bytes(b"%08x %s\n" % (zlib.crc32(text), text))
+    with pytest.raises(FormatVersionError, match="has version 4, this package reads 3; update ertis-numba"):
         Ledger(tmp_path)
+
+
+SETTLED = {Run("left", 2**62): 7, Run("left", 3): 5, Run("right", 3): 2**62}
+
+
+def saved(folder):
+    gaps = [Gap("left", 0, 9, "ring overflow", 4)]
+    Ledger(folder).save(SETTLED, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps)
+    return (folder / ".ertis-ledger"), gaps
+
+
+def test_no_flipped_bit_of_a_ledger_raises_a_mark_or_passes_unnoticed(tmp_path):
+    path, gaps = saved(tmp_path)
+    whole = path.read_bytes()
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        read = Ledger(tmp_path)
+        assert read.damage, damaged
+        assert read.settled.items() <= SETTLED.items()
+        assert {*read.open} <= {"a.h5.journal"}
+        assert {*read.gaps} <= {*gaps}
+
+
+def test_ledger_that_was_cut_short_is_noticed(tmp_path):
+    path, _ = saved(tmp_path)
+    whole = path.read_bytes()
+    for n_bytes in range(len(whole)):
+        path.write_bytes(whole[:n_bytes])
+        assert Ledger(tmp_path).damage
+
+
+def test_ledger_keeps_the_newest_runs_of_each_sensor(tmp_path):
+    settled = {Run(sensor, epoch): epoch for epoch in range(2_000) for sensor in ("left", "right")}
+    ledger = Ledger(tmp_path)
+    ledger.save(settled, open_=[], unsealed=[])
+    assert (tmp_path / ".ertis-ledger").stat().st_size < 10_000
+    kept = Ledger(tmp_path).settled
+    assert list(kept) == list(ledger.settled)
+    assert {run.epoch for run in kept} == set(range(2_000 - 64, 2_000))
 
 
 def test_a_ledger_that_cannot_be_read_is_refused(tmp_path):

@@ -143,7 +143,7 @@ def test_recover_damaged_measurements(tmp_path):
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
     told = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
-    assert told in run("recover", path).stderr
+    assert told in run("recover", path, code=3).stderr
 
 
 def test_recover_nothing(tmp_path):

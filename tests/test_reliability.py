@@ -2,6 +2,7 @@
 
 import pytest
 from ertis_bench import captures, reliability
+from ertis_bench.flips import flips
 
 from ertis_numba.errors import DataError
 
@@ -55,6 +56,13 @@ def test_killed_captures(tmp_path):
     found = captures.kills(SOURCE, tmp_path, seed=SEED, count=SHORT.n_kills)
     assert found["reported"] > 0
     assert (found["lost"], found["wrong"], found["unreadable"], found["left over"]) == (0, 0, 0, 0)
+
+
+def test_damage_to_files_is_reported(tmp_path):
+    found = flips(tmp_path, seed=SEED, count=SHORT.n_flips)
+    assert found["tried"] >= SHORT.n_flips
+    assert found["noticed"] > SHORT.n_flips / 3
+    assert (found["silent"], found["crashed"]) == (0, 0)
 
 
 def test_a_full_disk(tmp_path):

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,6 @@ from ertis_bench import kills
 
 from ertis_numba import atomic
 from ertis_numba.errors import ArgumentError, DataError, InUseError
-from ertis_numba.journal import Journal
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, Numbers
@@ -211,19 +211,34 @@ def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
     assert seal(path).measurements == 3
 
 
-@pytest.mark.parametrize("place", ["a folder", "nowhere"])
-def test_no_place_for_the_recording(tmp_path, place):
-    with Journal.create(tmp_path / "rec.h5.journal", target="there/rec.h5") as journal:
-        journal.add_sensor("left", TINY)
-        (tmp_path / "there").mkdir()
-        journal.append(entries())
-    if place == "a folder":
-        (tmp_path / "there" / "rec.h5").mkdir()
-    else:
-        (tmp_path / "there").rmdir()
-    with pytest.raises(ArgumentError, match=r"output .* is a folder; give|there is no folder .*there; make it"):
-        seal(journal.path)
-    assert journal.path.exists()
+def test_no_place_for_the_recording(tmp_path):
+    create(tmp_path).close()
+    (tmp_path / "rec.h5").mkdir()
+    with pytest.raises(ArgumentError, match=r"output .* is a folder; give"):
+        seal(tmp_path / "rec.h5.journal")
+    assert (tmp_path / "rec.h5.journal").exists()
+
+
+@pytest.mark.parametrize("target", ["../victim.h5", "{}/victim.h5", "link.h5"])
+def test_sealing_writes_nothing_outside_the_folder_of_the_journal(tmp_path, target):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "victim.h5").write_text("precious")
+    (tmp_path / "in" / "link.h5").symlink_to(tmp_path / "victim.h5")
+    create(tmp_path / "in", target=target.format(tmp_path)).close()
+    assert seal(tmp_path / "in" / "rec.h5.journal", overwrite=True).recording == tmp_path / "in" / "rec.h5"
+    assert (tmp_path / "victim.h5").read_text() == "precious"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "victim.h5"]
+
+
+@pytest.mark.parametrize("name", ["rec.h5", "rec.h5.sealing.part"])
+def test_sealing_follows_no_link(tmp_path, name):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "in" / name).symlink_to(tmp_path / "victim")
+    create(tmp_path / "in").close()
+    with suppress(ArgumentError):
+        seal(tmp_path / "in" / "rec.h5.journal", overwrite=True)
+    assert (tmp_path / "victim").read_text() == "precious"
 
 
 def test_a_process_of_its_own(tmp_path):

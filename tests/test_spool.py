@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, NetworkError
-from ertis_numba.journal import Entry, Journal
+from ertis_numba.journal import LOST, Entry, Journal
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.network.sensor_node import _disk as disk
 from ertis_numba.network.sensor_node import _runs as runs
@@ -298,3 +298,24 @@ def test_an_old_measurement_is_sent_as_it_was(tmp_path):
     with StandIn() as central, Node(central.address, (), spool=tmp_path) as node:
         assert node.flush(SOON_S)
     assert has_all(central, [given])
+
+
+def test_damaged_log_of_a_spool_is_reported_and_becomes_a_gap(tmp_path):
+    given = entries(6)
+    with Node(NOBODY, spool=tmp_path / "running") as node:
+        for entry in given:
+            node.append([entry])
+        shutil.copytree(tmp_path / "running", tmp_path / "killed")
+    (log,) = (tmp_path / "killed").glob("*-wal")
+    with log.open("r+b") as file:
+        file.truncate(log.stat().st_size - PAGE_BYTES)
+    notes = []
+    spool = disk.DiskSpool(tmp_path / "killed", 10**9, None, on_note=notes.append)
+    spool.open()
+    (run,) = spool.runs.values()
+    assert [(item.first, item.reason) for item in run.items] == [
+        *((number, "") for number in range(10, 15)),
+        (15, LOST),
+    ]
+    spool.close()
+    assert [note.partition(" was damaged")[2] for note in notes] == ["; stored numbers lost: 1"]

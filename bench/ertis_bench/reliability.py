@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ertis_bench import captures, kills, powercuts, signals, wire_faults
+from ertis_bench.flips import flips
 from ertis_bench.trials import Parts, try_parts
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
@@ -45,6 +46,8 @@ class Extent:
         To each command.
     n_power_cuts : int
         States of a disk after a power cut.
+    n_flips : int
+        Files that are damaged.
     """
 
     duration_s: float
@@ -55,6 +58,7 @@ class Extent:
     n_seal_kills: int
     n_signals: int
     n_power_cuts: int
+    n_flips: int
 
 
 SHORT = Extent(
@@ -66,6 +70,7 @@ SHORT = Extent(
     n_seal_kills=5,
     n_signals=2,
     n_power_cuts=40,
+    n_flips=60,
 )
 LONG = Extent(
     duration_s=600.0,
@@ -76,6 +81,7 @@ LONG = Extent(
     n_seal_kills=200,
     n_signals=200,
     n_power_cuts=1_500,
+    n_flips=2_000,
 )
 
 
@@ -151,6 +157,10 @@ PARTS: Parts[Extent] = {
     "seals": (
         "{n_seal_kills} sealings killed",
         lambda extent, folder, seed: kills.sealing(folder, seed=seed, count=extent.n_seal_kills),
+    ),
+    "flips": (
+        "{n_flips} damaged files",
+        lambda extent, folder, seed: flips(folder, seed=seed, count=extent.n_flips),
     ),
     "disk_full": ("a small disk", _disk_full),
     "signals": (

@@ -55,6 +55,11 @@ _SEALS = (
     "0 broken files",
     "{broken} broken, {different} other than without a kill, {left_over} files left over",
 )
+_FLIPS = (
+    "{tried:,} damaged files: a flipped bit, a zeroed block or a lost end ({each})",
+    "0 lost or changed in silence; 0 tracebacks",
+    "{noticed:,} reported, {harmless:,} without effect, {silent} silent, {crashed} tracebacks",
+)
 _FULL = (
     "disk full",
     "an error; nothing reported that is not stored",
@@ -82,6 +87,7 @@ _ROWS = (
     ("kills", _KILLS),
     ("journals", _JOURNALS),
     ("seals", _SEALS),
+    ("flips", _FLIPS),
     ("disk_full", _FULL),
     ("signals", _SIGNALS),
     ("power_cuts", _POWER_CUTS),

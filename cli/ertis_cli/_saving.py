@@ -95,6 +95,8 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     path = target.with_name(f"{target.name}{SUFFIX}")
     known: set[str] = set()
     with Journal.create(path, target=target.name, source="received from a central node") as journal:
+        if journal.remark:
+            click.echo(f"ertis: warning: {journal.remark}", err=True)
 
         def write(arrival: "Arrival") -> None:
             measurement = cast("Measurement", arrival.item)

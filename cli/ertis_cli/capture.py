@@ -232,6 +232,8 @@ def _record(
     journal = stack.enter_context(
         Journal.create(path, target=target.name, source=f"capture of {', '.join(session.counts)}")
     )
+    if journal.remark:
+        click.echo(f"ertis: warning: {journal.remark}", err=True)
     where = f"the measurements so far are safe in {path}; seal them by 'ertis recover {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):

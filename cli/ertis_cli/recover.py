@@ -12,6 +12,7 @@ from ertis_cli import options
 __all__ = ["recover"]
 
 _STEPS = 100  # of progress
+_FAILED, _INCOMPLETE = 1, 3
 
 
 @click.command()
@@ -25,7 +26,8 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
 
     A capture that was interrupted leaves a journal, in which is every measurement that it told to be stored. Its
     recording gets the name it was to have, and the journal goes; one that a running capture uses is left alone. In a
-    folder, all files named *.journal are taken. The exit code is 1 if a journal could not be sealed.
+    folder, all files named *.journal are taken. The exit code is 1 if a journal could not be sealed, and 3 if
+    measurements that were stored are damaged or lost.
     """
     journals = [journal for place in places for journal in _found(place)]
     if not journals:
@@ -36,11 +38,14 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
         reports.append(report)
         if _failed(report):
             click.echo(f"ertis: error: {report['error']}", err=True)
+        elif report.get("lost") or report.get("damage"):
+            click.echo(f"ertis: warning: {_told(report)}", err=True)
         else:
             options.say(_told(report), quiet=quiet)
     if as_json:
         options.print_json({"journals": reports})
-    ctx.exit(int(any(map(_failed, reports))))
+    incomplete = any(report.get("damaged") or report.get("lost") or report.get("damage") for report in reports)
+    ctx.exit(_FAILED if any(map(_failed, reports)) else _INCOMPLETE if incomplete else 0)
 
 
 def _found(place: Path) -> list[Path]:
@@ -86,4 +91,8 @@ def _told(report: dict[str, Any]) -> str:
     told = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
     if report["damaged"]:
         told.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
+    if report["lost"] or report["damage"]:
+        told.append(f"{report['lost']} of them stored and lost, as the log of the journal was damaged")
+    if report["damage"]:
+        told.append(f"also lost: {report['damage']}")
     return f"{report['recording']}: {', '.join(told)}"

@@ -66,6 +66,8 @@ def _line(report: "SensorReport") -> str:
         told.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
     if report.disordered:
         told.append(f"{len(report.disordered)} out of order (at {_places(report.disordered)})")
+    if report.remark:
+        told.append(report.remark)
     return f"{report.sensor}: {', '.join(told)}{', whole' if report.whole else ''}"
 
 

@@ -2,12 +2,16 @@
 
 from ertis_numba.journal._journal import SUFFIX, Journal
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor, require_same
+from ertis_numba.journal._rescue import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
+from ertis_numba.journal._tally import TALLY
 from ertis_numba.journal.sealer import Sealed, seal_apart
 
 __all__ = [
+    "LOST",
     "SUFFIX",
     "TABLES",
+    "TALLY",
     "VERSION",
     "Column",
     "Entry",

@@ -1,6 +1,7 @@
 """What is in a journal."""
 
 import os
+import re
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,9 +13,24 @@ from ertis_numba.journal._database import Database
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
 from ertis_numba.journal._tables import WHOLE_VERSION, selection
 
-__all__ = ["Contents"]
+__all__ = ["SUFFIX", "Contents"]
+
+SUFFIX: Final = ".journal"
+"""End of the name of a journal, after that of its recording."""
 
 _SELECTION: Final = selection("measurements", "WHERE id = ?")
+
+
+def _own_name(journal: str, target: str) -> str:
+    """Return the name of the recording to be made of a journal, in the folder of the journal.
+
+    A journal may come from a stranger: what it says itself counts only where its own name says nothing, and never as
+    another folder.
+    """
+    if journal.endswith(SUFFIX) and journal != SUFFIX:
+        return journal.removesuffix(SUFFIX)
+    name = re.split(r"[/\\\0]", target)[-1]
+    return f"{journal}.h5" if name in {"", ".", "..", journal} else name
 
 
 class Contents:
@@ -32,13 +48,15 @@ class Contents:
         self._ids: dict[str, int] = {}
         self._last: dict[tuple[str, int], int] = {}
         self._n_entries = self._held_bytes = 0
+        self._identity = 0
 
     def _load(self) -> None:
         rows = self._database.execute(selection("journal"))
         if len(rows) != 1:
             raise DamagedError(f"{self.path} is damaged, it has no header; copy it again if you can")
         target, self.source, _ = checked(self.path, "the journal", rows[0])
-        self.target = self.path.parent / os.fsdecode(target)
+        self.target = self.path.parent / _own_name(self.path.name, os.fsdecode(target))
+        self._identity = rows[0][-1]
         for row in self._database.execute(selection("sensors", "ORDER BY id")):
             self._know(row[0], Sensor.from_row(self.path, row))
         names = {number: name for name, number in self._ids.items()}
@@ -98,6 +116,15 @@ class Contents:
             )
         names = {number: name for name, number in self._ids.items()}
         return sorted(Key(place, names[number], *rest) for place, number, *rest in rows)
+
+    def newest(self, n_most: int) -> list[tuple[str, int, int, int]]:
+        """Return sensor, epoch, number and CRC-32 of the measurements that came last; their words are not read."""
+        with self._turn:
+            rows = self._database.execute(
+                "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_most,)
+            )
+        names = {number: name for name, number in self._ids.items()}
+        return [(names[number], *rest) for number, *rest in reversed(rows) if number in names]
 
     def find(self, sensor: str, epoch: int, sequence: int) -> Key:
         """Return where a measurement is.

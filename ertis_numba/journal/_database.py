@@ -174,6 +174,15 @@ class Database:
         """
         self._require_there(self._file)
 
+    @property
+    def has_name(self) -> bool:
+        """Whether the file is still the one of its name."""
+        try:
+            self._require_there(self._file)
+        except (InUseError, OSError):
+            return False
+        return True
+
     def _require_there(self, before: os.stat_result) -> None:
         """Refuse a file that has lost its name: who had locked it may have sealed and removed it."""
         now = self._path.stat() if self._path.exists() else None
@@ -246,6 +255,23 @@ class Database:
         """Make the tables; to be called in a transaction."""
         for statement in layout():
             self.execute(statement)
+
+    def copy_to(self, path: Path) -> None:
+        """Copy the pages of the file as they are now.
+
+        To open the file a second time would end the lock on it, as closing any descriptor does by POSIX.
+
+        Raises
+        ------
+        DataError
+            The disk is full or fails.
+        """
+        with self._told():
+            copy = sqlite3.connect(path, isolation_level=None)
+            try:
+                self._connection.backup(copy)
+            finally:
+                copy.close()
 
     def leave_log(self) -> None:
         """Bring all to the main file, and remove the log: then closing touches no file by its name.

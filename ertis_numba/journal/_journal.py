@@ -10,19 +10,20 @@ from typing import Any, Final, Self
 from ertis_numba.atomic import sync
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import _room
-from ertis_numba.journal._contents import Contents
+from ertis_numba.journal._contents import SUFFIX, Contents
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
+from ertis_numba.journal._log import read_log
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
+from ertis_numba.journal._rescue import rescue
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
+from ertis_numba.journal._tally import TALLY, Tally
 from ertis_numba.settings import Settings
 
 __all__ = ["SUFFIX", "Journal"]
 
-SUFFIX: Final = ".journal"
-"""End of the name of a journal, after that of its recording."""
-
-_BESIDE: Final = ("-wal", "-shm", "-journal", LIMIT)  # what SQLite may leave when it is killed, and the limit
+_LOGS: Final = ("-wal", "-journal")  # what SQLite may leave when it is killed, and what may be all that is left
+_NOTES: Final = ("-shm", TALLY, LIMIT)  # which mean nothing without the journal
 
 
 class Journal(Contents):
@@ -38,11 +39,22 @@ class Journal(Contents):
         The recording to be made of it.
     source : str
         Where the measurements come from.
+    tally : Tally
+        Highest numbers that were stored.
+    remark : str
+        Files that `create` has moved away; empty in general.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
         super().__init__(path, database)
         self._accepted: dict[str, Settings] = {}
+        self.tally = Tally(path)
+        self.remark = ""
+
+    @property
+    def damage(self) -> str:
+        """Losses from a damaged log that are not among the gaps; empty in general."""
+        return self.tally.damage
 
     @classmethod
     def create(cls, path: str | Path, *, target: str | Path, source: str = "") -> Self:
@@ -74,7 +86,9 @@ class Journal(Contents):
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a place that can be written") from error
         try:
+            remark = _clear(path)
             made = cls(path, Database(path, empty=True))
+            made.remark = remark
             try:
                 made._begin(Path(target), source)
             except BaseException:
@@ -99,14 +113,24 @@ class Journal(Contents):
             A newer version wrote it.
         """
         path = Path(path)
+        log = read_log(path)
         # A process that is killed right after it made the file leaves an empty one, or one without tables.
         opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
         try:
-            if opened._database.is_new:
+            is_new = opened._database.is_new
+            if is_new:
                 opened._begin(Path(path.name.removesuffix(SUFFIX)), "")
             else:
                 opened._load()
-                opened._obey_limit()
+            opened.tally.read(opened._identity, any_journal=is_new)
+            acked = limit_of(path)
+            if acked is not None:
+                opened.tally.limit(acked)  # what is above is no loss
+            damage = rescue(opened, opened._database, log)
+            if damage:
+                opened.tally.note_damage(damage)
+            if acked is not None:
+                opened._obey_limit(acked)  # also by rows that were rescued
         except BaseException:
             opened.close()
             raise
@@ -138,11 +162,8 @@ class Journal(Contents):
         _unlink(path)
         sync(path.parent)
 
-    def _obey_limit(self) -> None:
+    def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
         """Delete rows that were given up."""
-        acked = limit_of(self.path)
-        if acked is None:
-            return
         runs = {(key.sensor, key.epoch) for key in self.index()} | {(gap.sensor, gap.epoch) for gap in self.gaps}
         with self._database.transaction():
             self._database.execute(f"PRAGMA user_version = {VERSION}")  # numbers of rows may have holes now
@@ -155,7 +176,7 @@ class Journal(Contents):
         self._last.clear()
         self._n_entries = self._held_bytes = 0
         self._load()
-        self.path.with_name(f"{self.path.name}{LIMIT}").unlink(missing_ok=True)
+        _beside(self.path, LIMIT).unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -163,6 +184,7 @@ class Journal(Contents):
             self._database.lay_out()
             self._insert("journal", (os.fsencode(target), source, now))
         self._load()
+        self.tally.begin(self._identity)
 
     def add_sensor(
         self,
@@ -237,6 +259,11 @@ class Journal(Contents):
             self._last = last
             self._n_entries += len(rows)
             self._held_bytes += sum(sizes_bytes)
+            first: dict[tuple[str, int], int] = {}
+            for stamp in (entry.measurement.stamp for entry in entries):
+                first.setdefault((stamp.sensor, stamp.epoch), stamp.sequence)
+            for run, number in first.items():
+                self.tally.grow(*run, number, last[run])
 
     def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
         """Return the row of a measurement, whose number is to be above the one in ``last``."""
@@ -285,6 +312,8 @@ class Journal(Contents):
             with self._database.transaction():
                 for row in rows:
                     self._insert("gaps", row)
+            for gap in gaps:
+                self.tally.grow(gap.sensor, gap.epoch, gap.first, gap.last)
 
     def discard(self, sensor: str, epoch: int, up_to: int) -> int:
         """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
@@ -317,6 +346,10 @@ class Journal(Contents):
             # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
+            try:
+                self.tally.discard(sensor, epoch, up_to)
+            except OSError as error:
+                raise DataError(f"{self.tally.path}: {error.strerror}; check the disk") from error
             with self._database.transaction():
                 if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
                     self._database.execute(f"PRAGMA user_version = {VERSION}")
@@ -331,6 +364,28 @@ class Journal(Contents):
             self._n_entries -= n_deleted
             self._held_bytes -= n_deleted * known.n_bytes
         return int(n_deleted)
+
+    def adopt(self, header: Sequence[Any]) -> None:
+        """Say of what the journal is, as it said before its log was damaged.
+
+        Parameters
+        ----------
+        header : sequence
+            Columns of the table ``journal``, without the first and the last.
+
+        Raises
+        ------
+        DataError
+            The journal cannot be written.
+        """
+        identity = row_crc32(header)
+        with self._turn:
+            if identity != self._identity:
+                with self._database.transaction():
+                    self._database.execute("DELETE FROM journal")
+                    self._insert("journal", tuple(header))
+                self.source, self._identity = header[1], identity
+                self.tally.begin(identity)
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         self._database.execute(insertion(table), (*values, row_crc32(values)))
@@ -358,6 +413,7 @@ class Journal(Contents):
             try:
                 with suppress(DataError):
                     self._release()
+                self.tally.close()
                 _unlink(self.path)  # the log is there where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
@@ -378,11 +434,23 @@ class Journal(Contents):
                 while aside.exists():
                     number += 1
                     aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
+                self.tally.remove()
                 self.path.rename(aside)
             finally:
                 self.close()
             sync(self.path.parent)
         return aside
+
+    def close(self) -> None:
+        """Close the journal; closing twice does no harm."""
+        with self._turn:
+            is_ours = self._database.has_name
+            super().close()
+            # Without a log, all is in the main file, which tells itself what is damaged.
+            if is_ours and not self.damage and not any(_beside(self.path, end).exists() for end in _LOGS):
+                with suppress(OSError):
+                    self.tally.remove()
+            self.tally.close()
 
     def _release(self) -> None:
         """Make the file ready to lose its name; it stays locked where the system lets an open file lose it."""
@@ -394,8 +462,27 @@ class Journal(Contents):
 
 def _unlink(path: Path) -> None:
     """Remove a journal that is closed, and what lies beside it."""
-    for end in ("", *_BESIDE):
-        path.with_name(f"{path.name}{end}").unlink(missing_ok=True)
+    for end in ("", *_LOGS, *_NOTES):
+        _beside(path, end).unlink(missing_ok=True)
+
+
+def _beside(path: Path, end: str) -> Path:
+    return path.with_name(f"{path.name}{end}")
+
+
+def _clear(path: Path) -> str:
+    """Move logs away that are left of an earlier journal of this name, and return which."""
+    for end in _NOTES:
+        _beside(path, end).unlink(missing_ok=True)
+    moved = []
+    for log in (_beside(path, end) for end in _LOGS):
+        if log.exists():
+            number = 1
+            while (aside := _beside(log, f".{number}.orphaned")).exists():
+                number += 1
+            log.rename(aside)
+            moved.append(f"{log.name} had no journal and is kept as {aside.name}")
+    return "; ".join(moved)
 
 
 _INSERTION: Final = insertion("measurements")

@@ -36,6 +36,10 @@ class Sealed:
         … were damaged in the journal.
     set_aside : Path or None
         Where the journal is now, if measurements in it are damaged; it is gone otherwise.
+    lost : int
+        Of those missing, measurements that were stored and that a damaged log of the journal has lost.
+    damage : str
+        Losses from a damaged log that are no gaps of the recording; empty in general.
     """
 
     journal: Path
@@ -44,16 +48,23 @@ class Sealed:
     missing: int = 0
     damaged: int = 0
     set_aside: Path | None = None
+    lost: int = 0
+    damage: str = ""
 
     @property
     def remark(self) -> str:
         """What is not as its user would expect, in a line; empty where all is well."""
         if self.recording is None:
             return f"{self.journal}: no measurement was captured"
-        if self.set_aside is None:
-            return ""
-        number = "1 measurement is" if self.damaged == 1 else f"{self.damaged} measurements are"
-        return f"{number} damaged; the journal is kept as {self.set_aside}"
+        told = []
+        if self.lost or self.damage:
+            told.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
+        if self.damage:
+            told.append(f"also lost: {self.damage}")
+        if self.set_aside is not None:
+            number = "1 measurement is" if self.damaged == 1 else f"{self.damaged} measurements are"
+            told += [f"{number} damaged", f"the journal is kept as {self.set_aside}"]
+        return "; ".join(told)
 
 
 def seal_apart(

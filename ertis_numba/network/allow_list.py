@@ -8,8 +8,9 @@ from typing import Annotated, Final, Literal, Self, TypeAlias, get_args
 import msgspec
 
 from ertis_numba import checks
-from ertis_numba.documents import Document, Table
+from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
+from ertis_numba.network.checked import Checked
 from ertis_numba.network.keys import require_key, require_name
 from ertis_numba.network.own_files import locked, require_own, write
 
@@ -62,7 +63,7 @@ class Permission(Table, frozen=True, kw_only=True):
         return self.role in ("application", "admin")
 
 
-class AllowList(Document, frozen=True, kw_only=True):
+class AllowList(Checked, frozen=True, kw_only=True):
     """Who is let in, and as what.
 
     Attributes

@@ -10,8 +10,8 @@ import platformdirs
 import zmq
 from zmq.utils import z85
 
-from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.network.checked import Checked
 from ertis_numba.network.own_files import OTHERS, mode_of, private_folder, write
 
 __all__ = ["ClientKeys", "KeyPair", "ServerKeys", "default_folder", "public_key", "require_key", "require_name"]
@@ -20,12 +20,12 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,63}", re.ASCII)
 _Z85: Final = re.compile(r"[0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # ZeroMQ RFC 32
 
 
-class _Public(Document, frozen=True, kw_only=True):
+class _Public(Checked, frozen=True, kw_only=True):
     name: str
     public: str
 
 
-class _Secret(Document, frozen=True, kw_only=True):
+class _Secret(Checked, frozen=True, kw_only=True):
     name: str
     public: str
     secret: str

@@ -25,7 +25,10 @@ from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
 from ertis_numba.words import WordFormat, word_format
 
-__all__ = ["Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
+__all__ = ["JOURNAL_DAMAGE", "Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
+
+JOURNAL_DAMAGE = "journal_damage"
+"""Attribute of a recording: losses of the journal that it was made of, beyond its gaps."""
 
 Mounting = tuple[Sequence[float], Sequence[float]]
 """Where a sensor is, x, y, z in m, and how it is turned, a unit quaternion x, y, z, w."""

@@ -19,10 +19,10 @@ import numpy as np
 from ertis_numba.atomic import part_of, sync
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import SUFFIX, Journal, Sealed, Sensor
+from ertis_numba.journal import LOST, SUFFIX, Journal, Sealed, Sensor
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import RecordingReader, RecordingWriter, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, RecordingWriter, open_recording
 
 __all__ = ["TOKEN", "seal"]
 
@@ -64,6 +64,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         target = journal.target
         part_of(target, TOKEN).unlink(missing_ok=True)
         if not len(journal):
+            _require_nothing_lost(journal)
             journal.remove()
             return Sealed(path, None)
         rows = {name: JournalRows(journal, name) for name in journal.sensors}
@@ -79,6 +80,29 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             return _told(path, target, damaged=n_damaged, set_aside=journal.set_aside())
         journal.remove()
     return _told(path, target)
+
+
+def _require_nothing_lost(journal: Journal) -> None:
+    """Refuse to remove an empty journal that has held measurements before its log was damaged."""
+    lost = [journal.damage] if journal.damage else []
+    lost += [f"{gap.first} to {gap.last} of sensor {gap.sensor}" for gap in journal.gaps if gap.reason == LOST]
+    if lost:
+        raise DataError(
+            f"{journal.path} has lost all its measurements, as its log was damaged ({'; '.join(lost)}); copy both "
+            "again if you can, or remove it"
+        )
+
+
+def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
+    """Return what a damaged log has lost and no gap of the recording can tell."""
+    absent = (
+        f"{missing.first} to {missing.last} of sensor {name}"
+        for name, held in rows.items()
+        if len(held) == len(held.damaged)
+        for missing in held.missing
+        if missing.reason == LOST
+    )
+    return "; ".join([*([journal.damage] if journal.damage else []), *absent])
 
 
 def _origin(path: Path) -> str:
@@ -103,6 +127,10 @@ class _Sealer(RecordingWriter):
     def say(self, history: str) -> None:
         """Say what happened to the measurements."""
         self._attributes["history"] = history
+
+    def say_damage(self, damage: str) -> None:
+        """Say what is lost and is no gap."""
+        self._attributes[JOURNAL_DAMAGE] = damage
 
     def _require_words(self, item: Measurement) -> None:
         """Take what came: the journal has looked at its type, and what is no number must not keep the rest from it."""
@@ -131,6 +159,8 @@ def _write(journal: Journal, rows: dict[str, JournalRows], *, overwrite: bool, p
         if not n_written:
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
         writer.say("; ".join([_origin(journal.path), *_absent(rows)]))
+        if damage := _damage(journal, rows):
+            writer.say_damage(damage)
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
@@ -172,12 +202,15 @@ def _equal(one: Measurement, other: Measurement) -> bool:
 
 def _told(path: Path, recording: Path, *, damaged: int = 0, set_aside: Path | None = None) -> Sealed:
     """Return what a recording has come to."""
-    n_measurements = n_missing = 0
+    n_measurements = n_missing = n_lost = 0
+    damage = ""
     for name in sensor_names(recording):
         with open_recording(recording, sensor=name) as reader:
             n_measurements += len(reader)
             n_missing += sum(gap.last - gap.first + 1 for gap in reader.gaps)
-    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside)
+            n_lost += sum(gap.last - gap.first + 1 for gap in reader.gaps if gap.reason == LOST)
+            damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
+    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage)
 
 
 if __name__ == "__main__":

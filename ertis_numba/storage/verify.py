@@ -8,7 +8,8 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import Gap, open_recording
+from ertis_numba.storage._structure import fault_of
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, Gap, RecordingReader, open_recording
 
 __all__ = ["Damage", "SensorReport", "verify"]
 
@@ -31,6 +32,8 @@ class SensorReport:
         Places, counted from 0, of measurements whose sequence number is not above the one before of the same epoch.
     fault : str
         Why nothing of this sensor can be read; empty elsewhere.
+    remark : str
+        Damage to the file, or losses from its journal that are not among the gaps, of any sensor; empty in general.
     """
 
     sensor: str
@@ -39,6 +42,7 @@ class SensorReport:
     damaged: tuple[Damage, ...] = ()
     disordered: tuple[int, ...] = ()
     fault: str = ""
+    remark: str = ""
 
     @property
     def missing(self) -> int:
@@ -48,7 +52,7 @@ class SensorReport:
     @property
     def whole(self) -> bool:
         """Whether all is there and as it was written."""
-        return not (self.gaps or self.damaged or self.disordered or self.fault)
+        return not (self.gaps or self.damaged or self.disordered or self.fault or self.remark)
 
 
 def verify(path: str | Path) -> list[SensorReport]:
@@ -65,8 +69,14 @@ def verify(path: str | Path) -> list[SensorReport]:
     path = Path(path)
     if _is_journal(path):
         with Journal.open(path) as journal:
+            if journal.damage and not journal.sensors:
+                raise DataError(
+                    f"{path} has lost measurements, as its log was damaged ({journal.damage}); copy both again"
+                )
             return [_of_journal(journal, name) for name in journal.sensors]
-    reports = [_of_recording(path, name) for name in sensor_names(path)]
+    names = sensor_names(path)
+    structure = fault_of(path)
+    reports = [_of_recording(path, name, structure) for name in names]
     if all(report.fault for report in reports):
         raise DataError(reports[0].fault if reports else f"{path} holds no sensor; copy it again")
     return reports
@@ -80,7 +90,7 @@ def _is_journal(path: Path) -> bool:
         raise DataError(f"{path}: {error.strerror}; give a recording or a journal") from error
 
 
-def _of_recording(path: Path, sensor: str) -> SensorReport:
+def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
     try:
         recording = open_recording(path, sensor=sensor)
     except (ArgumentError, DataError) as error:
@@ -99,7 +109,13 @@ def _of_recording(path: Path, sensor: str) -> SensorReport:
             gaps=recording.gaps,
             damaged=tuple(damaged),
             disordered=_disordered((stamp.epoch, stamp.sequence) for stamp in stamps),
+            remark="; ".join(filter(None, (_journal_damage(recording), structure))),
         )
+
+
+def _journal_damage(recording: RecordingReader) -> str:
+    damage = recording.attributes.get(JOURNAL_DAMAGE, "")
+    return f"lost with a damaged journal: {damage}" if damage else ""
 
 
 def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
@@ -123,4 +139,5 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
         gaps=tuple(Gap(*item) for item in rows.missing),
         damaged=tuple(rows.damaged),
         disordered=_disordered((key.epoch, key.sequence) for key in rows.keys),
+        remark=f"lost with a damaged journal: {journal.damage}" if journal.damage else "",
     )

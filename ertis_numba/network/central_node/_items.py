@@ -5,7 +5,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from ertis_numba.journal import Entry, Gap, Sealed, Sensor
 
-__all__ = ["Event", "Failed", "Fault", "Forgotten", "Item", "Resumed", "Run", "SealedOne", "Stored", "Twin"]
+__all__ = ["Event", "Failed", "Fault", "Forgotten", "Item", "Remark", "Resumed", "Run", "SealedOne", "Stored", "Twin"]
 
 _OVERHEAD: Final = 2048  # of an item and what belongs to it, beside the words
 
@@ -108,4 +108,11 @@ class Failed:
     text: str
 
 
-Event: TypeAlias = Stored | Forgotten | Twin | Fault | Resumed | SealedOne | Failed
+@dataclass(slots=True)
+class Remark:
+    """Damage that was found when a folder was taken up; storing goes on."""
+
+    text: str
+
+
+Event: TypeAlias = Stored | Forgotten | Twin | Fault | Resumed | SealedOne | Failed | Remark

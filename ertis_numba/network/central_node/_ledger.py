@@ -4,9 +4,11 @@ import contextlib
 import os
 import subprocess
 import sys
+import zlib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
@@ -24,32 +26,65 @@ __all__ = ["Ledger", "Lock", "look"]
 
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
-_VERSION: Final = 2  # 1 had no gaps
+_VERSION: Final = 3  # 1 had no gaps, 2 had no checksums
+_RUNS_KEPT: Final = 64  # of each sensor
+_ALL_RUNS_KEPT: Final = 16_384
 
 
-class _Content(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """What is in the file, as JSON.
+class _Begin(msgspec.Struct, tag="ertis-ledger", array_like=True):
+    version: int
 
-    ``settled`` holds the highest settled number by sensor and epoch (in decimal); ``open`` the journals that may hold
-    more; ``unsealed`` journals that are to become recordings; ``gaps`` what is missing, and no recording tells yet:
-    sensor, epoch (in decimal), first, last, reason.
-    """
 
-    version: int = _VERSION
+class _Settled(msgspec.Struct, tag="run", array_like=True):
+    sensor: str
+    epoch: int
+    last: int
+
+
+class _Open(msgspec.Struct, tag="open", array_like=True):
+    name: str
+
+
+class _Unsealed(msgspec.Struct, tag="unsealed", array_like=True):
+    name: str
+
+
+class _Gap(msgspec.Struct, tag="gap", array_like=True):
+    sensor: str
+    epoch: int
+    first: int
+    last: int
+    reason: str
+
+
+class _Tail(msgspec.Struct, tag="crc32", array_like=True):
+    sensor: str
+    epoch: int
+    numbers: list[tuple[int, int]]
+
+
+class _End(msgspec.Struct, tag="end", array_like=True):
+    n_lines: int
+
+
+_Line: TypeAlias = _Begin | _Settled | _Open | _Unsealed | _Gap | _Tail | _End
+
+
+class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """Content of versions 1 and 2: one JSON object; numbers by sensor and epoch, which is text."""
+
+    version: Annotated[int, msgspec.Meta(ge=1, le=2)] = 2
     settled: dict[str, dict[str, int]] = {}
     open: list[str] = []
     unsealed: list[str] = []
     gaps: list[tuple[str, str, int, int, str]] = []
 
 
-class _Version(msgspec.Struct):
-    """Of any content, however much of it is not known here."""
-
-    version: int = _VERSION
-
-
 class Ledger:
     """The highest settled number of each run of a folder, durable.
+
+    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. An entry whose CRC-32
+    is wrong is left out. It has the newest runs only, 64 of each sensor.
 
     Parameters
     ----------
@@ -59,64 +94,168 @@ class Ledger:
     ----------
     is_new : bool
         There was none.
+    damage : str
+        Entries that are left out, and what follows from that; empty in general.
     settled : dict of Run to int
+        The run that grew last comes last.
     open, unsealed : list of str
         Names of journals that may hold more than is in ``settled``, and of those that are to be sealed.
     gaps : list of Gap
         What is missing, and no recording tells yet.
+    tails : dict of Run to dict of int to int
+        CRC-32 of the newest measurements of runs, by number.
 
     Raises
     ------
     DataError
         It cannot be read.
+    FormatVersionError
+        A newer version wrote it.
     """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / _NAME
         self.is_new = not self._path.exists()
-        content = _Content() if self.is_new else self._read()
-        self.settled = {
-            Run(sensor, int(epoch)): last for sensor, runs in content.settled.items() for epoch, last in runs.items()
-        }
-        self.open, self.unsealed = content.open, content.unsealed
-        self.gaps = [Gap(sensor, first, last, why, int(epoch)) for sensor, epoch, first, last, why in content.gaps]
+        self.damage = ""
+        self.settled: dict[Run, int] = {}
+        self.open: list[str] = []
+        self.unsealed: list[str] = []
+        self.gaps: list[Gap] = []
+        self.tails: dict[Run, dict[int, int]] = {}
+        if not self.is_new:
+            self._read()
 
-    def _read(self) -> _Content:
+    def _read(self) -> None:
         try:
-            text = self._path.read_bytes()
-            version = msgspec.json.decode(text, type=_Version).version
-            if version not in range(1, _VERSION + 1):
+            content = self._path.read_bytes()
+        except OSError as error:
+            raise DataError(f"{self._path}: {error.strerror}; allow reading it") from error
+        if content.startswith(b"{"):
+            try:
+                self._read_old(msgspec.json.decode(content, type=_Old))
+            except (msgspec.MsgspecError, ValueError):  # also texts that are no UTF-8
+                self._note_damage("it cannot be read")
+            return
+        lines = content.split(b"\n")[:-1]
+        n_bad, n_ended = 0, -1
+        for number, text in enumerate(lines):
+            try:
+                entry = _decoded(text)
+                self._add(entry)
+            except FormatVersionError:
+                raise
+            except ValueError:
+                n_bad += 1
+                continue
+            if isinstance(entry, _End) and entry.n_lines == number:
+                n_ended = number + 1
+        if n_bad:
+            self._note_damage(f"{n_bad} of {len(lines)} entries cannot be read")
+        elif n_ended != len(lines) or not lines:
+            self._note_damage("its end is missing")
+
+    def _read_old(self, old: _Old) -> None:
+        settled = {Run(name, int(epoch)): last for name, runs in old.settled.items() for epoch, last in runs.items()}
+        self.gaps = [Gap(sensor, first, last, why, int(epoch)) for sensor, epoch, first, last, why in old.gaps]
+        self.settled, self.open, self.unsealed = settled, old.open, old.unsealed
+
+    def _add(self, entry: _Line) -> None:
+        match entry:
+            case _Begin(version) if version > _VERSION:
                 raise FormatVersionError(
                     f"{self._path} has version {version}, this package reads {_VERSION}; update ertis-numba"
                 )
-            content = msgspec.json.decode(text, type=_Content)
-        except OSError as error:
-            raise DataError(f"{self._path}: {error.strerror}; allow reading it") from error
-        except msgspec.MsgspecError as error:
-            raise DataError(
-                f"{self._path} is damaged ({error}); remove it: it is made anew from the recordings beside it"
-            ) from error
-        return content
+            case _Settled(sensor, epoch, last):
+                self.settled[Run(sensor, epoch)] = last
+            case _Open(name):
+                self.open.append(name)
+            case _Unsealed(name):
+                self.unsealed.append(name)
+            case _Gap(sensor, epoch, first, last, reason):
+                self.gaps.append(Gap(sensor, first, last, reason, epoch))
+            case _Tail(sensor, epoch, numbers):
+                self.tails[Run(sensor, epoch)] = dict(numbers)
+
+    def _note_damage(self, what: str) -> None:
+        self.damage = (
+            f"{self._path} is damaged: {what}. What it said is read again from the recordings and journals beside it; "
+            "measurements in recordings that were moved elsewhere may be stored a second time"
+        )
 
     def save(
-        self, settled: Mapping[Run, int], *, open_: Iterable[str], unsealed: Iterable[str], gaps: Sequence[Gap] = ()
+        self,
+        settled: Mapping[Run, int],
+        *,
+        open_: Iterable[str],
+        unsealed: Iterable[str],
+        gaps: Sequence[Gap] = (),
+        tails: Mapping[Run, Mapping[int, int]] | None = None,
     ) -> None:
         """Replace what is in the file; when this returns, it is durable.
+
+        Parameters
+        ----------
+        settled : mapping of Run to int
+            The run that grew last comes last. Of those that grew first, only the newest of each sensor are kept.
+        open_, unsealed : iterable of str
+        gaps : sequence of Gap
+        tails : mapping of Run to dict of int to int, optional
+            CRC-32 of the newest measurements of each run.
 
         Raises
         ------
         OSError, DataError
             It cannot be written; the old content stays.
         """
-        runs: dict[str, dict[str, int]] = {}
-        for run, last in settled.items():
-            runs.setdefault(run.sensor, {})[str(run.epoch)] = last
-        told = [(gap.sensor, str(gap.epoch), gap.first, gap.last, gap.reason) for gap in gaps]
-        content = _Content(settled=runs, open=list(open_), unsealed=list(unsealed), gaps=told)
+        kept = _newest(settled)
+        opened, left = list(open_), list(unsealed)
+        lines: list[_Line] = [
+            _Begin(_VERSION),
+            *(_Settled(run.sensor, run.epoch, last) for run, last in kept.items()),
+            *map(_Open, opened),
+            *map(_Unsealed, left),
+            *(_Gap(gap.sensor, gap.epoch, gap.first, gap.last, gap.reason) for gap in gaps),
+            *(
+                _Tail(run.sensor, run.epoch, list(numbers.items()))
+                for run, numbers in (tails or {}).items()
+                if run in kept
+            ),
+        ]
         with replacing(self._path, overwrite=True, token="new") as part:  # noqa: S106  who has the lock writes alone
-            part.write_bytes(msgspec.json.encode(content))
-        self.settled, self.open, self.unsealed = dict(settled), content.open, content.unsealed
-        self.gaps = list(gaps)
+            part.write_bytes(b"".join(map(_encoded, [*lines, _End(len(lines))])))
+        self.settled, self.open, self.unsealed = kept, opened, left
+        self.gaps, self.tails, self.damage = list(gaps), {run: dict(each) for run, each in (tails or {}).items()}, ""
+
+
+def _newest(settled: Mapping[Run, int]) -> dict[Run, int]:
+    """Return the newest runs of each sensor, in their order.
+
+    A run that is forgotten does harm only if its sensor comes back with it after so many others: numbers whose ack it
+    has missed are then stored a second time.
+    """
+    counts: Counter[str] = Counter()
+    kept: list[Run] = []
+    for run in list(settled)[: -_ALL_RUNS_KEPT - 1 : -1]:
+        counts[run.sensor] += 1
+        if counts[run.sensor] <= _RUNS_KEPT:
+            kept.append(run)
+    return {run: settled[run] for run in reversed(kept)}
+
+
+def _encoded(line: _Line) -> bytes:
+    text = msgspec.json.encode(line)
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _decoded(line: bytes) -> _Line:
+    """Return an entry; a `ValueError` if it is not what was written."""
+    check, _, text = line.partition(b" ")
+    if check != b"%08x" % zlib.crc32(text):
+        raise ValueError("wrong CRC-32")
+    return _LINES.decode(text)
+
+
+_LINES: Final[msgspec.json.Decoder[_Line]] = msgspec.json.Decoder(_Line)
 
 
 class Lock:

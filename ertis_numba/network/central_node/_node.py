@@ -19,7 +19,7 @@ from ertis_numba.network.central_node._condition import Condition
 from ertis_numba.network.central_node._door import Door
 from ertis_numba.network.central_node._images import Guarded, Images
 from ertis_numba.network.central_node._intake import Intake
-from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Resumed, SealedOne, Stored, Twin
+from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Remark, Resumed, SealedOne, Stored, Twin
 from ertis_numba.network.central_node._reading import read, require_role
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._telling import Telling, text_of
@@ -295,6 +295,8 @@ class CentralNode:
                     self._telling.sealed(sealed)
                 case Failed(text):
                     self._telling.tell("unsealed", text=text)
+                case Remark(text):
+                    self._telling.tell("damage", text=text)
 
     def _tick(self) -> None:
         now_s = time.monotonic()

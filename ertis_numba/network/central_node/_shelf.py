@@ -9,7 +9,8 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, NoRoomError
 from ertis_numba.journal import SUFFIX, Entry, Journal
-from ertis_numba.network.central_node._items import Event, Forgotten, Item, Run, Stored, Twin
+from ertis_numba.network.central_node._checksums import Checksums
+from ertis_numba.network.central_node._items import Event, Forgotten, Item, Remark, Run, Stored, Twin
 from ertis_numba.network.central_node._ledger import Ledger, look
 from ertis_numba.network.central_node._untold import Untold
 from ertis_numba.network.central_node._volumes import Volume, journal_name, runs_of
@@ -55,8 +56,10 @@ class Shelf:
     def __init__(self, folder: Path, name: str, ledger: Ledger, tell: Callable[[Event], None]) -> None:
         self._folder, self._name, self._ledger, self._tell = folder, name, ledger, tell
         self.settled: dict[Run, int] = dict(ledger.settled)
+        self._by_age = dict.fromkeys(ledger.settled)
         self.volume: Volume | None = None
         self._twins: Volume | None = None
+        self._checksums = Checksums(ledger.tails)
         self._known_twins: dict[tuple[Run, int, int], None] = {}
         self._unsealed: set[str] = set(ledger.unsealed)
         self._untold = Untold(ledger.gaps)
@@ -67,7 +70,10 @@ class Shelf:
 
     def _take_up(self) -> None:
         """Learn what journals hold that a crash has left; they are to be sealed."""
-        if self._ledger.is_new:
+        damage = self._ledger.damage
+        if damage:
+            self._tell(Remark(damage))
+        if self._ledger.is_new or damage:
             self._settle(look(sorted(self._folder.glob("*.h5"))))
             names = sorted(path.name for path in self._folder.glob(f"*.h5{SUFFIX}"))
         else:
@@ -77,6 +83,9 @@ class Shelf:
         for name in dict.fromkeys([*self._ledger.unsealed, *names]):
             if (self._folder / name).exists():
                 self._retire(self._folder / name)
+        if damage:
+            with suppress(OSError, DataError):  # otherwise the same is done at the next start
+                self._save(open_=[])
 
     def _learn(self, path: Path) -> None:
         """Learn what a journal holds, or the recording that somebody has made of it meanwhile."""
@@ -85,12 +94,21 @@ class Shelf:
             with Journal.open(path) as journal:
                 self._settle(runs_of(journal))
                 self._untold.learn(journal)
+                self._checksums.learn(journal)
+                if journal.damage:
+                    self._tell(Remark(f"the log of {path.name} was damaged; lost: {journal.damage}"))
         elif recording.exists():
             self._settle(look([recording]))
 
     def _settle(self, runs: dict[Run, int]) -> None:
         for run, last in runs.items():
-            self.settled[run] = max(last, self.settled.get(run, -1))
+            self._grow(run, last)
+
+    def _grow(self, run: Run, last: int) -> None:
+        """Raise the mark of a run, which is then the newest."""
+        self.settled[run] = max(last, self.settled.get(run, -1))  # others read it meanwhile
+        self._by_age.pop(run, None)
+        self._by_age[run] = None
 
     def store(self, items: list[Item]) -> None:
         """Make items durable and tell of them; after an error, call it again with the same ones.
@@ -179,17 +197,18 @@ class Shelf:
 
     def _tell_stored(self, items: list[Item], took_ms: float) -> None:
         for item in items:
-            self.settled[item.run] = max(item.last, self.settled.get(item.run, -1))
+            self._grow(item.run, item.last)
             item.done = True
+            if isinstance(item.what, Entry):
+                self._checksums.add(item.run, item.first, item.what.crc32 or 0)
         self._tell(Stored(items, took_ms))
 
     def _store_twin(self, item: Item) -> None:
-        """Keep a measurement whose number is settled, if the journal holds another one under it."""
+        """Keep a measurement whose number is settled, unless the one that is stored is known to be the same."""
         if not isinstance(item.what, Entry):
             return
         key = (item.run, item.first, item.what.crc32 or 0)
-        held = None if self.volume is None or key in self._known_twins else self.volume.crc32_of(item.what)
-        differs = held is not None and held != item.what.crc32
+        differs = key not in self._known_twins and self._differs(item, item.what)
         if differs:
             if self._twins is not None and not self._twins.fits(item):
                 self._retire_volume(self._twins)
@@ -205,6 +224,15 @@ class Shelf:
         item.done = True
         self._tell(Twin(item, differs=differs))
 
+    def _differs(self, item: Item, entry: Entry) -> bool:
+        """Whether another measurement is stored under a number, or one that cannot be compared any more."""
+        held = self._checksums.find(item.run, item.first)
+        if held is None and self.volume is not None:
+            held = self.volume.crc32_of(entry)
+        if held is None:
+            return item.first <= self.settled.get(item.run, -1)
+        return held != entry.crc32
+
     @property
     def _open(self) -> list[str]:
         """Names of journals that hold more than the ledger says."""
@@ -214,7 +242,9 @@ class Shelf:
     def _save(self, *, open_: list[str], also: Iterable[str] = ()) -> None:
         self._unsealed = {name for name in self._unsealed if (self._folder / name).exists()}
         unsealed = sorted({*self._unsealed, *also})
-        self._ledger.save(self.settled, open_=open_, unsealed=unsealed, gaps=self._untold.gaps)
+        settled = {run: self.settled[run] for run in self._by_age}
+        tails = self._checksums.tails(settled)
+        self._ledger.save(settled, open_=open_, unsealed=unsealed, gaps=self._untold.gaps, tails=tails)
         self._unsealed.update(also)
         self._is_saved = True
 

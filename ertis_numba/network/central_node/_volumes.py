@@ -128,10 +128,7 @@ class Volume:
         self.know(source)
 
     def crc32_of(self, entry: Entry) -> int | None:
-        """Return the CRC-32 of the measurement with the number of this one; None where it is not held.
-
-        Only this journal is looked at, not those before it.
-        """
+        """Return the CRC-32 of the measurement with the number of this one; None where this journal has none."""
         stamp = entry.measurement.stamp
         if stamp.sensor not in self.journal.sensors:
             return None

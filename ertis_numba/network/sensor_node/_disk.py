@@ -12,7 +12,7 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.atomic import make_folder
 from ertis_numba.errors import DamagedError, DataError, InUseError, NetworkError
-from ertis_numba.journal import SUFFIX, Entry, Gap, Journal
+from ertis_numba.journal import LOST, SUFFIX, Entry, Gap, Journal
 from ertis_numba.network.messages import MOST_SEQUENCE
 from ertis_numba.network.sensor_node._runs import Item, Run
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
@@ -75,6 +75,7 @@ class DiskSpool(Spool):
             try:
                 journal = Journal.open(path)
                 try:
+                    self._tell_losses(journal)
                     self._take_up(journal)
                 except BaseException:
                     journal.close()
@@ -84,6 +85,14 @@ class DiskSpool(Spool):
             except DataError as error:
                 self._on_note(f"what is in {path.name} is not sent: {error}")
         self._sweeper.start()
+
+    def _tell_losses(self, journal: Journal) -> None:
+        """Report what a damaged log has lost; its gaps go to the central node as well."""
+        n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
+        if n_lost:
+            self._on_note(f"the log of {journal.path.name} was damaged; stored numbers lost: {n_lost}")
+        if journal.damage:
+            self._on_note(f"the log of {journal.path.name} was damaged; also lost: {journal.damage}")
 
     def _take_up(self, journal: Journal) -> None:
         runs: dict[tuple[str, int], Run] = {}

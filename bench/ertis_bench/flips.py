@@ -1,0 +1,352 @@
+"""Random damage to every kind of file: whatever is lost or changed has to be reported by whoever reads it.
+
+``python -m ertis_bench.flips STATE FOLDER`` makes files of one kind, prints what it was told to be stored, and ends by
+SIGKILL. The oracle reads recordings by h5py and zlib alone.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+
+from ertis_numba.errors import ErtisError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.journal import SUFFIX, Entry, Gap, Journal, Sensor
+from ertis_numba.journal._tables import insertion
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.central_node._ledger import Ledger
+from ertis_numba.network.keys import KeyPair, public_key
+from ertis_numba.network.sensor_node._disk import DiskSpool
+from ertis_numba.settings import Recording, Settings
+
+__all__ = ["flips"]
+
+_SETTINGS: Final = Settings(recording=Recording(n_samples=4_096))
+_EPOCH: Final = 7
+_SENSORS: Final = ("left", "right")
+_BLOCK_BYTES: Final = 512
+_OTHER_AT_EACH_SEALING: Final = {"/@date_created", "/@history"}
+
+Judge = Callable[[Path], str]
+"""Return "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """Files of one kind: the state they belong to, their names, and the share of all tries."""
+
+    state: str
+    pattern: str
+    share: float
+
+
+_KINDS: Final = {
+    "journal": _Kind("grown", f"*{SUFFIX}", 0.18),
+    "log of a journal": _Kind("young", f"*{SUFFIX}-wal", 0.22),
+    "log of a grown journal": _Kind("grown", f"*{SUFFIX}-wal", 0.06),
+    "rollback journal": _Kind("large", f"*{SUFFIX}-journal", 0.04),
+    "spool": _Kind("spool", f"*{SUFFIX}*", 0.14),
+    "ledger": _Kind("ledger", ".ertis-ledger", 0.08),
+    "recording": _Kind("recording", "*.h5", 0.16),
+    "keys": _Kind("keys", "robot.*.toml", 0.06),
+    "allow list": _Kind("keys", "allow.toml", 0.06),
+}
+
+
+def flips(folder: Path, *, seed: int, count: int, only: str = "") -> dict[str, Any]:
+    """Damage files ``count`` times: a flipped bit, or one time in ten each, a zeroed block or a lost end.
+
+    Returns
+    -------
+    dict
+        ``tried``, ``noticed``, ``harmless``, ``silent`` and ``crashed`` in all, and ``kinds`` with the same of each.
+    """
+    rng = random.Random(seed)  # noqa: S311  nothing is secret
+    kinds: dict[str, dict[str, int]] = {}
+    judges: dict[str, Judge] = {}
+    for name, kind in _KINDS.items():
+        if only and only != name:
+            continue
+        made = folder / kind.state
+        if kind.state not in judges:
+            judges[kind.state] = _STATES[kind.state](made)
+        counts: Counter[str] = Counter()
+        for _ in range(max(1, round(count * kind.share))):
+            work = shutil.copytree(made, folder / "work")
+            what = _damage(rng.choice(sorted(work.glob(kind.pattern))), rng)
+            verdict = judges[kind.state](work)
+            counts[verdict] += 1
+            if verdict in {"silent", "crashed"}:
+                sys.stderr.write(f"{name}: {verdict}: {what}\n")
+            shutil.rmtree(work)
+        kinds[name] = {"tried": counts.total(), **{key: counts[key] for key in _VERDICTS}}
+    return {key: sum(each[key] for each in kinds.values()) for key in ("tried", *_VERDICTS)} | {
+        "kinds": kinds,
+        "each": ", ".join(f"{name} {each['tried']:,}" for name, each in kinds.items()),
+    }
+
+
+_VERDICTS: Final = ("noticed", "harmless", "silent", "crashed")
+
+
+def _damage(path: Path, rng: random.Random) -> str:
+    """Damage a file, and return how."""
+    content = bytearray(path.read_bytes())
+    place = rng.randrange(len(content))
+    how = rng.random()
+    if how < 0.1:
+        content[place : place + _BLOCK_BYTES] = bytes(len(content[place : place + _BLOCK_BYTES]))
+    elif how < 0.2:
+        del content[place:]
+    else:
+        content[place] ^= 1 << rng.randrange(8)
+    path.write_bytes(content)
+    return f"{path.name}, {'block' if how < 0.1 else 'end' if how < 0.2 else 'bit'} at {place}"
+
+
+def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
+    """Judge what was read, and whether something was reported beside it."""
+    try:
+        found, reported = read()
+    except ErtisError as error:
+        return "noticed" if str(error) and "\n" not in str(error) else "crashed"
+    except Exception as error:  # noqa: BLE001  a traceback in the face of a user
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+        return "crashed"
+    if reported:
+        return "noticed"
+    return "harmless" if found == wanted else "silent"
+
+
+# States
+
+
+def _made(state: str, folder: Path) -> list[list[Any]]:
+    """Have a process make a state and be killed; return what it was told."""
+    folder.mkdir()
+    command = [sys.executable, "-m", "ertis_bench.flips", state, str(folder)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode != -signal.SIGKILL:
+        raise RuntimeError(f"the process that makes {state} ended with {done.returncode}: {done.stderr[-500:]}")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def _journal(state: str) -> Callable[[Path], Judge]:
+    def make(folder: Path) -> Judge:
+        from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes to be killed do without HDF5
+        from ertis_numba.storage.verify import verify  # noqa: PLC0415
+
+        told = {tuple(each) for each in _made(state, folder)}
+        whole = shutil.copytree(folder, folder.with_name(f"{state}-whole"))
+        seal(whole / f"rec.h5{SUFFIX}")
+        wanted = _content(whole / "rec.h5")
+        if told != _measured(whole / "rec.h5"):
+            raise RuntimeError(f"without damage, a journal ({state}) is not what was told")
+
+        def read(work: Path) -> tuple[object, bool]:
+            sealed = seal(work / f"rec.h5{SUFFIX}")
+            if sealed.recording is None:
+                return None, False
+            reported = bool(sealed.remark) or not all(report.whole for report in verify(sealed.recording))
+            return _content(sealed.recording), reported
+
+        return lambda work: _judged(lambda: read(work), wanted)
+
+    return make
+
+
+def _recording(folder: Path) -> Judge:
+    from ertis_numba.storage.sealing import seal  # noqa: PLC0415
+    from ertis_numba.storage.verify import verify  # noqa: PLC0415
+
+    _made("young", folder)
+    seal(folder / f"rec.h5{SUFFIX}")
+    wanted = _content(folder / "rec.h5")
+
+    def read(work: Path) -> tuple[object, bool]:
+        reported = not all(report.whole for report in verify(work / "rec.h5"))
+        return (None if reported else _content(work / "rec.h5")), reported
+
+    return lambda work: _judged(lambda: read(work), wanted)
+
+
+def _spool(folder: Path) -> Judge:
+    told = {tuple(each) for each in _made("spool", folder)}
+
+    def read(work: Path) -> tuple[object, bool]:
+        notes: list[str] = []
+        spool = DiskSpool(work, 10**9, None, on_note=notes.append)
+        spool.open()
+        found, is_gap = set(), False
+        for run in spool.runs.values():
+            for item in run.items:
+                entry = spool.entry(item, run)
+                if entry is None:
+                    is_gap = True
+                else:
+                    found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.words.tobytes())))
+        spool.close()
+        # What was discarded may come back: the central node knows it.
+        return found >= told, bool(notes) or is_gap
+
+    return lambda work: _judged(lambda: read(work), wanted=True)
+
+
+def _ledger(folder: Path) -> Judge:
+    _made("ledger", folder)
+    whole = Ledger(folder)
+    wanted = (whole.settled, whole.open, whole.unsealed, whole.gaps)
+
+    def read(work: Path) -> tuple[object, bool]:
+        ledger = Ledger(work)
+        if any(last > whole.settled.get(run, -1) for run, last in ledger.settled.items()):
+            return None, False  # measurements to come would be thrown away, whatever is reported
+        return (ledger.settled, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
+
+    return lambda work: _judged(lambda: read(work), wanted)
+
+
+def _keys(folder: Path) -> Judge:
+    _made("keys", folder)
+
+    def read(work: Path) -> tuple[object, bool]:
+        work.chmod(0o700)
+        pair = KeyPair.load(work / "robot.secret.toml")
+        return (pair, public_key(work / "robot.public.toml"), AllowList.load(work / "allow.toml")), False
+
+    wanted, _ = read(folder)
+    return lambda work: _judged(lambda: read(work), wanted)
+
+
+_STATES: Final[dict[str, Callable[[Path], Judge]]] = {
+    **{state: _journal(state) for state in ("young", "grown", "large")},
+    "recording": _recording,
+    "spool": _spool,
+    "ledger": _ledger,
+    "keys": _keys,
+}
+
+
+# The oracle
+
+
+def _measured(path: Path) -> set[tuple[str, int, int]]:
+    """Return sensor, number and CRC-32 of the words of all measurements of a recording."""
+    with h5py.File(path) as file:
+        return {
+            (name, int(number), zlib.crc32(np.ascontiguousarray(words).tobytes()))
+            for name, group in file["sensors"].items()
+            for number, words in zip(group["sequence"][:], group["pdm"], strict=True)
+        }
+
+
+def _content(path: Path) -> dict[str, object]:
+    """Return all attributes and arrays of a file, but for what differs between two sealings."""
+    found: dict[str, object] = {}
+    with h5py.File(path) as file:
+        names = ["/"]
+        file.visit(names.append)
+        for name in names:
+            item = file[name]
+            found[name] = "" if isinstance(item, h5py.Group) else (item.shape, str(item.dtype), item[()].tobytes())
+            for key in item.attrs:
+                found[f"{name}@{key}"] = _attribute(file, item.attrs[key], key)
+    return {key: value for key, value in found.items() if key not in _OTHER_AT_EACH_SEALING}
+
+
+def _attribute(file: h5py.File, value: Any, key: str) -> object:
+    if key == "DIMENSION_LIST":
+        return [[file[each].name for each in axis] for axis in value]
+    if key == "REFERENCE_LIST":
+        return [(file[each].name, int(axis)) for each, axis in value]
+    return np.asarray(value).tobytes() if not isinstance(value, str) else value
+
+
+# Processes that are killed
+
+
+def _entries(count: int, first: int = 0) -> Iterator[Entry]:
+    for number in range(first, first + count):
+        for sensor in _SENSORS:
+            words = np.random.default_rng([number, _SENSORS.index(sensor)]).integers(
+                0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32
+            )
+            stamp = Stamp(sensor=sensor, sequence=number, epoch=_EPOCH, timestamp_ns=1_000_000_007 * number)
+            yield Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=number)
+
+
+def _tell(entries: list[Entry]) -> None:
+    for entry in entries:
+        stamp = entry.measurement.stamp
+        sys.stdout.write(json.dumps([stamp.sensor, stamp.sequence, entry.crc32]) + "\n")
+    sys.stdout.flush()
+
+
+def _begin_another_commit(journal: Journal) -> None:
+    """Change pages that a rollback journal brings back."""
+    execute = journal._database.execute  # noqa: SLF001  nobody else can be killed in mid commit
+    execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
+    execute("BEGIN")
+    execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
+    for number in range(60):
+        execute(insertion("measurements"), (1, _EPOCH, 10_000 + number, *[0] * 9, bytes(8192)))
+
+
+def _live(state: str, folder: Path) -> None:
+    """Make the files of a state."""
+    if state in {"young", "grown", "large"}:
+        journal = Journal.create(folder / f"rec.h5{SUFFIX}", target="rec.h5", source="flips")
+        for sensor in _SENSORS:
+            journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
+        size = 320 if state == "large" else 1
+        entries = list(_entries({"young": 12, "grown": 150, "large": 160}[state]))
+        for begin in range(0, len(entries), size):
+            journal.append(entries[begin : begin + size])
+            _tell(entries[begin : begin + size])
+        if state == "large":
+            _begin_another_commit(journal)
+    elif state == "spool":
+        spool = DiskSpool(folder, 10**9, None, on_note=lambda _: None)
+        spool.open()
+        for sensor in _SENSORS:
+            spool.add_sensor(Sensor.of(sensor, _SETTINGS))
+        entries = list(_entries(20))
+        for entry in entries:
+            spool.append([entry])
+        _tell(entries)
+    elif state == "ledger":
+        runs = {Run(sensor, 2**40 + epoch): 1_000 * epoch for epoch in range(8) for sensor in _SENSORS}
+        gaps = [Gap("left", 3, 9, "the spool was full", 5)]
+        tails = {run: {last - number: last * number for number in range(16)} for run, last in runs.items()}
+        Ledger(folder).save(runs, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps, tails=tails)
+    else:
+        pair = KeyPair.new("robot")
+        pair.save(folder / "made")
+        serials = ("front", "left", "right")
+        robot = Permission(name="robot", public=pair.public, role="sensor", serials=serials)
+        viewer = Permission(name="viewer", public=KeyPair.new("viewer").public, role="application")
+        AllowList(keys=(robot, viewer)).save(folder / "allow.toml")
+        for path in (folder / "made").iterdir():
+            path.rename(folder / path.name)
+        (folder / "made").rmdir()
+
+
+if __name__ == "__main__":
+    with suppress(BrokenPipeError):
+        _live(sys.argv[1], Path(sys.argv[2]))
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -1,0 +1,185 @@
+"""Rescue of a journal whose log is damaged: later commits are read from a repaired copy, the rest becomes gaps."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.journal._database import Database
+from ertis_numba.journal._log import Log
+from ertis_numba.journal._records import Entry, Gap, Sensor, checked
+from ertis_numba.journal._tables import selection
+
+if TYPE_CHECKING:
+    from ertis_numba.journal._journal import Journal
+
+__all__ = ["LOST", "rescue"]
+
+LOST: Final = "lost in a damaged journal"
+"""Reason of a gap whose measurements were stored."""
+
+
+@dataclass(slots=True)
+class _Found:
+    """Rows of a repaired copy that the journal does not have.
+
+    ``lost`` are measurements whose record is sound and whose words are not, ``n_unreadable`` the others that are
+    damaged.
+    """
+
+    header: list[Any] = field(default_factory=list)
+    sensors: list[Sensor] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
+    gaps: list[Gap] = field(default_factory=list)
+    lost: list[Gap] = field(default_factory=list)
+    n_unreadable: int = 0
+
+
+def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
+    """Bring back what a damaged log has kept from SQLite, and note the rest as gaps.
+
+    Parameters
+    ----------
+    journal : Journal
+        Open; its tally is read.
+    database : Database
+        Of the journal.
+    log : Log or None
+        As it was before the journal was opened.
+
+    Returns
+    -------
+    str
+        Losses that no gap of the journal tells; empty in general.
+    """
+    n_commits = log.n_lost_commits if log is not None else 0
+    try:
+        missing = list(_missing(journal))
+    except DamagedError:  # of a record of a gap, without which nothing is sealed
+        return ""
+    if not n_commits and not missing:
+        return ""
+    found = None
+    aside = journal.path.with_name(f"{journal.path.name}-wal.damaged")
+    if log is not None:
+        with suppress(OSError):
+            aside.write_bytes(log.content)
+        with suppress(DataError, OSError):
+            found = _read_copy(journal, database, log)
+    untold = [] if found is None else _add(journal, found)
+    if n_commits and found is None and not missing:
+        untold.append(f"{n_commits} commits of unknown content")
+    for gap in (*missing, *(found.lost if found is not None else ())):
+        if gap.sensor in journal.sensors:
+            journal.note_gaps(list(_holes(journal, gap)))
+        else:
+            untold.append(f"{gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
+    if not (untold or missing or found is None or found.entries or found.gaps or found.lost):
+        aside.unlink(missing_ok=True)  # only rows that were deleted meanwhile
+    return "; ".join(untold)
+
+
+def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
+    """Yield what a journal holds or says to be missing: run, first and last number."""
+    for key in journal.index():
+        yield (key.sensor, key.epoch), key.sequence, key.sequence
+    for gap in journal.gaps:
+        yield (gap.sensor, gap.epoch), gap.first, gap.last
+
+
+def _missing(journal: "Journal") -> Iterator[Gap]:
+    """Yield what the tally says to be stored beyond what the journal holds."""
+    if not journal.tally.marks:
+        return
+    highest: dict[tuple[str, int], int] = {}
+    for run, _, last in _held(journal):
+        highest[run] = max(last, highest.get(run, -1))
+    for run, mark in journal.tally.marks.items():
+        before = max(highest.get(run, -1), mark.first - 1, mark.discarded)
+        if mark.last > before:
+            yield Gap(mark.sensor, before + 1, mark.last, LOST, mark.epoch)
+
+
+def _holes(journal: "Journal", gap: Gap) -> Iterator[Gap]:
+    """Yield the parts of a gap of which the journal holds nothing."""
+    begin = gap.first
+    held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.epoch))
+    for first, last in [*held, (gap.last + 1, gap.last + 1)]:
+        if begin < first <= gap.last + 1:
+            yield Gap(gap.sensor, begin, first - 1, gap.reason, gap.epoch)
+        begin = max(begin, last + 1)
+
+
+def _read_copy(journal: "Journal", database: Database, log: Log) -> _Found:
+    """Read the rows that the journal does not have from a copy of it with the repaired log.
+
+    Each row has a checksum of its own: what a repaired log gets wrong is not taken for a row.
+
+    Raises
+    ------
+    DataError, OSError
+        There is no room for a copy, or SQLite cannot read it.
+    """
+    n_bytes = journal.path.stat().st_size + 2 * len(log.content)
+    if shutil.disk_usage(journal.path.parent).free < 2 * n_bytes:
+        raise DataError(f"{journal.path.parent} has no room for a copy of {journal.path.name}")
+    with tempfile.TemporaryDirectory(prefix=f".{journal.path.name}.", dir=journal.path.parent) as folder:
+        copy = Path(folder) / journal.path.name
+        database.copy_to(copy)
+        copy.with_name(f"{copy.name}-wal").write_bytes(log.repaired)
+        repaired = Database(copy, empty=False)
+        try:
+            return _read(journal, database, repaired)
+        finally:
+            repaired.close()
+
+
+def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
+    found = _Found()
+    with suppress(DamagedError, ValueError):
+        (row,) = repaired.execute(selection("journal"))
+        found.header = checked(journal.path, "the journal", row)
+    sensors = {row[0]: Sensor.from_row(journal.path, row) for row in repaired.execute(selection("sensors"))}
+    found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
+    ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
+    rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", ends[:1])
+    for (number,) in rows:
+        record: list[int] = []
+        try:
+            (row,) = repaired.execute(selection("measurements", "WHERE id = ?"), (number,))
+            record = checked(journal.path, "a measurement", row[:-1])
+            found.entries.append(sensors[record[0]].entry(journal.path, row))
+        except (DamagedError, KeyError, ValueError):
+            if record and record[0] in sensors:
+                found.lost.append(Gap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
+            else:
+                found.n_unreadable += 1
+    for row in repaired.execute(selection("gaps", "WHERE id > ? ORDER BY id"), ends[1:]):
+        with suppress(DamagedError, KeyError):
+            number, epoch, first, last, reason = checked(journal.path, "a gap", row)
+            found.gaps.append(Gap(sensors[number].name, first, last, reason, epoch))
+    return found
+
+
+def _add(journal: "Journal", found: _Found) -> list[str]:
+    """Store what was found, and return what cannot be told as a gap."""
+    if found.header:
+        journal.adopt(found.header)
+    for sensor in found.sensors:
+        with suppress(ArgumentError):
+            journal.add_sensor(
+                sensor.name,
+                sensor.settings,
+                firmware=sensor.firmware,
+                translation_m=sensor.translation_m,
+                rotation_xyzw=sensor.rotation_xyzw,
+            )
+    for entry in found.entries:
+        with suppress(ArgumentError):  # what a crash before has left in the log may be there already
+            journal.append([entry])
+    journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
+    return [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []

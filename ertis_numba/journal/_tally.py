@@ -1,0 +1,174 @@
+"""Highest numbers that a journal holds, in a file beside it.
+
+A damaged log can take measurements away in a way that SQLite does not notice. The tally is written after each commit
+and not synced: it never says more than the journal has, and after a kill it says all of it.
+"""
+
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+__all__ = ["TALLY", "Mark", "Tally"]
+
+TALLY: Final = "-tally"
+"""End of the name of the file, after that of the journal."""
+
+_BLOCK_BYTES: Final = 512  # which a disk writes as a whole
+
+
+@dataclass(slots=True)
+class Mark:
+    """Numbers of one run of a sensor.
+
+    Attributes
+    ----------
+    sensor : str
+    epoch : int
+    first, last : int
+        Of the measurements and gaps that were stored.
+    discarded : int
+        Up to which measurements may have been deleted.
+    """
+
+    sensor: str
+    epoch: int
+    first: int
+    last: int
+    discarded: int = -1
+
+
+_FIELDS: Final = tuple(field.name for field in fields(Mark))
+
+
+class Tally:
+    """A file of one block for each run, which is written again whenever the run grows.
+
+    Parameters
+    ----------
+    journal : Path
+
+    Attributes
+    ----------
+    marks : dict of (sensor, epoch) to Mark
+    damage : str
+        Losses that are known and are no gaps of the journal; empty in general.
+    """
+
+    def __init__(self, journal: Path) -> None:
+        self.path = journal.with_name(f"{journal.name}{TALLY}")
+        self._descriptor = -1
+        self._identity = 0
+        self._places: dict[tuple[str, int], int] = {}
+        self.marks: dict[tuple[str, int], Mark] = {}
+        self.damage = ""
+
+    def begin(self, identity: int) -> None:
+        """Write for a new journal of this identity."""
+        self._identity = identity
+
+    def read(self, identity: int, *, any_journal: bool = False) -> None:
+        """Read what an earlier process has left for the journal of this identity, or for any; write for it later."""
+        self._identity = identity
+        try:
+            content = self.path.read_bytes()
+        except OSError:
+            return
+        blocks = dict(_blocks(content))
+        if blocks.get(0, {}).get("journal") != identity and not any_journal:
+            return
+        self.damage = blocks.pop(0, {}).get("damage", "")
+        for place, block in blocks.items():
+            mark = Mark(**block)
+            self._places[mark.sensor, mark.epoch] = place
+            self.marks[mark.sensor, mark.epoch] = mark
+
+    def grow(self, sensor: str, epoch: int, first: int, last: int) -> None:
+        """Note that numbers are stored; where the disk is too full for that, a loss of them would not be noticed."""
+        mark = self.marks.setdefault((sensor, epoch), Mark(sensor, epoch, first, last))
+        mark.last = max(mark.last, last)
+        with suppress(OSError):
+            self._put(mark)
+
+    def note_damage(self, text: str) -> None:
+        """Keep in the file what a damaged log has lost, where the journal itself cannot say it."""
+        self.damage = text
+        with suppress(OSError):
+            self._begin()
+
+    def discard(self, sensor: str, epoch: int, up_to: int) -> None:
+        """Note durably that numbers may be deleted.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        mark = self.marks.get((sensor, epoch))
+        if mark is not None and up_to > mark.discarded:
+            mark.discarded = up_to
+            self._put(mark)
+            os.fsync(self._descriptor)
+
+    def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
+        """Forget numbers beyond those that were acknowledged: a failed journal was given up beyond them.
+
+        Parameters
+        ----------
+        acked : mapping of (sensor, epoch) to int
+            Highest acknowledged number of each run that has one.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        for run, mark in self.marks.items():
+            last = max(acked.get(run, -1), mark.first - 1)
+            if mark.last > last:
+                mark.last = last
+                self._put(mark)
+
+    def _put(self, mark: Mark) -> None:
+        place = self._places.setdefault((mark.sensor, mark.epoch), max(self._places.values(), default=0) + 1)
+        if self._descriptor < 0:
+            self._begin()
+        self._write(place, {name: getattr(mark, name) for name in _FIELDS})
+
+    def _begin(self) -> None:
+        """Open the file and write what it belongs to; what is in it stays only if it was read."""
+        if self._descriptor < 0:
+            flags = os.O_CREAT | os.O_RDWR | (0 if self.marks else os.O_TRUNC) | getattr(os, "O_BINARY", 0)
+            self._descriptor = os.open(self.path, flags, 0o666)
+        self._write(0, {"journal": self._identity} | ({"damage": self.damage} if self.damage else {}))
+
+    def _write(self, place: int, block: dict[str, Any]) -> None:
+        text = json.dumps(block, ensure_ascii=False).encode()
+        line = b"%08x %s" % (zlib.crc32(text), text)
+        if len(line) >= _BLOCK_BYTES:  # the longest names are not counted
+            return
+        os.lseek(self._descriptor, place * _BLOCK_BYTES, os.SEEK_SET)
+        os.write(self._descriptor, line.ljust(_BLOCK_BYTES - 1) + b"\n")
+
+    def close(self) -> None:
+        """Close the file; closing twice does no harm."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def remove(self) -> None:
+        """Close the file and remove it."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+def _blocks(content: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the blocks that are as they were written, and their places."""
+    for begin in range(0, len(content), _BLOCK_BYTES):
+        check, _, text = content[begin : begin + _BLOCK_BYTES].rstrip().partition(b" ")
+        if check == b"%08x" % zlib.crc32(text):
+            yield begin // _BLOCK_BYTES, json.loads(text)

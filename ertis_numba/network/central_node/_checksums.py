@@ -1,0 +1,53 @@
+"""CRC-32 of measurements that are stored: a number that comes again is compared with what came first."""
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+from ertis_numba.journal import Journal
+from ertis_numba.network.central_node._items import Run
+
+__all__ = ["Checksums"]
+
+_KEPT: Final = 65_536  # about 15 MB
+_LEARNED: Final = 1024  # of a journal that a crash has left
+_TAIL: Final = 16  # of each run: what a sensor node may have under way
+
+
+class Checksums:
+    """CRC-32 of the newest measurements by run and number.
+
+    Parameters
+    ----------
+    tails : mapping of Run to dict of int to int
+        Those of earlier processes.
+    """
+
+    def __init__(self, tails: Mapping[Run, Mapping[int, int]]) -> None:
+        self._kept: OrderedDict[tuple[Run, int], int] = OrderedDict()
+        for run, numbers in tails.items():
+            for number, crc32 in numbers.items():
+                self._kept[run, number] = crc32
+
+    def find(self, run: Run, number: int) -> int | None:
+        """Return the CRC-32 of a measurement; None if it is not kept."""
+        return self._kept.get((run, number))
+
+    def add(self, run: Run, number: int, crc32: int) -> None:
+        """Keep the CRC-32 of a measurement that is stored."""
+        self._kept[run, number] = crc32
+        if len(self._kept) > _KEPT:
+            self._kept.popitem(last=False)
+
+    def learn(self, journal: Journal) -> None:
+        """Keep those of the newest measurements of a journal."""
+        for sensor, epoch, number, crc32 in journal.newest(_LEARNED):
+            self.add(Run(sensor, epoch), number, crc32)
+
+    def tails(self, runs: Iterable[Run]) -> dict[Run, dict[int, int]]:
+        """Return those of the newest measurements of some runs, for the next process."""
+        found: dict[Run, dict[int, int]] = {run: {} for run in runs}
+        for (run, number), crc32 in reversed(self._kept.items()):
+            if run in found and len(found[run]) < _TAIL:
+                found[run][number] = crc32
+        return {run: dict(sorted(numbers.items())) for run, numbers in found.items() if numbers}
