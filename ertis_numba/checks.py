@@ -17,6 +17,7 @@ __all__ = [
     "finite_array",
     "gap",
     "interval",
+    "length",
     "positive",
     "sensor_name",
     "shape",
@@ -69,6 +70,12 @@ def whole(name: str, value: int, low: int, high: int | None = None) -> int:
         wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
         raise ArgumentError(f"{name} is {value}; give a whole number {wanted}")
     return int(value)
+
+
+def length(name: str, value: str, most: int) -> None:
+    """Refuse a text of more than ``most`` characters."""
+    if len(value) > most:
+        raise ArgumentError(f"{name} has {len(value)} characters; the limit is {most}")
 
 
 def choice(name: str, value: object, known: Iterable[object]) -> None:
