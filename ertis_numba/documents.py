@@ -120,7 +120,9 @@ class Document(Table, frozen=True, kw_only=True):
         except msgspec.DecodeError as error:  # a syntax error, which names its line itself
             raise SettingsError(_told(cls, source, error)) from error
         except RecursionError as error:
-            raise SettingsError(f"{source or cls.label()}: lists or tables are nested too deeply; flatten them") from error
+            raise SettingsError(
+                f"{source or cls.label()}: lists or tables are nested too deeply; flatten them"
+            ) from error
         except ValueError as error:  # a number of thousands of digits
             raise SettingsError(
                 f"{source or cls.label()}: {' '.join(str(error).split())}; give a shorter number"
