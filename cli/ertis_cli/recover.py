@@ -25,7 +25,8 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
 
     A capture that was interrupted leaves a journal, in which is every measurement that it told to be stored. Its
     recording gets the name it was to have, and the journal goes; one that a running capture uses is left alone. In a
-    folder, all files named *.journal are taken. The exit code is 1 if a journal could not be sealed.
+    folder, all files named *.journal are taken. Where no recording can hold a sensor, the others are sealed and the
+    journal is kept, with a name that ends in .refused. The exit code is 1 if something could not be sealed.
     """
     journals = [journal for place in places for journal in _found(place)]
     if not journals:
@@ -34,9 +35,11 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
     for journal in journals:
         report = _seal(journal, force=force, quiet=quiet)
         reports.append(report)
-        if _failed(report):
+        if report.get("refused"):
+            click.echo(f"ertis: error: {_refusal(report)}", err=True)
+        elif _failed(report):
             click.echo(f"ertis: error: {report['error']}", err=True)
-        else:
+        if "error" not in report or not _failed(report):
             options.say(_told(report), quiet=quiet)
     if as_json:
         options.print_json({"journals": reports})
@@ -74,13 +77,21 @@ def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
 
 
 def _failed(report: dict[str, Any]) -> bool:
-    return "error" in report and not report.get("in_use")
+    return bool(report.get("refused")) or ("error" in report and not report.get("in_use"))
+
+
+def _refusal(report: dict[str, Any]) -> str:
+    """Return why sensors of a journal are not in its recording, in a line."""
+    reasons = "; ".join(f"no recording can hold sensor {name} ({why})" for name, why in report["refused"].items())
+    return f"{report['journal']}: {reasons}; the journal is kept as {report['set_aside']}"
 
 
 def _told(report: dict[str, Any]) -> str:
     """Return what became of a journal, in a line."""
     if "error" in report:
         return f"{report['journal']}: in use by a running capture; left alone"
+    if report["recording"] is None and report["refused"]:
+        return f"{report['journal']}: kept as {report['set_aside']}"
     if report["recording"] is None:
         return f"{report['journal']}: no measurement was captured; removed"
     told = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]

@@ -1,4 +1,4 @@
-"""Settings that come from another machine or stand in a file of measurements, where nobody on this machine wrote them."""
+"""Settings from another machine, or from a file of measurements that may come from one."""
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry.grids import grid_count

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 from typing import IO, Any
@@ -35,7 +35,9 @@ class Sealed:
     damaged : int
         … were damaged in the journal.
     set_aside : Path or None
-        Where the journal is now, if measurements in it are damaged; it is gone otherwise.
+        Where the journal is now, if measurements in it are damaged or refused; it is gone otherwise.
+    refused : dict of str to str
+        Sensors whose measurements no recording can hold, and the reasons.
     """
 
     journal: Path
@@ -44,16 +46,19 @@ class Sealed:
     missing: int = 0
     damaged: int = 0
     set_aside: Path | None = None
+    refused: dict[str, str] = field(default_factory=dict)
 
     @property
     def remark(self) -> str:
         """What is not as its user would expect, in a line; empty where all is well."""
-        if self.recording is None:
+        if self.recording is None and not self.refused:
             return f"{self.journal}: no measurement was captured"
         if self.set_aside is None:
             return ""
         number = "1 measurement is" if self.damaged == 1 else f"{self.damaged} measurements are"
-        return f"{number} damaged; the journal is kept as {self.set_aside}"
+        found = [f"{number} damaged"] if self.damaged else []
+        found += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
+        return f"{'; '.join(found)}; the journal is kept as {self.set_aside}"
 
 
 def seal_apart(

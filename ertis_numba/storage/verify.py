@@ -65,7 +65,14 @@ def verify(path: str | Path) -> list[SensorReport]:
     path = Path(path)
     if _is_journal(path):
         with Journal.open(path) as journal:
-            return [_of_journal(journal, name) for name in journal.sensors]
+            reports = [_of_journal(journal, name) for name in journal.sensors]
+            reports += [
+                SensorReport(sensor=name, measurements=count, fault=reason)
+                for name, (reason, count) in journal.unusable.items()
+            ]
+        if reports and all(report.fault for report in reports):
+            raise DataError(reports[0].fault)
+        return reports
     reports = [_of_recording(path, name) for name in sensor_names(path)]
     if all(report.fault for report in reports):
         raise DataError(reports[0].fault if reports else f"{path} holds no sensor; copy it again")
