@@ -30,6 +30,7 @@ _SYSTEM_SAYS = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid wha
 _PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
 _LEFT_OPEN = "already open for write"  # a mark in the file, which a program that is killed leaves behind
 _OMITTED = {"word"}  # where there is one of them
+_MAX_NAMES = 64  # of sensors, in an error
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -180,7 +181,7 @@ class Reader(Sequence[Item]):
             raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
 
     def _choose(self, sensor: str | None) -> str:
-        names = ", ".join(self.sensors)
+        names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
         if sensor is None and len(self.sensors) != 1:
             raise ArgumentError(f"{self.path} holds {len(self.sensors)} sensors; choose one of {names} (--sensor)")
         if sensor is not None and sensor not in self.sensors:

@@ -146,7 +146,8 @@ def files(folder: Path, *, count: int | None = None) -> Found:
     Returns
     -------
     dict
-        ``files``, ``reads`` of them, ``taken``, ``tracebacks``, ``crashes``, the slowest and the largest of them.
+        ``files``, ``reads`` of them, those that were ``taken``, that ``failed`` with a traceback, and ``crashes``; the
+        slowest and the largest of them.
     """
     options = [] if count is None else [f"--count={count}"]
     command = [sys.executable, "-m", "ertis_bench.network.hostile_reads", str(folder), *options]
