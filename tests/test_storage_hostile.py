@@ -25,7 +25,7 @@ REFUSED = {
     "rows: 100,000,000 of pdm": r"/sensors/front/pdm has \d+ bytes .*, and the file holds \d+",
     "attribute: 24 MB of sensors/front": r"attribute 'firmware' of /sensors/front has 24000000 bytes; the limit is",
     "attribute: 5,000 of /": r"/ has 50\d\d attributes; the limit is 256",
-    "names: 5,000 sensors": r"5001 sensors; the limit is 4096",
+    "names: 5,000 sensors": r"5001 sensors; the limit is 1024",
     "names: the same rows under 201 names": r"has several names in the file",
     "names: sensor '..'": r"sensor name '..' cannot stand in a file",
     "settings: text of 262,145 bytes": r"settings holds \|S262145, wanted text of up to 262144 bytes",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.atomic import require_room
-from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.errors import DamagedError, DataError, ForeignDataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
 from ertis_numba.settings import Array, Recording, Settings
@@ -65,7 +65,7 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             told = None
             if "metadata" in file:
                 told = child(file, "metadata", h5py.Group).attrs.get("settings")
-    except DamagedError as error:
+    except (DamagedError, ForeignDataError) as error:
         raise DataError(f"{path}: {error}") from error
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(

@@ -13,13 +13,13 @@ import h5py
 import numpy as np
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
 from ertis_numba.settings import Settings
 from ertis_numba.storage.schema import TRUTH, Variable
 
 __all__ = ["child", "require_attributes", "require_variables", "sensors_of", "stored_bytes"]
 
-MAX_SENSORS: Final = 4096
+MAX_SENSORS: Final = 1024  # as a central node takes
 MAX_MEMBERS: Final = 256  # of a group: variables, and the scales of their axes
 MAX_ATTRIBUTES: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 65_536
@@ -41,23 +41,25 @@ def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
 
     Raises
     ------
+    ForeignDataError
+        It is a link to somewhere else, or has several names.
     DamagedError
-        It is a link to somewhere else, has several names, or is something else.
+        It is something else.
     KeyError
         There is none.
     """
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
-        raise DamagedError(
+        raise ForeignDataError(
             f"{_path(group, name)} is a link into the file {link.filename[:200]!r}; copy the data into one file"
         )
     if isinstance(link, h5py.SoftLink):
-        raise DamagedError(f"{_path(group, name)} is a link to {link.path[:200]!r}; copy the data to its place")
+        raise ForeignDataError(f"{_path(group, name)} is a link to {link.path[:200]!r}; copy the data to its place")
     found = group[name]
     if not isinstance(found, kind):
         raise DamagedError(f"{_path(group, name)} is a {type(found).__name__.lower()}, not a {kind.__name__.lower()}")
     if h5py.h5o.get_info(found.id).rc != 1:
-        raise DamagedError(f"{_path(group, name)} has several names in the file; copy the data to each place")
+        raise ForeignDataError(f"{_path(group, name)} has several names in the file; copy the data to each place")
     return found
 
 
@@ -110,8 +112,10 @@ def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
 
     Raises
     ------
+    ForeignDataError
+        A variable lies elsewhere or is compressed.
     DamagedError
-        A variable lies elsewhere, is not stored whole, is compressed, or has another type or number of axes.
+        A variable is not stored whole, or has another type or number of axes.
     """
     if len(group) > MAX_MEMBERS:
         raise DamagedError(f"{group.name} has {len(group)} members; the limit is {MAX_MEMBERS}")
@@ -167,15 +171,17 @@ def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int
 
     Raises
     ------
+    ForeignDataError
+        It is elsewhere or compressed.
     DamagedError
-        It is one of these.
+        It is not stored whole.
     """
     if dataset.is_virtual or dataset.external:
-        raise DamagedError(f"{dataset.name} lies in other files; copy the data into one file")
+        raise ForeignDataError(f"{dataset.name} lies in other files; copy the data into one file")
     stored, wanted = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize
     if dataset.id.get_create_plist().get_nfilters():
         if not may_be_filtered:
-            raise DamagedError(f"{dataset.name} is compressed or filtered; write it again without filters")
+            raise ForeignDataError(f"{dataset.name} is compressed or filtered; write it again without filters")
         stored *= MAX_COMPRESSION
     if stored < wanted:
         raise DamagedError(

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
@@ -90,6 +90,8 @@ def _is_journal(path: Path) -> bool:
 def _of_recording(path: Path, sensor: str) -> SensorReport:
     try:
         recording = open_recording(path, sensor=sensor)
+    except ForeignDataError:  # such a file was not written by this package: nothing of it is worth a look
+        raise
     except (ArgumentError, DataError) as error:
         return SensorReport(sensor=sensor, fault=str(error))
     damaged: list[Damage] = []
