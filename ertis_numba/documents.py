@@ -88,10 +88,13 @@ class Document(Table, frozen=True, kw_only=True):
         Names that keys had, and have now: recordings hold documents, and those of before stay readable.
     max_bytes : int
         Limit on the length of a document in UTF-8.
+    max_items : int
+        Limit on its lines and commas, which bound the time to parse it.
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
     max_bytes: ClassVar[int] = 16 * 2**20
+    max_items: ClassVar[int] = 2**20
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None, *, find_line: bool = True) -> Self:
@@ -134,6 +137,9 @@ class Document(Table, frozen=True, kw_only=True):
         n_bytes = len(text) if text.isascii() else len(text.encode("utf-8", "surrogatepass"))
         if n_bytes > cls.max_bytes:
             raise SettingsError(f"{source or cls.label()}: {n_bytes} bytes; the limit is {cls.max_bytes}")
+        n_items = text.count("\n") + text.count(",")
+        if n_items > cls.max_items:
+            raise SettingsError(f"{source or cls.label()}: {n_items} lines and commas; the limit is {cls.max_items}")
         found = _LONG_KEY.search(text)
         if found is not None:
             line = text.count("\n", 0, found.start()) + 1
