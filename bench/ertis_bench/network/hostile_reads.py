@@ -30,6 +30,7 @@ _MOST_S: Final = 20
 class _Read(NamedTuple):
     code: int
     took_s: float
+    cpu_s: float
     peak_bytes: int
     said: str
 
@@ -76,6 +77,7 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
                 "name": f"{command}: {each.name}",
                 "code": read.code,
                 "took_s": max(0.0, read.took_s - least.took_s),
+                "cpu_s": max(0.0, read.cpu_s - least.cpu_s),
                 "grew_mb": max(0.0, (read.peak_bytes - least.peak_bytes) / 1e6),
                 "said": read.said,
             }
@@ -98,7 +100,11 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
     traceback = any(line.startswith("Traceback (most") for line in lines)
     last = lines[-1] if lines else ""
     return _Read(
-        os.waitstatus_to_exitcode(status), took_s, 1024 * usage.ru_maxrss, "Traceback: " + last if traceback else last
+        os.waitstatus_to_exitcode(status),
+        took_s,
+        usage.ru_utime + usage.ru_stime,
+        1024 * usage.ru_maxrss,
+        "Traceback: " + last if traceback else last,
     )
 
 
@@ -141,6 +147,7 @@ def _summary(chosen: list[HostileFile], reads: list[dict[str, Any]]) -> dict[str
         "crashes": [f"{read['name']}: {read['code']}" for read in reads if read["code"] < 0],
         "slowest, s": round(slowest["took_s"], 3),
         "slowest": slowest["name"],
+        "slowest, s of CPU": round(max(read["cpu_s"] for read in reads), 3),
         "memory grew, MB": round(largest["grew_mb"], 1),
         "largest": largest["name"],
     }

@@ -109,7 +109,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "refused within 1 s, memory + < 200 MB",
         (
             "{reads:,} reads: taken: {taken all}; crashed: {crashes all}; with a traceback: {failed all}; slowest "
-            "{slowest, s:.2f} s, memory + {memory grew, MB:.0f} MB"
+            "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of a processor), memory + {memory grew, MB:.0f} MB"
         ),
     ),
     "overload": (
