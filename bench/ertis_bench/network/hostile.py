@@ -11,19 +11,18 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-import zmq
-
 from ertis_bench.network.faults_kills import judged
 from ertis_bench.network.hostile_hellos import HostileHello, hostile_hellos
 from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import Process, central, until
 from ertis_bench.network.sender import Job
+from ertis_bench.network.zmtp import Peer
 from ertis_numba.errors import DataError
 from ertis_numba.network import messages
 
 __all__ = ["files", "hellos"]
 
-_WAIT_MS: Final = 20_000
+_WAIT_S: Final = 20.0
 Found = dict[str, Any]
 
 
@@ -88,15 +87,14 @@ def _spread(given: list[HostileHello], count: int | None) -> list[HostileHello]:
 def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
     """Send hellos, one after the other, and return what became of each."""
     found: list[Found] = []
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.connect(address)
+    with Peer(address, timeout_s=_WAIT_S) as peer:
         for hello in given:
             begun_s = time.monotonic()
-            socket.send_multipart([hello.header, *hello.payload])
-            if not socket.poll(_WAIT_MS):
-                raise DataError(f"the central node does not answer to hello {hello.name!r} within {_WAIT_MS / 1e3:g} s")
-            answer = messages.decode(socket.recv_multipart()[0])
+            peer.send([hello.header, *hello.payload])
+            try:
+                answer = messages.decode(peer.receive()[0])
+            except OSError as error:
+                raise DataError(f"the central node does not answer to hello {hello.name!r} ({error})") from error
             took_s = round(time.monotonic() - begun_s, 3)
             found.append({"name": hello.name, "took_s": took_s, "refused": isinstance(answer, messages.Refused)})
     return found
