@@ -17,6 +17,7 @@ __all__ = [
     "finite_array",
     "gap",
     "interval",
+    "length",
     "positive",
     "sensor_name",
     "shape",
@@ -24,7 +25,7 @@ __all__ = [
 ]
 
 _REASON_BYTES = 64
-_SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")
+_SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 
 
 def finite(name: str, value: float) -> float:
@@ -71,6 +72,12 @@ def whole(name: str, value: int, low: int, high: int | None = None) -> int:
     return int(value)
 
 
+def length(name: str, value: str, most: int) -> None:
+    """Refuse a text of more than ``most`` characters."""
+    if len(value) > most:
+        raise ArgumentError(f"{name} has {len(value)} characters; the limit is {most}")
+
+
 def choice(name: str, value: object, known: Iterable[object]) -> None:
     """Refuse a ``value`` that is not among ``known``, naming the nearest one."""
     names = [str(item) for item in known]
@@ -99,7 +106,8 @@ def sensor_name(name: str) -> str:
     """Return the name of a sensor if it can be that of a group in a file."""
     if not _SENSOR_NAME.fullmatch(name):
         raise ArgumentError(
-            f"sensor name {name!r} cannot stand in a file; give letters, digits and _, after the first also . @ + -"
+            f"sensor name {name[:80]!r} cannot stand in a file; give letters, digits and _, after the first also "
+            ". @ + -; 255 at most"
         )
     return name
 

@@ -5,6 +5,7 @@ from typing import Final
 __all__ = [
     "ERTIS_PDM_RATE_HZ",
     "MAX_MICROPHONES",
+    "MAX_NAME_LENGTH",
     "STANDARD_HUMIDITY_PERCENT",
     "STANDARD_PRESSURE_PA",
     "STANDARD_TEMPERATURE_C",
@@ -20,4 +21,5 @@ ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
 SYNC_STEP_S: Final = 400e-9  # from one sensor of the SYNC chain to the next; Jansen et al., 2019
 
 MAX_MICROPHONES: Final = 1024
+MAX_NAME_LENGTH: Final = 4096  # characters of a name or path in settings, as PATH_MAX of Linux; HDF5 takes 65,536 bytes
 WORD_BITS: Final = (8, 16, 32, 64)

@@ -11,7 +11,7 @@ import reprlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_args, get_origin
+from typing import Any, ClassVar, Final, Literal, Self, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -19,10 +19,15 @@ import tomli_w
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, SettingsError
 
-__all__ = ["Document", "Table"]
+__all__ = ["MAX_KEY_PARTS", "Document", "Table"]
 
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
 _KEY = re.compile(r"\s*([\w.-]+)\s*=")
+MAX_KEY_PARTS: Final = 16
+"""Limit on the parts of a dotted key, such as 2 of ``call.duration_s``: the parser's time grows with their square."""
+
+_NAME = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_NAME}(?:[ \t]*+\.[ \t]*+{_NAME}){{{MAX_KEY_PARTS}}}")
 _PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
 _WANTED = {
@@ -81,27 +86,66 @@ class Document(Table, frozen=True, kw_only=True):
     ----------
     former_keys : dict of str to str
         Names that keys had, and have now: recordings hold documents, and those of before stay readable.
+    max_bytes : int
+        Limit on the length of a document in UTF-8.
+    max_items : int
+        Limit on its lines and commas, which bound the time to parse it.
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
+    max_bytes: ClassVar[int] = 16 * 2**20
+    max_items: ClassVar[int] = 2**20
 
     @classmethod
-    def from_toml(cls, text: str, source: str | None = None) -> Self:
-        """Read a document; ``source``, such as its path, names it in errors.
+    def from_toml(cls, text: str, source: str | None = None, *, find_line: bool = True) -> Self:
+        """Read a document.
+
+        Parameters
+        ----------
+        text : str
+        source : str, optional
+            Name of the document in errors, such as its path.
+        find_line : bool
+            Name the line of an error. That parses the text several times, so leave it out for text that nobody edits.
 
         Raises
         ------
         SettingsError
-            The text is not TOML, has unknown keys, or a value cannot be used.
+            The text is not TOML, has unknown keys, is too long, or a value cannot be used.
         """
+        cls._require_size(text, source)
         text = cls._renamed(text)
         try:
             return msgspec.toml.decode(text, type=cls)
         except msgspec.ValidationError as error:
-            line = _line_to_blame(cls, text, error)
+            line = _line_to_blame(cls, text, error) if find_line else 0
             raise SettingsError(_told(cls, source, error, f", line {line}" if line else "")) from error
         except msgspec.DecodeError as error:  # a syntax error, which names its line itself
             raise SettingsError(_told(cls, source, error)) from error
+        except RecursionError as error:
+            raise SettingsError(
+                f"{source or cls.label()}: lists or tables are nested too deeply; flatten them"
+            ) from error
+        except ValueError as error:  # a number of thousands of digits
+            raise SettingsError(
+                f"{source or cls.label()}: {' '.join(str(error).split())}; give a shorter number"
+            ) from error
+
+    @classmethod
+    def _require_size(cls, text: str, source: str | None) -> None:
+        """Refuse text that would take the parser long."""
+        n_bytes = len(text) if text.isascii() else len(text.encode("utf-8", "surrogatepass"))
+        if n_bytes > cls.max_bytes:
+            raise SettingsError(f"{source or cls.label()}: {n_bytes} bytes; the limit is {cls.max_bytes}")
+        n_items = text.count("\n") + text.count(",")
+        if n_items > cls.max_items:
+            raise SettingsError(f"{source or cls.label()}: {n_items} lines and commas; the limit is {cls.max_items}")
+        found = _LONG_KEY.search(text)
+        if found is not None:
+            line = text.count("\n", 0, found.start()) + 1
+            raise SettingsError(
+                f"{source or cls.label()}, line {line}: a dotted key has more than {MAX_KEY_PARTS} parts; give fewer"
+            )
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -206,8 +250,7 @@ def _told(kind: type[Document], source: str | None, error: msgspec.MsgspecError,
 def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationError) -> int:
     """Return the number of the line that an error is about, counted from 1.
 
-    That is the first line up to which the text errs in this way, or the one of the same table whose key the error
-    names.
+    That is the line in the erring table whose key the error names, or the first line of the table; 0 if there is none.
     """
     lines = text.splitlines()
     starts = [1, *(n for n, line in enumerate(lines, 1) if n > 1 and _HEADER.match(line))]
@@ -215,12 +258,11 @@ def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationErr
     # Tables are read one after the other, and what errs once keeps erring: the first one is found by halves.
     table = bisect.bisect_left(stops[:-1], x=True, key=lambda stop: _error(kind, lines[: stop - 1]) == str(error))
     begin, stop = starts[table], stops[table]
-    end = next((n for n in range(begin, stop) if _error(kind, lines[:n]) == str(error)), stop - 1)
     told, _, path = str(error).partition(" - at `$")
     named = {*re.findall(r"\w+", told.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
     keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
     is_table = bool(lines and _HEADER.match(lines[begin - 1]))
-    return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else end)
+    return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else 0)
 
 
 def _error(kind: type[Document], lines: list[str]) -> str:

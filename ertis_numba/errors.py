@@ -7,6 +7,7 @@
     │   └── SettingsError                a settings file or structure cannot be used
     ├── DataError (ValueError)           a file or measurement does not hold what it should
     │   ├── DamagedError                 it is not what was written, and never will be
+    │   ├── ForeignDataError             a file points into other files, or to one place by several names
     │   ├── FormatVersionError           a file was written by a newer version
     │   ├── InUseError                   a journal belongs to another process
     │   └── NoRoomError                  a disk is too full, and nothing was written
@@ -25,6 +26,7 @@ __all__ = [
     "DataError",
     "DeviceError",
     "ErtisError",
+    "ForeignDataError",
     "FormatVersionError",
     "InUseError",
     "NetworkError",
@@ -54,6 +56,10 @@ class DataError(ErtisError, ValueError):
 
 class DamagedError(DataError):
     """What is in a file is not what was written; to read it again, as after a fault of the disk, does not help."""
+
+
+class ForeignDataError(DataError):
+    """A file points into other files, or to one place by several names, which no file of this package does."""
 
 
 class FormatVersionError(DataError):

@@ -14,6 +14,7 @@ from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.memory import require_memory
 from ertis_numba.words import word_format
 
 __all__ = ["Pipeline"]
@@ -37,6 +38,8 @@ class Pipeline:
         Error that the images may have; that of ``settings.accuracy`` by default.
     graphs : bool
         Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
+    max_bytes : int, optional
+        Limit on the memory, predicted before any of it is taken; that of a plan's tables alone is 2 GiB by default.
 
     Attributes
     ----------
@@ -52,8 +55,8 @@ class Pipeline:
     Raises
     ------
     ArgumentError
-        The settings name a layout, grid or range that cannot be used, no plan keeps the error, or the device is
-        unknown or has no graphs.
+        The settings name a layout, grid or range that cannot be used, no plan keeps the error or the limit on memory,
+        or the device is unknown or has no graphs.
     DeviceError
         The device cannot be used here, or has too little memory.
 
@@ -73,7 +76,9 @@ class Pipeline:
         *,
         max_error_db: float | str | None = None,
         graphs: bool = False,
+        max_bytes: int | None = None,
     ) -> None:
+        left_bytes = None if max_bytes is None else require_memory(settings, max_bytes)
         if isinstance(max_error_db, str):
             checks.choice("max_error_db", max_error_db, ERROR_PRESETS_DB)
             max_error_db = ERROR_PRESETS_DB[max_error_db]
@@ -88,7 +93,7 @@ class Pipeline:
             )
         if max_error_db is not None:
             settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=float(max_error_db)))
-        settings = planner.complete(settings, kernel_set, threads=threads)
+        settings = planner.complete(settings, kernel_set, threads=threads, max_bytes=left_bytes)
         self.settings = settings
         self.device = kernel_set.device
         self._accepted = settings

@@ -63,7 +63,7 @@ class Taken:
     def greet(self, peer=b"a", *, settings=TINY, epoch=EPOCH, key="", first=0):
         text = settings.to_toml().encode()
         hello = Hello(sensor="left", epoch=epoch, next_sequence=first, settings_crc32=zlib.crc32(text))
-        return self.intake.greet(peer, hello, [text], key)
+        return self.intake.greet(peer, hello, self.intake.read(hello, [text]), key)
 
     def measure(self, *given):
         for entry in given:

@@ -5,6 +5,7 @@ import json
 import os
 import stat
 import threading
+from pathlib import Path
 
 import pytest
 import zmq
@@ -434,3 +435,56 @@ def test_half_of_the_keys_is_refused(folder, key, server_key):
 def test_a_list_without_a_key_is_refused(tmp_path):
     with pytest.raises(Exception, match="give --key, too"):
         _network.server_keys(None, tmp_path / "allow.toml")
+
+
+def _as_somebody_elses(monkeypatch, path):
+    """Have a file belong to another user."""
+    if os.geteuid() == 0:
+        os.lchown(path, 12345, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+
+
+def test_a_list_of_another_user_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "allow.toml"
+    AllowList().allow(_permission()).save(path)
+    _as_somebody_elses(monkeypatch, path)
+    with pytest.raises(SettingsError, match=r"others may change .*\(owned by user \d+\); run 'chown"):
+        AllowList.load(path)
+
+
+def test_a_secret_of_another_user_is_refused(tmp_path, monkeypatch):
+    secret, _ = PAIR.save(tmp_path / "keys")
+    _as_somebody_elses(monkeypatch, secret)
+    with pytest.raises(SettingsError, match=r"holds a secret and others may change .*\(owned by user \d+\)"):
+        KeyPair.load(secret)
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_a_list_behind_links_into_a_folder_that_others_may_change_is_refused(tmp_path, depth):
+    """Also where the link leads on to one that leads back to a safe place: somebody may put another there."""
+    (tmp_path / "open").mkdir()
+    (tmp_path / "own").mkdir()
+    AllowList().allow(_permission()).save(tmp_path / "open" / "allow.toml")
+    AllowList().allow(_permission()).save(tmp_path / "own" / "real.toml")
+    if depth == 2:
+        (tmp_path / "open" / "allow.toml").unlink()
+        (tmp_path / "open" / "allow.toml").symlink_to(tmp_path / "own" / "real.toml")
+    (tmp_path / "open").chmod(0o777)
+    link = tmp_path / "own" / "allow.toml"
+    link.symlink_to(Path("..") / "open" / "allow.toml")
+    with pytest.raises(SettingsError, match=rf"others may change {tmp_path / 'open'} \(mode 0777\); run 'chmod go-w"):
+        AllowList.load(link)
+    (tmp_path / "open").chmod(0o755)
+    assert AllowList.load(link).keys == (_permission(),)
+
+
+def test_a_list_below_a_folder_that_others_may_change_is_refused(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    path = tmp_path / "a" / "b" / "allow.toml"
+    AllowList().save(path)
+    (tmp_path / "a").chmod(0o777)
+    with pytest.raises(SettingsError, match=rf"others may change {tmp_path / 'a'} \(mode 0777\)"):
+        AllowList.load(path)
+    (tmp_path / "a").chmod(0o1777)  # as /tmp is: nobody can take away what is another's
+    AllowList.load(path)

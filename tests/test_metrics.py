@@ -1,5 +1,6 @@
 """Metrics as Prometheus reads them, over HTTP, and log lines."""
 
+import http.client
 import io
 import json
 import logging
@@ -121,3 +122,31 @@ def test_what_is_below_the_level_is_not_shown(lines):
     log.logger("central_node").info("joined", sensor="front")
     log.logger("central_node").debug("turn")
     assert not stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("host", "code"),
+    [
+        ("localhost", 200),
+        ("LOCALHOST:1", 200),
+        ("127.0.0.1:9101", 200),
+        ("[::1]:9101", 200),
+        ("evil.example", 421),
+        ("evil.example:9101", 421),
+        ("127.0.0.1.evil.example", 421),
+        ("localhost.evil.example", 421),
+        ("192.168.0.7", 421),
+        ("", 421),
+        ("localhost, evil.example", 421),
+    ],
+)
+def test_metrics_are_served_to_loopback_hosts_only(host, code):
+    with Metrics("127.0.0.1:0", lambda: BUSY) as metrics:
+        connection = http.client.HTTPConnection(metrics.address, timeout=10)
+        connection.putrequest("GET", "/metrics", skip_host=True)
+        connection.putheader("Host", host)
+        connection.endheaders()
+        answer = connection.getresponse()
+        text = answer.read()
+    assert answer.status == code
+    assert (b"ertis_node" in text) == (code == 200)

@@ -154,9 +154,7 @@ def test_settings_that_cannot_be_used(path):
     with h5py.File(path, "r+") as file:
         text = file[f"{GROUP}/settings"]
         text[()] = text[()].replace(b"duration_s = 0.0025", b"duration_s = nan")
-    with pytest.raises(
-        DataError, match=r"rec.h5: settings, line \d+, call: call.duration_s is nan; give a finite number"
-    ):
+    with pytest.raises(DataError, match=r"rec.h5: settings, call: call.duration_s is nan; give a finite number"):
         open_recording(path)
 
 
@@ -212,7 +210,7 @@ def test_scalar_words_are_refused(tmp_path):
         (group,) = file["sensors"].values()
         del group["pdm"]
         group["pdm"] = 1
-    with pytest.raises(DataError, match="damaged or cut short"):
+    with pytest.raises(DataError, match=r"pdm has shape \(\), wanted \(time, sample, word\)"):
         open_recording(path)
 
 

@@ -26,7 +26,8 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
 
     A capture that was interrupted leaves a journal, in which is every measurement that it told to be stored. Its
     recording gets the name it was to have, and the journal goes; one that a running capture uses is left alone. In a
-    folder, all files named *.journal are taken. The exit code is 1 if a journal could not be sealed, and 3 if
+    folder, all files named *.journal are taken. Where no recording can hold a sensor, the others are sealed and the
+    journal is kept, with a name that ends in .refused. The exit code is 1 if something could not be sealed, and 3 if
     measurements that were stored are damaged or lost.
     """
     journals = [journal for place in places for journal in _found(place)]
@@ -36,9 +37,13 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
     for journal in journals:
         report = _seal(journal, force=force, quiet=quiet)
         reports.append(report)
-        if _failed(report):
+        if report.get("refused"):
+            click.echo(f"ertis: error: {_refusal(report)}", err=True)
+        elif _failed(report):
             click.echo(f"ertis: error: {report['error']}", err=True)
-        elif report.get("lost") or report.get("damage"):
+        if "error" in report and _failed(report):
+            continue
+        if report.get("lost") or report.get("damage"):
             click.echo(f"ertis: warning: {_told(report)}", err=True)
         else:
             options.say(_told(report), quiet=quiet)
@@ -79,13 +84,21 @@ def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
 
 
 def _failed(report: dict[str, Any]) -> bool:
-    return "error" in report and not report.get("in_use")
+    return bool(report.get("refused")) or ("error" in report and not report.get("in_use"))
+
+
+def _refusal(report: dict[str, Any]) -> str:
+    """Return why sensors of a journal are not in its recording, in a line."""
+    reasons = "; ".join(f"no recording can hold sensor {name} ({why})" for name, why in report["refused"].items())
+    return f"{report['journal']}: {reasons}; the journal is kept as {report['set_aside']}"
 
 
 def _told(report: dict[str, Any]) -> str:
     """Return what became of a journal, in a line."""
     if "error" in report:
         return f"{report['journal']}: in use by a running capture; left alone"
+    if report["recording"] is None and report["refused"]:
+        return f"{report['journal']}: kept as {report['set_aside']}"
     if report["recording"] is None:
         return f"{report['journal']}: no measurement was captured; removed"
     told = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]

@@ -150,6 +150,7 @@ def _below(now: "Status") -> Iterator[str]:
     archive, processing = now.archive, now.processing
     if archive is not None:
         failed = f", {archive.sealing_failed} not sealed" if archive.sealing_failed else ""
+        failed += f", {archive.set_aside} set aside" if archive.set_aside else ""
         yield (
             f"archive {archive.folder}: {_writing(archive, fault=bool(now.fault))}, {archive.sealed} sealed, "
             f"{archive.sealing} to seal{failed}"

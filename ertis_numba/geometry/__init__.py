@@ -6,26 +6,30 @@ taken from the centroid of the enabled microphones.
 
 from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad
 from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
-from ertis_numba.geometry.grids import PAPER_GRIDS, Grid, direction_grid
+from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count
 from ertis_numba.geometry.layouts import Layout, layout_names, load_layout, microphones, self_contained, storable
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
+from ertis_numba.geometry.received import received_settings
 
 __all__ = [
     "ALONE_RAD",
     "FAR",
+    "MAX_DIRECTIONS",
     "PAPER_GRIDS",
     "Grid",
     "Layout",
     "azimuth_columns",
     "direction_grid",
     "far_field_delays",
+    "grid_count",
     "is_closed",
     "layout_names",
     "load_layout",
     "microphones",
     "mounting",
     "reach_rad",
+    "received_settings",
     "self_contained",
     "spacing_rad",
     "spherical_delays",

@@ -13,7 +13,10 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.settings import Processing
 
-__all__ = ["PAPER_GRIDS", "Grid", "direction_grid"]
+__all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_count"]
+
+MAX_DIRECTIONS = 1_000_000
+"""Limit on the directions of a grid."""
 
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
@@ -37,6 +40,31 @@ class Grid:
 
     def __len__(self) -> int:
         return len(self.azimuth_rad)
+
+
+def grid_count(name: str) -> int | None:
+    """Return the number of directions of a named grid; None where the name is the path of a file.
+
+    Parameters
+    ----------
+    name : str
+        As `Processing.directions`.
+
+    Raises
+    ------
+    ArgumentError
+        The count is missing or out of range.
+    """
+    head, colon, count = PAPER_GRIDS.get(name, (name,))[0].partition(":")
+    if head not in {"2d", "3d"} or not colon:
+        return None
+    if not (count.isascii() and count.isdecimal()):
+        raise ArgumentError(f"directions {name[:80]!r} has no count; give for instance {head}:181")
+    if len(count.lstrip("0")) > len(str(MAX_DIRECTIONS)):  # Python refuses to convert some thousand digits
+        raise ArgumentError(
+            f"directions {name[:80]!r} has a count of {len(count)} digits; give {MAX_DIRECTIONS} at most"
+        )
+    return checks.whole(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
 
 
 def direction_grid(processing: Processing) -> Grid:
@@ -63,15 +91,12 @@ def direction_grid(processing: Processing) -> Grid:
     kind, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
         name, (name, processing.azimuth_limits_deg, processing.elevation_limits_deg)
     )
-    head, colon, count = kind.partition(":")
-    if head in {"2d", "3d"} and colon:
-        if not count.isdecimal():
-            raise ArgumentError(f"directions {name!r} has no count; give for instance {head}:181")
-        n_directions = checks.whole(f"count of directions {name!r}", int(count), 1, 1_000_000)
-        if head == "2d":
-            return _planar_grid(n_directions, azimuth_deg)
-        return _equal_area_grid(n_directions, azimuth_deg, elevation_deg)
-    return _csv_grid(name)
+    n_directions = grid_count(name)
+    if n_directions is None:
+        return _csv_grid(name)
+    if kind.startswith("2d:"):
+        return _planar_grid(n_directions, azimuth_deg)
+    return _equal_area_grid(n_directions, azimuth_deg, elevation_deg)
 
 
 def _planar_grid(n_directions: int, limits_deg: tuple[float, float]) -> Grid:

@@ -13,6 +13,7 @@ from ertis_numba import checks
 from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
+from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
 
 __all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable"]
@@ -225,7 +226,7 @@ def storable(settings: Settings) -> Settings:
     ArgumentError
         The directions are those of a file, or the layout cannot be used.
     """
-    if settings.processing.directions.lower().endswith(".csv"):
+    if grid_count(settings.processing.directions) is None:
         raise ArgumentError(
             f"processing.directions is the file {settings.processing.directions}, which a recording cannot hold; "
             "name a grid, and give the file when processing"

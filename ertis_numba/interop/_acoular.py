@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.atomic import require_room
-from ertis_numba.errors import DataError
+from ertis_numba.errors import DamagedError, DataError, ForeignDataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import Layout, microphones, self_contained
+from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.stages.signals import signals_of
+from ertis_numba.storage.structure import child, require_attributes, stored_bytes
 
 __all__ = ["read_acoular", "write_acoular"]
 
@@ -56,9 +57,16 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     """
     try:
         with h5py.File(path, "r") as file:
-            numbers = np.asarray(file["time_data"][()])
-            rates_hz = np.asarray(file["time_data"].attrs["sample_freq"], dtype=np.float64)
-            told = file["metadata"].attrs.get("settings") if "metadata" in file else None
+            data = child(file, "time_data", h5py.Dataset)
+            require_attributes(data)
+            stored_bytes(data, may_be_filtered=True)
+            numbers = np.asarray(data[()])
+            rates_hz = np.asarray(data.attrs["sample_freq"], dtype=np.float64)
+            told = None
+            if "metadata" in file:
+                told = child(file, "metadata", h5py.Group).attrs.get("settings")
+    except (DamagedError, ForeignDataError) as error:
+        raise DataError(f"{path}: {error}") from error
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
             f"{path} holds no time_data with a sample_freq; give a file of Acoular, or a recording to 'ertis process'"
@@ -72,7 +80,7 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             f"{path}: time_data is {numbers.dtype} of shape {numbers.shape}; give floating or signed numbers of shape "
             "(sample, channel)"
         )
-    return rate_hz, numbers, None if told is None else _of_signals(Settings.from_toml(str(told), str(path)), rate_hz)
+    return rate_hz, numbers, None if told is None else _of_signals(received_settings(str(told), str(path)), rate_hz)
 
 
 def _of_signals(settings: Settings, rate_hz: float) -> Settings:

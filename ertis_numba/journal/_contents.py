@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
 from ertis_numba.journal._tables import WHOLE_VERSION, selection
@@ -46,6 +46,7 @@ class Contents:
         self._turn = threading.RLock()
         self._sensors: dict[str, Sensor] = {}
         self._ids: dict[str, int] = {}
+        self._unusable: dict[int, tuple[str, str, int]] = {}  # name, reason and measurements, by number
         self._last: dict[tuple[str, int], int] = {}
         self._n_entries = self._held_bytes = 0
         self._identity = 0
@@ -58,22 +59,30 @@ class Contents:
         self.target = self.path.parent / _own_name(self.path.name, os.fsdecode(target))
         self._identity = rows[0][-1]
         for row in self._database.execute(selection("sensors", "ORDER BY id")):
-            self._know(row[0], Sensor.from_row(self.path, row))
+            try:
+                self._know(row[0], Sensor.from_row(self.path, row))
+            except DamagedError:
+                raise
+            except (ArgumentError, DataError) as error:  # the settings of one sensor must not lock up the others
+                self._unusable[row[0]] = row[1], str(error), 0
         names = {number: name for name, number in self._ids.items()}
         counts = self._database.execute(
             "SELECT sensor, epoch, max(sequence), count(*) FROM measurements INDEXED BY key GROUP BY sensor, epoch"
         )
         for number, epoch, last, count in counts:
+            if number in self._unusable:
+                name, reason, before = self._unusable[number]
+                self._unusable[number] = name, reason, before + count
+                continue
             if number not in names:
                 raise DamagedError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
             self._last[names[number], epoch] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
-        n_rows = self._count_rows()
-        if n_rows != self._n_entries:
+        n_rows, n_listed = self._count_rows(), self._n_entries + sum(count for *_, count in self._unusable.values())
+        if n_rows != n_listed:
             raise DamagedError(
-                f"{self.path} is damaged, it lists {self._n_entries} measurements and has {n_rows}; copy it again if "
-                "you can"
+                f"{self.path} is damaged, it lists {n_listed} measurements and has {n_rows}; copy it again if you can"
             )
 
     def _count_rows(self) -> int:
@@ -89,7 +98,7 @@ class Contents:
             try:
                 rows = self._database.execute("SELECT count(*) FROM measurements NOT INDEXED")
             except DamagedError:  # of some pages; who reads what is in them is told so, and the others are sound
-                return self._n_entries
+                return self._n_entries + sum(count for *_, count in self._unusable.values())
         return int(rows[0][0])
 
     @property
@@ -98,13 +107,22 @@ class Contents:
         return MappingProxyType(self._sensors)
 
     @property
+    def unusable(self) -> Mapping[str, tuple[str, int]]:
+        """Sensors whose settings this version cannot use, by name: the reason, and the number of measurements."""
+        return MappingProxyType({name: (reason, count) for name, reason, count in self._unusable.values()})
+
+    @property
     def gaps(self) -> tuple[Gap, ...]:
         """What was noted to be missing, in that order."""
         with self._turn:
             rows = self._database.execute(selection("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
         made = (checked(self.path, "a gap", row) for row in rows)
-        return tuple(Gap(names[number], first, last, why, epoch) for number, epoch, first, last, why in made)
+        return tuple(
+            Gap(names[number], first, last, why, epoch)
+            for number, epoch, first, last, why in made
+            if number not in self._unusable
+        )
 
     def index(self, sensor: str | None = None) -> list[Key]:
         """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
@@ -115,7 +133,7 @@ class Contents:
                 (number,),
             )
         names = {number: name for name, number in self._ids.items()}
-        return sorted(Key(place, names[number], *rest) for place, number, *rest in rows)
+        return sorted(Key(place, names[number], *rest) for place, number, *rest in rows if number not in self._unusable)
 
     def newest(self, n_most: int) -> list[tuple[str, int, int, int]]:
         """Return sensor, epoch, number and CRC-32 of the measurements that came last; their words are not read."""

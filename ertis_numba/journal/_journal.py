@@ -221,7 +221,7 @@ class Journal(Contents):
                 raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor a name of its own")
             with self._database.transaction():
                 self._insert("sensors", made.row())
-            self._know(len(self._ids) + 1, made)
+            self._know(len(self._ids) + len(self._unusable) + 1, made)
 
     def append(self, entries: Sequence[Entry]) -> None:
         """Make measurements durable: when this returns they are, all of them; when it raises, none is there.
@@ -419,8 +419,13 @@ class Journal(Contents):
                 self.close()
             sync(self.path.parent)
 
-    def set_aside(self) -> Path:
+    def set_aside(self, end: str = "damaged") -> Path:
         """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that.
+
+        Parameters
+        ----------
+        end : str
+            Another end of the name.
 
         Raises
         ------
@@ -430,10 +435,10 @@ class Journal(Contents):
         with self._turn:
             try:
                 self._release()
-                number, aside = 1, self.path.with_name(f"{self.path.name}.damaged")
+                number, aside = 1, self.path.with_name(f"{self.path.name}.{end}")
                 while aside.exists():
                     number += 1
-                    aside = self.path.with_name(f"{self.path.name}.{number}.damaged")
+                    aside = self.path.with_name(f"{self.path.name}.{number}.{end}")
                 self.tally.remove()
                 self.path.rename(aside)
             finally:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.geometry import mounting, self_contained, storable
+from ertis_numba.geometry import mounting, received_settings, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
 from ertis_numba.settings import Air, Settings
 from ertis_numba.words import word_format
@@ -138,7 +138,7 @@ class Sensor:
         """Return what stands in the table of a journal."""
         name, text, firmware, *place = checked(path, "a sensor", row)
         try:
-            settings = Settings.from_toml(text, f"{path}: settings of sensor {name}")
+            settings = received_settings(text, f"{path}: settings of sensor {name}")
         except SettingsError as error:
             raise DataError(str(error)) from error
         return cls.of(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 from typing import IO, Any
@@ -35,11 +35,13 @@ class Sealed:
     damaged : int
         … were damaged in the journal.
     set_aside : Path or None
-        Where the journal is now, if measurements in it are damaged; it is gone otherwise.
+        Where the journal is now, if measurements in it are damaged or refused; it is gone otherwise.
     lost : int
         Of those missing, measurements that were stored and that a damaged log of the journal has lost.
     damage : str
         Losses from a damaged log that are no gaps of the recording; empty in general.
+    refused : dict of str to str
+        Sensors whose measurements no recording can hold, and the reasons.
     """
 
     journal: Path
@@ -50,20 +52,23 @@ class Sealed:
     set_aside: Path | None = None
     lost: int = 0
     damage: str = ""
+    refused: dict[str, str] = field(default_factory=dict)
 
     @property
     def remark(self) -> str:
         """What is not as its user would expect, in a line; empty where all is well."""
-        if self.recording is None:
+        if self.recording is None and not self.refused:
             return f"{self.journal}: no measurement was captured"
         told = []
         if self.lost or self.damage:
             told.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
         if self.damage:
             told.append(f"also lost: {self.damage}")
+        if self.damaged:
+            told.append("1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged")
+        told += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
         if self.set_aside is not None:
-            number = "1 measurement is" if self.damaged == 1 else f"{self.damaged} measurements are"
-            told += [f"{number} damaged", f"the journal is kept as {self.set_aside}"]
+            told.append(f"the journal is kept as {self.set_aside}")
         return "; ".join(told)
 
 

@@ -6,7 +6,16 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["DEFAULT_LISTEN", "DEFAULT_PUBLISH", "at_port", "endpoint", "host_of", "is_loopback", "require_keys"]
+__all__ = [
+    "DEFAULT_LISTEN",
+    "DEFAULT_PUBLISH",
+    "at_port",
+    "endpoint",
+    "host_of",
+    "is_loopback",
+    "is_own_host",
+    "require_keys",
+]
 
 DEFAULT_LISTEN: Final = "tcp://127.0.0.1:5601"
 """Where sensor nodes find a central node."""
@@ -14,6 +23,7 @@ DEFAULT_PUBLISH: Final = "tcp://127.0.0.1:5602"
 """Where applications find it."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*):(\*|[0-9]{1,5})", re.ASCII)
+_HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(?::[0-9]{1,5})?", re.ASCII)
 
 
 def endpoint(text: str) -> str:
@@ -63,6 +73,23 @@ def is_loopback(endpoint: str) -> bool:
     except ValueError:
         return False
     return address == ipaddress.IPv6Address("::1") or (address.version == 4 and address.is_loopback)
+
+
+def is_own_host(given: str, host: str) -> bool:
+    """Whether the Host of an HTTP request is a loopback name or address, or the host that a server was given.
+
+    Parameters
+    ----------
+    given : str
+        As the request has it, with or without a port.
+    host : str
+        Of the server, without brackets.
+    """
+    found = _HTTP_HOST.fullmatch(given)
+    if found is None:
+        return False
+    bare = found[1].lower().strip("[]").removesuffix(".")
+    return bare == host.lower() or is_loopback(f"tcp://[{bare}]:0" if ":" in bare else f"tcp://{bare}:0")
 
 
 def require_keys(endpoint: str, *, keys: object | None) -> None:

@@ -23,7 +23,7 @@ class Checked(Document, frozen=True, kw_only=True):
     check: str = ""
 
     @classmethod
-    def from_toml(cls, text: str, source: str | None = None) -> Self:
+    def from_toml(cls, text: str, source: str | None = None, *, find_line: bool = True) -> Self:
         """Read a document and compare its checksum, if it has one.
 
         Raises
@@ -33,7 +33,7 @@ class Checked(Document, frozen=True, kw_only=True):
         """
         if not text.strip():
             raise SettingsError(f"{source or cls.label()} is empty; copy it again, or make it anew by 'ertis keys'")
-        read = super().from_toml(text, source)
+        read = super().from_toml(text, source, find_line=find_line)
         made = read.replace(check="")
         if read.check and read.check != _crc32(made):
             raise SettingsError(

@@ -12,7 +12,7 @@ from zmq.utils import z85
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.network.checked import Checked
-from ertis_numba.network.own_files import OTHERS, mode_of, private_folder, write
+from ertis_numba.network.own_files import OTHERS, mode_of, private_folder, require_own, write
 
 __all__ = ["ClientKeys", "KeyPair", "ServerKeys", "default_folder", "public_key", "require_key", "require_name"]
 
@@ -99,6 +99,7 @@ class KeyPair:
                 f"{path} holds a secret and others may use its folder (mode {folder_mode:04o}); "
                 f"run 'chmod 700 {path.parent}', or move it to a folder of its own"
             )
+        require_own(path, "holds a secret")
         read = _Secret.load(path)
         try:
             return cls(read.public, read.secret, read.name)

@@ -1,6 +1,6 @@
 """How a central node is, for Prometheus."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -10,6 +10,7 @@ from ertis_numba.network.status import Percentiles, Status
 
 if TYPE_CHECKING:
     import threading
+    from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
     from prometheus_client.core import Metric
 
@@ -36,6 +37,8 @@ _NOW_OF_SENSOR: Final = {
 
 class Metrics:
     """Serves the status of a central node as metrics, over HTTP and on this machine only.
+
+    Requests whose Host is not a loopback name or address are refused with 421.
 
     ::
 
@@ -90,6 +93,7 @@ class Metrics:
         registry.register(self)
         try:
             self._server, self._thread = start_http_server(int(self._port), addr=self._host, registry=registry)
+            self._server.set_app(_of_own_hosts(self._server.get_app(), self._host))
         except OSError as error:
             raise NetworkError(
                 f"{self.address} cannot be served at ({error.strerror}); give another address"
@@ -166,7 +170,7 @@ class Metrics:
         if archive is not None:
             for field in ("journal_bytes", "free_bytes", "room_bytes", "sealing"):
                 yield gauge(f"archive_{field}", f"Archive: {field}", {(): getattr(archive, field)})
-            for field in ("sealed", "sealing_failed"):
+            for field in ("sealed", "sealing_failed", "set_aside"):
                 yield counter(f"archive_{field}", f"Recordings: {field}", {(): getattr(archive, field)})
             for field in ("commit", "ack"):
                 rows = {(q,): s for q, s in _quantiles(getattr(archive, field))}
@@ -179,6 +183,22 @@ class Metrics:
             yield gauge("process_seconds", "Time of a measurement in a worker, of the latest", rows, "quantile")
             yield gauge("subscribers", "Applications that are there", {(): len(processing.subscribers)})
             yield counter("groups", "Groups of simultaneous measurements", _by(processing.groups), "kind")
+
+
+def _of_own_hosts(app: "WSGIApplication", host: str) -> "WSGIApplication":
+    """Return an application that refuses requests to other host names, which a page of another site may let lead here.
+
+    A browser that fetches from ``evil.example`` names it as Host, even if that name has the address of this machine.
+    """
+
+    def guarded(environ: "WSGIEnvironment", start_response: "StartResponse") -> "Iterable[bytes]":
+        if addresses.is_own_host(environ.get("HTTP_HOST", ""), host):
+            return app(environ, start_response)
+        text = b"This host name is not served here. Use localhost or a loopback address.\n"
+        start_response("421 Misdirected Request", [("Content-Type", "text/plain"), ("Content-Length", str(len(text)))])
+        return [text]
+
+    return guarded
 
 
 def _by(counts: dict[str, int]) -> dict[tuple[str, ...], float]:

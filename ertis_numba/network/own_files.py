@@ -1,8 +1,10 @@
 """Files that only their owner may read or change."""
 
+import errno
 import os
 import stat
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +24,7 @@ OTHERS: Final = 0o077
 """What a mode must not have where nobody else may use a file."""
 
 _OTHERS_WRITE: Final = 0o022
+_MAX_LINKS: Final = 40  # that a path leads through, as on Linux
 
 
 def private_folder(folder: Path) -> Path:
@@ -38,21 +41,68 @@ def private_folder(folder: Path) -> Path:
     return folder
 
 
-def require_own(path: Path) -> None:
-    """Refuse a list of keys that others on this machine may change, by itself or by another in its place.
+def require_own(path: Path, about: str = "says who is let in") -> None:
+    """Refuse a file that others on this machine may change, by itself or by another in its place.
+
+    Others are all users but this one and root. Each link on the way is followed, and each folder that it leads through
+    is looked at, as StrictModes of OpenSSH does with the folders above ``authorized_keys``.
+
+    Parameters
+    ----------
+    path : Path
+    about : str
+        What the file is for, in errors.
 
     Raises
     ------
     SettingsError
         They may.
+    OSError
+        There is no such file.
     """
-    for where, what in ((path, "it"), (path.parent, "its folder")):
-        mode = mode_of(where)
-        if mode & _OTHERS_WRITE and not mode & stat.S_ISVTX:
+    if os.name != "posix":
+        return
+    folders, links, file = _way_to(path)
+    for where in (*links, *folders, file):
+        status = where.lstat()
+        given = path.absolute()
+        what = "it" if where in (file, given) else "its folder" if where == given.parent else str(where)
+        if status.st_uid not in (0, os.geteuid()):
             raise SettingsError(
-                f"{path} says who is let in and others may change {what} (mode {mode:04o}); "
+                f"{path} {about} and others may change {what} (owned by user {status.st_uid}); "
+                f"run 'chown {os.geteuid()} {where}', and look at what it says"
+            )
+        mode = stat.S_IMODE(status.st_mode)
+        is_kept = where in links or (where in folders and mode & stat.S_ISVTX)  # others cannot put another in its place
+        if mode & _OTHERS_WRITE and not is_kept:
+            raise SettingsError(
+                f"{path} {about} and others may change {what} (mode {mode:04o}); "
                 f"run 'chmod go-w {where}', and look at what it says"
             )
+
+
+def _way_to(path: Path) -> tuple[list[Path], list[Path], Path]:
+    """Return the folders and the links that a path leads through, and where it ends."""
+    folders: dict[Path, None] = {}
+    links: dict[Path, None] = {}
+    here, left, n_followed = Path("/"), deque(path.absolute().parts[1:]), 0
+    while left:
+        folders[here] = None
+        part = left.popleft()
+        if part == "..":
+            here = here.parent
+            continue
+        here /= part
+        if not here.is_symlink():
+            continue
+        n_followed += 1
+        if n_followed > _MAX_LINKS:
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+        links[here] = None
+        target = here.readlink()
+        left.extendleft(reversed(target.parts[1:] if target.is_absolute() else target.parts))
+        here = Path("/") if target.is_absolute() else here.parent
+    return list(folders), list(links), here
 
 
 def mode_of(path: Path) -> int:

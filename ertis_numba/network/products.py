@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
+from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Points, Raw, Report
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Settings
@@ -84,8 +85,8 @@ class _Described:
         if len(payload) != 1 + _AXES:
             raise DataError(f"a description has {len(payload)} payloads; send settings and {_AXES} axes")
         try:
-            settings = Settings.from_toml(bytes(payload[0]).decode(), f"settings of sensor {header.sensor}")
-        except (UnicodeDecodeError, ErtisError) as error:
+            settings = received_settings(bytes(payload[0]), f"settings of sensor {header.sensor}", are_applied=True)
+        except ErtisError as error:
             raise DataError(f"a description cannot be used ({error})") from error
         axes = []
         for axis in payload[1:]:

@@ -100,6 +100,8 @@ class ArchiveStatus(msgspec.Struct, kw_only=True):
     sealed: int = 0
     sealing: int = 0
     sealing_failed: int = 0
+    set_aside: int = 0
+    """Journals kept under another name: what is in them is damaged, or no recording can hold it."""
     commit: Percentiles = Percentiles()
     ack: Percentiles = Percentiles()
     """From the arrival of a measurement to its ack being sent."""

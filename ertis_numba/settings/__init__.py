@@ -7,7 +7,7 @@ recording presets.
 
 from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MOST_ZONES, Accuracy
 from ertis_numba.settings.array import Array
-from ertis_numba.settings.call import Call
+from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import suit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
@@ -17,6 +17,7 @@ __all__ = [
     "ENCODINGS",
     "ERROR_PRESETS_DB",
     "INTERPOLATIONS",
+    "MAX_CALL_SAMPLES",
     "MOST_ZONES",
     "PRESETS",
     "Accuracy",

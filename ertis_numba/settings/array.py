@@ -3,7 +3,7 @@
 import numpy as np
 
 from ertis_numba import checks
-from ertis_numba.constants import MAX_MICROPHONES, WORD_BITS
+from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
 
@@ -41,6 +41,7 @@ class Array(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.whole("array.word_bits", self.word_bits, 1), WORD_BITS)
         if self.positions_m is None:
             for name in ("enabled", "gain", "delay_s"):

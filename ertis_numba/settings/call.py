@@ -6,7 +6,10 @@ from ertis_numba import checks
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["Call"]
+__all__ = ["MAX_CALL_SAMPLES", "Call"]
+
+MAX_CALL_SAMPLES = 2**20
+"""Limit on the samples of a call: a second at 1 MHz. Files hold them, and filters take several copies of them."""
 
 
 class Call(Table, frozen=True, kw_only=True):
@@ -48,6 +51,12 @@ class Call(Table, frozen=True, kw_only=True):
                 f"call sweeps from {self.start_frequency_hz:g} Hz to itself; give two different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
+        if self.duration_s * self.sample_rate_hz > MAX_CALL_SAMPLES:
+            raise ArgumentError(
+                f"call has {self.duration_s * self.sample_rate_hz:.0f} samples ({self.duration_s:g} s at "
+                f"{self.sample_rate_hz:g} Hz); the limit is {MAX_CALL_SAMPLES}. Shorten call.duration_s or lower "
+                "call.sample_rate_hz"
+            )
         if self.duration_s * self.low_frequency_hz < 1:
             raise ArgumentError(
                 f"call.duration_s is {self.duration_s:g}, less than a period of {self.low_frequency_hz:g} Hz; "

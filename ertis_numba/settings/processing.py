@@ -3,6 +3,7 @@
 from typing import Literal
 
 from ertis_numba import checks
+from ertis_numba.constants import MAX_NAME_LENGTH
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
 
@@ -59,6 +60,7 @@ class Processing(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.choice("processing.method", self.method, ("fast", "paper"))
+        checks.length("processing.directions", self.directions, MAX_NAME_LENGTH)
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)

@@ -34,6 +34,8 @@ class Settings(Document, frozen=True, kw_only=True):
     processing: Processing = Processing()
     accuracy: Accuracy = Accuracy()
 
+    max_bytes: ClassVar[int] = 262_144  # an array of 1024 microphones takes 170,000 …
+    max_items: ClassVar[int] = 30_000  # … and 16,500
     former_keys: ClassVar[dict[str, str]] = {"pdm_rate_hz": "sample_rate_hz"}
 
     def __post_init__(self) -> None:

@@ -100,7 +100,7 @@ class _Delays:
     squares: float
 
 
-def complete(settings: Settings, kernels: KernelSet, *, threads: int) -> Settings:
+def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
     """Return settings whose accuracy leaves nothing open; see `Planner.choose`.
 
     Raises
@@ -110,7 +110,7 @@ def complete(settings: Settings, kernels: KernelSet, *, threads: int) -> Setting
     """
     if settings.processing.method == "paper":
         return settings
-    return Planner(settings, kernels, threads=threads).choose().settings
+    return Planner(settings, kernels, threads=threads, max_bytes=max_bytes).choose().settings
 
 
 class Planner:
@@ -124,6 +124,8 @@ class Planner:
     threads : int
     texture : Texture, optional
         Of what is heard; what errs on the safe side by default.
+    max_bytes : int, optional
+        Limit on the memory of a plan's signals and delays.
 
     Raises
     ------
@@ -131,8 +133,17 @@ class Planner:
         16 bits are asked for, and the device has no dot product for them.
     """
 
-    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, texture: Texture | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        kernels: KernelSet,
+        *,
+        threads: int,
+        texture: Texture | None = None,
+        max_bytes: int | None = None,
+    ) -> None:
         self._settings, self._kernels = settings, kernels
+        self._most_bytes = _MOST_BYTES if max_bytes is None else max_bytes
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
         self._threads = threads
@@ -256,7 +267,7 @@ class Planner:
         nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self._n_directions if nodes is None else nodes.count
         table = _TABLE_BYTES * n_beams * self._n_mics * plan.delay_taps * len(self._zones(plan.zones))
-        return table + 16 * self._n_mics * plan.n_phases * self._window.n_outputs <= _MOST_BYTES
+        return table + 16 * self._n_mics * plan.n_phases * self._window.n_outputs <= self._most_bytes
 
     def _open_plans(self, budget: float) -> list[_Plan]:
         """Return the plans that the settings leave open and that fit into memory."""

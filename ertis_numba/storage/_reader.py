@@ -16,9 +16,10 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError, SettingsError
 from ertis_numba.frames import Stamp
-from ertis_numba.settings import Settings
+from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
+from ertis_numba.storage.structure import child, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import Truth, read_truth
 
 __all__ = ["Reader", "file_kind", "plain", "sensor_names"]
@@ -28,6 +29,8 @@ _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, Va
 _SYSTEM_SAYS = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
 _PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
 _LEFT_OPEN = "already open for write"  # a mark in the file, which a program that is killed leaves behind
+_OMITTED = {"word"}  # where there is one of them
+_MAX_NAMES = 64  # of sensors, in an error
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -54,7 +57,7 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
     """
     with _open(Path(path)) as file, _reading(file, Path(path)):
         _kind(file, Path(path), "a recording or an energyscape file")
-        return tuple(file["sensors"])
+        return sensors_of(file)
 
 
 class Reader(Sequence[Item]):
@@ -87,14 +90,16 @@ class Reader(Sequence[Item]):
         try:
             with self._reading():
                 self._require_kind()
-                self.sensors: tuple[str, ...] = tuple(self._file["sensors"])
+                self.sensors: tuple[str, ...] = sensors_of(self._file)
                 self.sensor = self._choose(sensor)
-                self._group = self._file["sensors"][self.sensor]
+                self._group = child(self._file["sensors"], self.sensor, h5py.Group)
                 self._look()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data)
                 self.attributes = {name: plain(value) for name, value in self._file.attrs.items()}
-                self.settings = Settings.from_toml(self._group["settings"][()].decode(), f"{self.path}: settings")
+                self.settings = received_settings(
+                    self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind == "energyscape"
+                )
                 self._require_shapes()
                 self._load()
                 self._require_content()
@@ -176,7 +181,7 @@ class Reader(Sequence[Item]):
             raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
 
     def _choose(self, sensor: str | None) -> str:
-        names = ", ".join(self.sensors)
+        names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
         if sensor is None and len(self.sensors) != 1:
             raise ArgumentError(f"{self.path} holds {len(self.sensors)} sensors; choose one of {names} (--sensor)")
         if sensor is not None and sensor not in self.sensors:
@@ -189,15 +194,18 @@ class Reader(Sequence[Item]):
         ]
         if missing:
             raise DamagedError(f"{self.path} has no {missing[0]!r} for sensor {self.sensor}; copy it again")
+        require_variables(self._group, self._table)
 
     def _require_shapes(self) -> None:
         sizes = {"time": len(self._rows), **self._sizes()}
         for variable in self._table:
             if variable.optional and variable.name not in self._group:
                 continue
+            if not sizes.keys() >= set(variable.dims) - _OMITTED:  # its length is its own
+                continue
             wanted = tuple(sizes[dim] for dim in variable.dims if dim in sizes)
             shape = self._group[variable.name].shape
-            if len(wanted) == len(shape) and shape != wanted:
+            if shape != wanted:
                 raise DamagedError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
 
     def _require_content(self) -> None:
@@ -259,6 +267,8 @@ def _open(path: Path) -> h5py.File:
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
+    with _reading(file, path):
+        require_attributes(file)
     kind = plain(file.attrs.get("ertis_format", ""))
     version = plain(file.attrs.get("ertis_format_version", 0))
     if not isinstance(kind, str) or kind not in _A or not isinstance(version, int):

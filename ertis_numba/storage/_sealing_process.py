@@ -11,7 +11,7 @@ from typing import TextIO
 
 from ertis_numba.atomic import part_of
 from ertis_numba.errors import ErtisError, InUseError
-from ertis_numba.journal import SUFFIX
+from ertis_numba.journal import SUFFIX, Sealed
 from ertis_numba.storage._gently import Pace, shrinking
 from ertis_numba.storage.sealing import TOKEN, seal
 
@@ -73,6 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _say(str(sealed.recording), sys.stdout)
         if sealed.remark:
             _say(sealed.remark, sys.stderr)
+    return _code_of(sealed)
+
+
+def _code_of(sealed: Sealed) -> int:
+    if sealed.refused:
+        return FAILED
     return NOTHING if sealed.recording is None else 0
 
 

@@ -25,7 +25,15 @@ from ertis_numba.storage.truth import Truth
 from ertis_numba.waveform import call_samples
 from ertis_numba.words import WordFormat, word_format
 
-__all__ = ["JOURNAL_DAMAGE", "Gap", "RecordingReader", "RecordingWriter", "open_recording", "write_recording"]
+__all__ = [
+    "JOURNAL_DAMAGE",
+    "Gap",
+    "RecordingReader",
+    "RecordingWriter",
+    "lay_out_sensor",
+    "open_recording",
+    "write_recording",
+]
 
 JOURNAL_DAMAGE = "journal_damage"
 """Attribute of a recording: losses of the journal that it was made of, beyond its gaps."""
@@ -120,26 +128,13 @@ class RecordingWriter(Writer[Measurement]):
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
-        layout = microphones(settings.array)
-        words = self._formats[sensor] = word_format(settings)
-        samples = call_samples(settings.call)
-        data, table = _data_and_table(pdm=settings.recording.is_pdm)
-        lay_out(
+        self._formats[sensor] = word_format(settings)
+        lay_out_sensor(
             group,
-            table,
-            sizes={**_sizes(settings), "call_sample": len(samples)},
-            dtypes={data: words.dtype},
-            texts={"settings": settings.to_toml()},
+            settings,
+            firmware=self._firmware.get(sensor, ""),
+            mounting=self._mounting.get(sensor, mounted(sensor)),
         )
-        identity = _identity(sensor, settings, self._firmware.get(sensor, ""))
-        describe(group, identity | self._mounting.get(sensor, mounted(sensor)))
-        bits = {"bit_order": "lsb_first"} if settings.recording.is_pdm else {}
-        describe(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
-        describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
-        group["microphone"][:] = np.arange(len(layout.enabled))
-        group["call"][:] = samples
-        for name, values in _copies(layout).items():
-            group[name][:] = values
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
         self._require_same(item.stamp.sensor, item.settings)
@@ -191,6 +186,43 @@ class RecordingWriter(Writer[Measurement]):
             group[name].resize((len(gaps),))
             if len(column):
                 group[name][:] = column
+
+
+def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]) -> None:
+    """Make all variables of a sensor but its rows.
+
+    Parameters
+    ----------
+    group : h5py.Group
+        The sensor's own, named as it is.
+    settings : Settings
+        As `storable` returns them.
+    firmware : str
+    mounting : mapping of str to array
+        As `ertis_numba.geometry.mounting` returns it.
+
+    Raises
+    ------
+    ArgumentError
+        A row is longer than HDF5 can hold.
+    """
+    layout, words, samples = microphones(settings.array), word_format(settings), call_samples(settings.call)
+    data, table = _data_and_table(pdm=settings.recording.is_pdm)
+    lay_out(
+        group,
+        table,
+        sizes={**_sizes(settings), "call_sample": len(samples)},
+        dtypes={data: words.dtype},
+        texts={"settings": settings.to_toml()},
+    )
+    describe(group, {**_identity(group.name.rpartition("/")[2], settings, firmware), **mounting})
+    bits = {"bit_order": "lsb_first"} if settings.recording.is_pdm else {}
+    describe(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
+    describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
+    group["microphone"][:] = np.arange(len(layout.enabled))
+    group["call"][:] = samples
+    for name, values in _copies(layout).items():
+        group[name][:] = values
 
 
 def _data_and_table(*, pdm: bool) -> tuple[str, tuple[Variable, ...]]:

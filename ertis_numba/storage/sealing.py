@@ -14,17 +14,32 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import ClassVar
 
+import h5py
 import numpy as np
 
 from ertis_numba.atomic import part_of, sync
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry import mounting as mounted
+from ertis_numba.geometry import storable
 from ertis_numba.journal import LOST, SUFFIX, Journal, Sealed, Sensor
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, RecordingWriter, open_recording
+from ertis_numba.storage.recording import (
+    JOURNAL_DAMAGE,
+    RecordingReader,
+    RecordingWriter,
+    lay_out_sensor,
+    open_recording,
+)
+from ertis_numba.storage.schema import sensor_path
 
-__all__ = ["TOKEN", "seal"]
+__all__ = ["REFUSED", "TOKEN", "seal"]
+
+REFUSED = "refused"
+"""End of the name of a journal that is kept because no recording can hold some sensor in it."""
+
+MAX_HISTORY = 16_000  # characters; an attribute of HDF5 takes 65,536 bytes
 
 TOKEN = "sealing"  # noqa: S105
 """Of the part file: who has the journal is the only one to write it."""
@@ -36,7 +51,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """Make the recording of a journal; when it is complete, verified and on the disk, remove the journal.
 
     Measurements that are damaged in the journal are gaps of the recording, and the journal is kept under another name.
-    What was sealed before is not written again.
+    So it is where no recording can hold a sensor; those of the other sensors are sealed. What was sealed before is not
+    written again.
 
     Parameters
     ----------
@@ -63,21 +79,25 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     with Journal.open(path) as journal:
         target = journal.target
         part_of(target, TOKEN).unlink(missing_ok=True)
+        rows = {name: JournalRows(journal, name) for name in journal.sensors}
+        refused = _refused(journal, rows)
+        if refused and not any(map(len, rows.values())):
+            return Sealed(path, None, set_aside=journal.set_aside(REFUSED), refused=refused)
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()
             return Sealed(path, None)
-        rows = {name: JournalRows(journal, name) for name in journal.sensors}
         if target.is_file() and _holds(target, journal, rows):
             for place in (target, target.parent):  # who wrote it may have been killed before it did this
                 sync(place)
         elif target.is_file() and not overwrite:
             raise DataError(f"{target} exists and holds something else than {path}; move it, or give --force")
         else:
-            _write(journal, rows, overwrite=overwrite, progress=progress)
+            _write(journal, rows, refused, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
-        if n_damaged:
-            return _told(path, target, damaged=n_damaged, set_aside=journal.set_aside())
+        if n_damaged or refused:
+            aside = journal.set_aside("damaged" if n_damaged else REFUSED)
+            return _told(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
         journal.remove()
     return _told(path, target)
 
@@ -103,6 +123,35 @@ def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
         if missing.reason == LOST
     )
     return "; ".join([*([journal.damage] if journal.damage else []), *absent])
+
+
+def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
+    """Return the reasons why a recording cannot hold some sensors, by name, and take those out of the rows."""
+    refused = {name: reason for name, (reason, count) in journal.unusable.items() if count}
+    for name, held in list(rows.items()):
+        first = next(iter(held), None)
+        reason = "" if first is None else _refusal(journal.sensors[name], first.measurement)
+        if reason:
+            refused[name] = reason
+            del rows[name]
+    return refused
+
+
+def _refusal(sensor: Sensor, first: Measurement) -> str:
+    """Return why a recording cannot hold a sensor, by a trial in memory; empty where it can."""
+    try:
+        with h5py.File("trial", "w", driver="core", backing_store=False, libver=("v110", "v110")) as trial:
+            lay_out_sensor(
+                trial.create_group(sensor_path(sensor.name), track_order=True),
+                storable(first.settings),
+                firmware=sensor.firmware,
+                mounting=mounted(sensor.name, sensor.translation_m, sensor.rotation_xyzw),
+            )
+    except MemoryError:  # which may pass
+        raise
+    except Exception as error:  # noqa: BLE001  whatever it is, it must not keep the others from being sealed
+        return " ".join(str(error).split()) or type(error).__name__
+    return ""
 
 
 def _origin(path: Path) -> str:
@@ -139,8 +188,10 @@ class _Sealer(RecordingWriter):
         """Take what is known of sensors of which nothing comes: the history tells of them."""
 
 
-def _write(journal: Journal, rows: dict[str, JournalRows], *, overwrite: bool, progress: Progress) -> None:
-    sensors = journal.sensors.values()
+def _write(
+    journal: Journal, rows: dict[str, JournalRows], refused: dict[str, str], *, overwrite: bool, progress: Progress
+) -> None:
+    sensors = [journal.sensors[name] for name in rows]
     with _Sealer(
         journal.target,
         overwrite=overwrite,
@@ -158,9 +209,10 @@ def _write(journal: Journal, rows: dict[str, JournalRows], *, overwrite: bool, p
                 writer.note_gap(name, *gap)
         if not n_written:
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
-        writer.say("; ".join([_origin(journal.path), *_absent(rows)]))
         if damage := _damage(journal, rows):
             writer.say_damage(damage)
+        kept = (f"sensor {name} was set aside: {reason}" for name, reason in refused.items())
+        writer.say("; ".join([_origin(journal.path), *_absent(rows), *kept])[:MAX_HISTORY])
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
@@ -200,7 +252,14 @@ def _equal(one: Measurement, other: Measurement) -> bool:
     return (one.stamp, one.settings) == (other.stamp, other.settings) and np.array_equal(one.words, other.words)
 
 
-def _told(path: Path, recording: Path, *, damaged: int = 0, set_aside: Path | None = None) -> Sealed:
+def _told(
+    path: Path,
+    recording: Path,
+    *,
+    damaged: int = 0,
+    set_aside: Path | None = None,
+    refused: dict[str, str] | None = None,
+) -> Sealed:
     """Return what a recording has come to."""
     n_measurements = n_missing = n_lost = 0
     damage = ""
@@ -210,7 +269,7 @@ def _told(path: Path, recording: Path, *, damaged: int = 0, set_aside: Path | No
             n_missing += sum(gap.last - gap.first + 1 for gap in reader.gaps)
             n_lost += sum(gap.last - gap.first + 1 for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
-    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage)
+    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
@@ -73,7 +73,14 @@ def verify(path: str | Path) -> list[SensorReport]:
                 raise DataError(
                     f"{path} has lost measurements, as its log was damaged ({journal.damage}); copy both again"
                 )
-            return [_of_journal(journal, name) for name in journal.sensors]
+            reports = [_of_journal(journal, name) for name in journal.sensors]
+            reports += [
+                SensorReport(sensor=name, measurements=count, fault=reason)
+                for name, (reason, count) in journal.unusable.items()
+            ]
+        if reports and all(report.fault for report in reports):
+            raise DataError(reports[0].fault)
+        return reports
     names = sensor_names(path)
     structure = fault_of(path)
     reports = [_of_recording(path, name, structure) for name in names]
@@ -93,6 +100,8 @@ def _is_journal(path: Path) -> bool:
 def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
     try:
         recording = open_recording(path, sensor=sensor)
+    except ForeignDataError:  # such a file was not written by this package: nothing of it is worth a look
+        raise
     except (ArgumentError, DataError) as error:
         return SensorReport(sensor=sensor, fault=str(error))
     damaged: list[Damage] = []

@@ -14,6 +14,7 @@ from ertis_bench.network import (
     faults_load,
     faults_peers,
     faults_processing,
+    hostile,
 )
 from ertis_bench.reliability import small_disk
 from ertis_bench.trials import Parts, try_parts
@@ -40,6 +41,8 @@ class Extent:
         Kills while emulated sensors are captured from.
     n_hostile, n_fuzzed : int
         Connections and messages.
+    n_hellos, n_files : int
+        Hostile hellos, and hostile files; there are fewer if these are all.
     overload_s, slow_s : float
         How long there is too much to do, and how long there are slow applications.
     n_pulses : int
@@ -58,6 +61,8 @@ class Extent:
     n_captures: int
     n_hostile: int
     n_fuzzed: int
+    n_hellos: int
+    n_files: int
     overload_s: float
     slow_s: float
     n_pulses: int
@@ -66,12 +71,12 @@ class Extent:
 
 SHORT = Extent(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
-    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
+    n_hostile=200, n_fuzzed=10_000, n_hellos=60, n_files=60, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
 )  # fmt: skip
 LONG = Extent(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
-    n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
-    n_power_cuts=4_500,
+    n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, n_hellos=1_000, n_files=1_000, overload_s=600.0,
+    slow_s=240.0, n_pulses=400, n_power_cuts=4_500,
 )  # fmt: skip
 
 
@@ -141,6 +146,14 @@ PARTS: Parts[Extent] = {
     "fuzzed": (
         "{n_fuzzed} malformed messages",
         lambda extent, folder, seed: faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
+    ),
+    "hellos": (
+        "hostile hellos",
+        lambda extent, folder, seed: hostile.hellos(folder, seed=seed, count=extent.n_hellos),
+    ),
+    "files": (
+        "hostile files",
+        lambda extent, folder, _: hostile.files(folder, count=extent.n_files),
     ),
     "overload": (
         "{overload_s:g} s of twice as much as can be done",

@@ -98,6 +98,20 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "refused, no crash",
         "{answers:,} answers, {restarts} restarts, memory + {memory grew, MB:.0f} MB; of the real sensor " + _STORED,
     ),
+    "hellos": (
+        "{hellos:,} hostile hellos: sizes, names, lines, depth, numbers",
+        "refused within 1 s, memory + < 200 MB; acks of others < 200 ms",
+        "taken: {taken all}; slowest refusal {slowest refusal, s:.2f} s, memory + {memory grew, MB:.0f} MB; slowest "
+        "ack {slowest ack, ms:.0f} ms, {slowest ack alone, ms:.0f} ms before; of the real sensor " + _STORED,
+    ),
+    "files": (
+        "{files:,} hostile files read by `ertis verify`, `info` and `process`",
+        "refused within 1 s, memory + < 200 MB",
+        (
+            "{reads:,} reads: taken: {taken all}; crashed: {crashes all}; with a traceback: {failed all}; slowest "
+            "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of a processor), memory + {memory grew, MB:.0f} MB"
+        ),
+    ),
     "overload": (
         "overload 2×, {capacity per s:.0f} images/s being possible",
         "received = published + dropped; latency bounded",
@@ -144,7 +158,7 @@ def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
         return tried, wanted, f"not tried: {found['reason']}"
     values = dict(found)
     values["faults"] = sum(found.get("meddled", {}).values())
-    for field in ("dropped", "refused", "let in"):
+    for field in ("dropped", "refused", "let in", "taken", "crashes", "failed"):
         values[f"{field} all"] = _all(found.get(field))
     return tried.format(**values), wanted, became.format(**values)
 

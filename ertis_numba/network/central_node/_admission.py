@@ -11,9 +11,10 @@ from ertis_numba.frames import Measurement
 from ertis_numba.journal import Entry, Sensor
 from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.central_node._streams import SETTINGS_BYTES, Peer, Stream, Track, source_of
+from ertis_numba.network.central_node._streams import Peer, Stream, Track, source_of
 from ertis_numba.network.central_node._volumes import same
 from ertis_numba.network.messages import Data, Hello
+from ertis_numba.settings import Settings
 
 __all__ = ["entry_in", "require_room", "require_same", "source_in"]
 
@@ -25,8 +26,8 @@ _PEERS_OF_KEY: Final = 64
 
 def source_in(hello: Hello, payload: list[bytes], *, most_bytes: int) -> Sensor:
     """Return the sensor of a greeting, or refuse what is none."""
-    if len(payload) != 1 or len(payload[0]) > SETTINGS_BYTES:
-        raise Unwanted("settings", f"a hello has no settings of at most {SETTINGS_BYTES} bytes; send them", "size")
+    if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
+        raise Unwanted("settings", f"a hello has no settings of at most {Settings.max_bytes} bytes; send them", "size")
     if zlib.crc32(payload[0]) != hello.settings_crc32:
         raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
     try:

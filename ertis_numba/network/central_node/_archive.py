@@ -142,7 +142,13 @@ class Archive:
         sealing = self._sealing
         if sealing is None:
             return replace(self._snapshot)
-        return replace(self._snapshot, sealed=sealing.sealed, sealing=sealing.left, sealing_failed=sealing.failed)
+        return replace(
+            self._snapshot,
+            sealed=sealing.sealed,
+            sealing=sealing.left,
+            sealing_failed=sealing.failed,
+            set_aside=sealing.set_aside,
+        )
 
     def finish(self, timeout_s: float) -> bool:
         """Store what was offered, end the thread, and return whether that was done in time."""

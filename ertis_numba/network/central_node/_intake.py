@@ -72,14 +72,25 @@ class Intake:
 
     # What comes from nodes
 
-    def greet(self, peer_id: bytes, hello: Hello, payload: list[bytes], key: str = "") -> Stream:
+    def read(self, hello: Hello, payload: list[bytes]) -> Sensor:
+        """Return the sensor of a greeting; any thread may call this.
+
+        Raises
+        ------
+        Unwanted
+            It cannot be taken.
+        """
+        return source_in(hello, payload, most_bytes=self._most_bytes)
+
+    def greet(self, peer_id: bytes, hello: Hello, source: Sensor, key: str = "") -> Stream:
         """Take a greeting, and return the run.
 
         Parameters
         ----------
         peer_id : bytes
         hello : Hello
-        payload : list of bytes
+        source : Sensor
+            As `read` returns it.
         key : str
             Of the peer; there are fewer peers of each key than of all.
 
@@ -88,7 +99,6 @@ class Intake:
         Unwanted
             It cannot be taken.
         """
-        source = source_in(hello, payload, most_bytes=self._most_bytes)
         run = Run(hello.sensor, hello.epoch)
         peer = self.peers.get(peer_id)
         require_room(self.peers, self.tracks, peer, run, key)

@@ -3,8 +3,9 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -17,6 +18,7 @@ from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._condition import Condition
 from ertis_numba.network.central_node._door import Door
+from ertis_numba.network.central_node._greetings import Greeting, Greetings
 from ertis_numba.network.central_node._images import Guarded, Images
 from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Remark, Resumed, SealedOne, Stored, Twin
@@ -113,7 +115,8 @@ class CentralNode:
         self._condition = Condition(
             listen, self._door, self._intake, archive=archive, images=self._images, keys=keys is not None
         )
-        self._archive_fd = -1
+        self._greetings = Greetings(self._intake.read)
+        self._archive_fd = self._greetings_fd = -1
         self._next_tick_s = self._next_told_s = self._next_status_s = 0.0
         self.latest = self.status()
 
@@ -133,6 +136,7 @@ class CentralNode:
             self._archive_fd = self._archive.open()
         if self._images is not None:
             self._images.start()
+        self._greetings_fd = self._greetings.open()
         self._door.open(self._listen, most_bytes=self._most_bytes)
         self._telling.tell("listening", address=self._condition.address, pid=os.getpid())
 
@@ -153,6 +157,7 @@ class CentralNode:
                 stack.callback(self._archive.close)
             if self._images is not None:
                 stack.callback(self._images.close, _FINISH_S)
+            stack.callback(self._greetings.close)
             stack.callback(self._door.close)
             self._telling.refused(self._door.refused)
 
@@ -188,12 +193,16 @@ class CentralNode:
         others = set() if self._images is None else set(self._images.fds())
         if self._archive is not None:
             poller.register(self._archive_fd, zmq.POLLIN)
+        poller.register(self._greetings_fd, zmq.POLLIN)
         for fd in others:
             poller.register(fd, zmq.POLLIN)
         ready = dict(poller.poll(max(0, round(1e3 * (self._next_tick_s - time.monotonic())))))
         called = self._door.serve(ready)
         if self._archive_fd in ready:
             self._hear()
+        if self._greetings_fd in ready:
+            for greeting in self._greetings.take():
+                self._guarded(greeting.frames, greeting.hello, partial(self._greet, greeting))
         if self._images is not None:
             for fd in ready.keys() & others:
                 self._images.ready(fd)
@@ -211,7 +220,7 @@ class CentralNode:
                 return
             try:
                 self._handle(frames)
-            except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
+            except Exception as error:  # noqa: BLE001  as in _guarded
                 self._internal(error)
 
     def _internal(self, error: Exception) -> None:
@@ -225,6 +234,7 @@ class CentralNode:
         sender = frames[0].bytes
         who = self._door.who(frames)
         if who is None:  # counted there
+            self._greetings.forget(sender)
             self._intake.bye(sender)
             self._door.send(sender, Refused(code="role", reason="this key is not listed (any more); have it listed"))
             return
@@ -232,21 +242,52 @@ class CentralNode:
         try:
             message = read(frames)
             require_role(who, message)
-            self._take(sender, who, message, frames, arrived_ns)
         except Unwanted as error:
-            self._door.refused[error.kind] += 1
-            self._door.send(sender, error.answer(message or Bye()))
-        except Exception as error:
+            self._refuse(sender, error, message)
+            return
+        self._guarded(frames, message, partial(self._take, frames, who, message, arrived_ns))
+
+    def _guarded(self, frames: list[zmq.Frame], message: Message, act: Callable[[], None]) -> None:
+        """Do what a message asks, or answer why not."""
+        sender = frames[0].bytes
+        try:
+            act()
+        except Unwanted as error:
+            self._refuse(sender, error, message)
+        except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
             text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
-            self._door.send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
-            raise
+            self._door.send(sender, Unwanted("message", text, "internal").answer(message))
+            self._internal(error)
         else:
             if sender in self._intake.peers:
                 self._door.keep_badge(frames)
 
-    def _take(
-        self, sender: bytes, who: Permission, message: Message, frames: Sequence[zmq.Frame], arrived_ns: int
-    ) -> None:
+    def _refuse(self, sender: bytes, error: Unwanted, message: Message | None) -> None:
+        self._door.refused[error.kind] += 1
+        self._door.send(sender, error.answer(message or Bye()))
+
+    def _greet(self, greeting: Greeting) -> None:
+        """Take a greeting whose settings were read."""
+        if isinstance(greeting.result, Exception):
+            raise greeting.result
+        if greeting.result is None or self._door.who(greeting.frames) is None:  # its key was removed meanwhile
+            return
+        sender, hello = greeting.peer_id, greeting.hello
+        stream = self._intake.greet(sender, hello, greeting.result, greeting.key)
+        self._door.send(
+            sender,
+            Welcome(
+                sensor=hello.sensor,
+                epoch=hello.epoch,
+                state=self.state,
+                acks="accepted" if self._archive is None else "stored",
+                window=self._window,
+                settled=stream.settled,
+            ),
+        )
+
+    def _take(self, frames: list[zmq.Frame], who: Permission, message: Message, arrived_ns: int) -> None:
+        sender = frames[0].bytes
         match message:
             case Data():
                 self._intake.measure(sender, message, [frame.buffer for frame in frames[2:]], arrived_ns)
@@ -258,19 +299,9 @@ class CentralNode:
                 self._door.send(sender, Pong(state=self.state, text=text[:500]))
             case Hello():
                 key = "" if self._keys is None else who.public
-                stream = self._intake.greet(sender, message, [frame.bytes for frame in frames[2:]], key)
-                self._door.send(
-                    sender,
-                    Welcome(
-                        sensor=message.sensor,
-                        epoch=message.epoch,
-                        state=self.state,
-                        acks="accepted" if self._archive is None else "stored",
-                        window=self._window,
-                        settled=stream.settled,
-                    ),
-                )
+                self._greetings.offer(Greeting(frames[:2], message, [frame.bytes for frame in frames[2:]], key))
             case Bye():
+                self._greetings.forget(sender)
                 self._intake.bye(sender)
             case AskStatus():
                 self._door.send(sender, Report(), self._condition.report())

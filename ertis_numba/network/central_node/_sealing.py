@@ -41,7 +41,7 @@ class Sealing:
 
     Attributes
     ----------
-    sealed, failed : int
+    sealed, failed, set_aside : int
         So far.
     """
 
@@ -51,7 +51,7 @@ class Sealing:
         self._waiting: list[tuple[float, float, Path]] = []  # when it is due, how long it waited, which
         self._left: set[Path] = set()
         self._ends = False
-        self.sealed = self.failed = 0
+        self.sealed = self.failed = self.set_aside = 0
         self._thread = threading.Thread(target=self._run, name="sealing", daemon=True)
         self._thread.start()
 
@@ -107,7 +107,8 @@ class Sealing:
             self._on_failed(f"{path.name} is not sealed yet: {' '.join(str(error).split())}")
             return
         self._left.discard(path)
-        self.sealed += 1
+        self.sealed += sealed.recording is not None
+        self.set_aside += sealed.set_aside is not None
         self._on_sealed(sealed)
 
     def _rests(self, folder: Path) -> float:

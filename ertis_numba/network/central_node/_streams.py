@@ -8,17 +8,14 @@ from itertools import count
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, SettingsError
-from ertis_numba.geometry import layout_names
+from ertis_numba.geometry import received_settings
 from ertis_numba.journal import Sensor
 from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.messages import Data, Hello
 from ertis_numba.network.status import SensorStatus
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["SETTINGS_BYTES", "Peer", "Stream", "Track", "source_of"]
-
-SETTINGS_BYTES: Final = 262_144
-"""Of the settings of a sensor, as TOML."""
+__all__ = ["Peer", "Stream", "Track", "source_of"]
 
 _turns = count()
 _RECENT_S: Final = 3.0
@@ -59,16 +56,7 @@ def _source(
 ) -> Sensor:
     if not firmware.isprintable():
         raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; give printable characters")
-    try:
-        settings = Settings.from_toml(text.decode(), f"settings of sensor {name}")
-    except UnicodeDecodeError as error:
-        raise SettingsError(f"settings of sensor {name} are no text ({error}); give TOML in UTF-8") from error
-    if not settings.array.layout.isprintable() or not settings.processing.directions.isprintable():
-        raise SettingsError(f"settings of sensor {name} hold names that cannot be printed; give printable characters")
-    if settings.array.positions_m is None and settings.array.layout not in layout_names():
-        raise SettingsError(  # what others name must not be opened as a file here
-            f"array.layout of sensor {name} is {settings.array.layout!r}, a file; send its positions instead"
-        )
+    settings = received_settings(text, f"settings of sensor {name}")
     source = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
     if source.n_bytes > most_bytes:
         raise SettingsError(

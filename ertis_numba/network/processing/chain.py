@@ -18,6 +18,9 @@ from ertis_numba.words import word_format
 
 __all__ = ["Chain"]
 
+MAX_BYTES: Final = 1_000_000_000
+"""Limit on the memory of one pipeline, which a sensor's settings decide about."""
+
 _TIMED: Final = 5  # measurements, whose median counts
 
 
@@ -38,7 +41,8 @@ class Chain:
     """
 
     def __init__(self, settings: str, device: str) -> None:
-        self.pipeline = Pipeline(Settings.from_toml(settings, "settings of a sensor"), device=device)
+        said = Settings.from_toml(settings, "settings of a sensor", find_line=False)
+        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self._format = word_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)

@@ -7,7 +7,7 @@ from typing import Final, Protocol
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import PAPER_GRIDS, self_contained
+from ertis_numba.geometry import grid_count, self_contained
 from ertis_numba.network.log import Log
 from ertis_numba.network.messages import Data, Description, Hello
 from ertis_numba.network.processing.notes import Prepared
@@ -208,12 +208,11 @@ def _about(came: Air, used: Air) -> Air:
 def _require_size(settings: Settings) -> None:
     """Refuse images that nobody has the memory for, before anything is made for them."""
     processing = settings.processing
-    grid, *_ = PAPER_GRIDS.get(processing.directions, (processing.directions,))
-    count = grid.partition(":")[2]
-    if not count.isdecimal():  # a list of directions, which is as long as somebody has written it here
+    grid, count = processing.directions, grid_count(processing.directions)
+    if count is None:  # a list of directions, which is as long as somebody has written it here
         return
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
-    n_bytes = 4 * int(count) * (processing.range_m[1] - processing.range_m[0]) / step_m
+    n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
     if n_bytes > _MOST_BYTES:
         raise ArgumentError(
             f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have {n_bytes / 1e6:.0f} "

@@ -1,0 +1,56 @@
+"""Settings from another machine, or from a file of measurements that may come from one."""
+
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.geometry.grids import grid_count
+from ertis_numba.geometry.layouts import layout_names
+from ertis_numba.settings import Settings
+
+__all__ = ["received_settings"]
+
+
+def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
+    """Return settings that somebody else wrote; they name no file of this machine.
+
+    Parameters
+    ----------
+    text : bytes or str
+        TOML, in UTF-8.
+    source : str
+        Name of the settings in errors.
+    are_applied : bool
+        Accept any name as ``processing.directions``, because the directions themselves come with the settings.
+
+    Returns
+    -------
+    Settings
+
+    Raises
+    ------
+    SettingsError
+        The text is too long, is not TOML, a value cannot be used, or a name is that of a file.
+    """
+    if isinstance(text, bytes):
+        if len(text) > Settings.max_bytes:  # before a copy of it is made
+            raise SettingsError(f"{source}: {len(text)} bytes; the limit is {Settings.max_bytes}")
+        try:
+            text = text.decode()
+        except UnicodeDecodeError as error:
+            raise SettingsError(f"{source} are no text ({error}); give TOML in UTF-8") from error
+    settings = Settings.from_toml(text, source, find_line=False)
+    layout, directions = settings.array.layout, settings.processing.directions
+    if not layout.isprintable() or not directions.isprintable():
+        raise SettingsError(f"{source} hold names that cannot be printed; give printable characters")
+    if settings.array.positions_m is None and layout not in layout_names():
+        raise SettingsError(
+            f"{source}: array.layout is {layout[:80]!r}, a file; send its positions instead, or name one of "
+            f"{', '.join(layout_names())}"
+        )
+    try:
+        count = None if are_applied else grid_count(directions)
+    except ArgumentError as error:
+        raise SettingsError(f"{source}: {error}") from error
+    if count is None and not are_applied:
+        raise SettingsError(
+            f"{source}: processing.directions is {directions[:80]!r}, a file; name a grid instead, such as 2d:181"
+        )
+    return settings

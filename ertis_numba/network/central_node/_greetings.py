@@ -1,0 +1,147 @@
+"""Hello messages whose settings are being read, in a thread of their own: TOML of 256 kB takes a tenth of a second."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import zmq
+
+from ertis_numba.journal import Sensor
+from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.messages import Hello
+from ertis_numba.network.waker import Waker
+
+__all__ = ["Greeting", "Greetings"]
+
+MAX_WAITING_OF_PEER: Final = 128
+MAX_WAITING_BYTES: Final = 64_000_000
+
+
+@dataclass(slots=True, eq=False)
+class Greeting:
+    """A Hello message and what came of it.
+
+    Attributes
+    ----------
+    frames : list of zmq.Frame
+        The message as it came, for the gate to look up its sender again.
+    hello : Hello
+    payload : list of bytes
+    key : str
+        Public key of the peer; empty where there are none.
+    result : Sensor or Exception
+        The sensor, once it is read, or why there is none.
+    """
+
+    frames: list[zmq.Frame]
+    hello: Hello
+    payload: list[bytes]
+    key: str
+    result: Sensor | Exception | None = None
+
+    @property
+    def peer_id(self) -> bytes:
+        """The sender."""
+        return self.frames[0].bytes
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the payload."""
+        return sum(map(len, self.payload))
+
+
+class Greetings:
+    """Reads the settings in Hello messages, one after the other; peers take turns.
+
+    Parameters
+    ----------
+    read : callable
+        Called in the thread with the message and its payload; returns the sensor, or raises what is wrong.
+    """
+
+    def __init__(self, read: Callable[[Hello, list[bytes]], Sensor]) -> None:
+        self._read = read
+        self._change = threading.Condition()
+        self._waiting: dict[bytes, deque[Greeting]] = {}  # by peer, the next one's turn first
+        self._done: deque[Greeting] = deque()
+        self._bytes = 0
+        self._ends = False
+        self._thread: threading.Thread | None = None
+        self._waker: Waker | None = None
+
+    def open(self) -> int:
+        """Start the thread, and return what to poll: `take` when it can be read."""
+        self._waker = Waker()
+        self._thread = threading.Thread(target=self._run, args=(self._waker,), name="greetings", daemon=True)
+        self._thread.start()
+        return self._waker.fileno()
+
+    def close(self) -> None:
+        """End the thread; closing twice does no harm."""
+        with self._change:
+            self._ends = True
+            self._change.notify()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._waker is not None:
+            self._waker.close()
+            self._waker = None
+
+    def offer(self, greeting: Greeting) -> None:
+        """Have a greeting read; returns at once.
+
+        Raises
+        ------
+        Unwanted
+            Too many wait.
+        """
+        with self._change:
+            waiting = self._waiting.setdefault(greeting.peer_id, deque())
+            if len(waiting) >= MAX_WAITING_OF_PEER or self._bytes + greeting.n_bytes > MAX_WAITING_BYTES:
+                if not waiting:
+                    del self._waiting[greeting.peer_id]
+                raise Unwanted(
+                    "message", "too many hellos wait to be read; say hello again in some seconds", "too many"
+                )
+            self._bytes += greeting.n_bytes
+            waiting.append(greeting)
+            self._change.notify()
+
+    def forget(self, peer_id: bytes) -> None:
+        """Drop the greetings of a peer that has left."""
+        with self._change:
+            self._bytes -= sum(greeting.n_bytes for greeting in self._waiting.pop(peer_id, ()))
+            for greeting in [each for each in self._done if each.peer_id == peer_id]:
+                self._done.remove(greeting)
+
+    def take(self) -> list[Greeting]:
+        """Return the greetings that were read since; returns at once."""
+        if self._waker is not None:
+            self._waker.clear()
+        with self._change:
+            found = list(self._done)
+            self._done.clear()
+        return found
+
+    def _run(self, waker: Waker) -> None:
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._ends or self._waiting)
+                if self._ends:
+                    return
+                peer_id = next(iter(self._waiting))
+                waiting = self._waiting.pop(peer_id)
+                greeting = waiting.popleft()
+                self._bytes -= greeting.n_bytes
+                if waiting:
+                    self._waiting[peer_id] = waiting  # behind all others
+            try:
+                greeting.result = self._read(greeting.hello, greeting.payload)
+            except Exception as error:  # noqa: BLE001  the loop answers whatever it is
+                greeting.result = error
+            with self._change:
+                self._done.append(greeting)
+            waker.wake()

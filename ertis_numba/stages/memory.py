@@ -1,0 +1,49 @@
+"""Memory that a pipeline needs, predicted before anything is made for it."""
+
+from typing import Final
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid, grid_count, microphones
+from ertis_numba.settings import Settings
+from ertis_numba.stages.window import time_window
+
+__all__ = ["predicted_bytes", "require_memory"]
+
+# Upper bounds of what was measured for 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
+_OF_DIRECTION: Final = 2500  # tables of beam-grid points that the planner compares
+_OF_DELAY: Final = 75  # a direction and a microphone: delays, offsets, weights, and copies while they are made
+_OF_SAMPLE: Final = 32  # a microphone and a sample of its transform: signal, spectrum, filter
+_OF_POINT: Final = 4  # of an image
+
+
+def predicted_bytes(settings: Settings) -> int:
+    """Return the memory that planning and processing take, besides libraries and the tables of an unusually exact plan.
+
+    Raises
+    ------
+    ArgumentError
+        The ranges lie outside the record, or the directions cannot be read.
+    """
+    count = grid_count(settings.processing.directions)
+    n_directions = len(direction_grid(settings.processing)) if count is None else count
+    n_mics = int(microphones(settings.array).enabled.sum())
+    window = time_window(settings, largest_delay_s=0.0, n_taps=1)
+    of_direction = _OF_DIRECTION + _OF_DELAY * n_mics + _OF_POINT * len(window.range_m)
+    return n_directions * of_direction + _OF_SAMPLE * n_mics * window.n_fft
+
+
+def require_memory(settings: Settings, max_bytes: int) -> int:
+    """Return the memory that is left for the tables of a plan; refuse settings whose pipeline would need more.
+
+    Raises
+    ------
+    ArgumentError
+        It would.
+    """
+    n_bytes = predicted_bytes(settings)
+    if n_bytes > max_bytes:
+        raise ArgumentError(
+            f"a pipeline for these settings needs about {n_bytes / 1e6:.0f} MB; the limit is {max_bytes / 1e6:.0f} MB. "
+            "Give fewer directions, a shorter processing.range_m, a shorter call or a lower rate"
+        )
+    return max_bytes - n_bytes

@@ -1,0 +1,194 @@
+"""Bounded access to HDF5 files, which may come from anybody.
+
+HDF5 files can point into other files, claim billions of rows that take up no room, and hold the same rows under many
+names. Files of this package do none of that. So everything that is read is compared with what the file itself stores,
+before any of it is read: time and memory are then bounded by the size of the file.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+import h5py
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
+from ertis_numba.settings import Settings
+from ertis_numba.storage.schema import TRUTH, Variable
+
+__all__ = ["child", "require_attributes", "require_variables", "sensors_of", "stored_bytes"]
+
+MAX_SENSORS: Final = 1024  # as a central node takes
+MAX_MEMBERS: Final = 256  # of a group: variables, and the scales of their axes
+MAX_ATTRIBUTES: Final = 256
+MAX_ATTRIBUTE_BYTES: Final = 65_536
+MAX_TEXT_BYTES: Final = {"settings": Settings.max_bytes, "scene": 16 * 2**20, "name": 4096}
+MAX_COLUMN_TEXT_BYTES: Final = 64
+MAX_COMPRESSION: Final = 1032  # of deflate
+MAX_ROW_BYTES: Final = 2**32 - 1
+
+
+def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
+    """Return a member of a group that lies in the same file and has no other name.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    name : str
+    kind : type
+        ``h5py.Group`` or ``h5py.Dataset``.
+
+    Raises
+    ------
+    ForeignDataError
+        It is a link to somewhere else, or has several names.
+    DamagedError
+        It is something else.
+    KeyError
+        There is none.
+    """
+    link = group.get(name, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        raise ForeignDataError(
+            f"{_path(group, name)} is a link into the file {link.filename[:200]!r}; copy the data into one file"
+        )
+    if isinstance(link, h5py.SoftLink):
+        raise ForeignDataError(f"{_path(group, name)} is a link to {link.path[:200]!r}; copy the data to its place")
+    found = group[name]
+    if not isinstance(found, kind):
+        raise DamagedError(f"{_path(group, name)} is a {type(found).__name__.lower()}, not a {kind.__name__.lower()}")
+    if h5py.h5o.get_info(found.id).rc != 1:
+        raise ForeignDataError(f"{_path(group, name)} has several names in the file; copy the data to each place")
+    return found
+
+
+def sensors_of(file: h5py.File) -> tuple[str, ...]:
+    """Return the names of the sensors in a file, in its order.
+
+    Raises
+    ------
+    DamagedError
+        There are too many, or a name cannot be that of a sensor.
+    """
+    group = child(file, "sensors", h5py.Group)
+    if len(group) > MAX_SENSORS:
+        raise DamagedError(f"{len(group)} sensors; the limit is {MAX_SENSORS}")
+    try:
+        return tuple(map(checks.sensor_name, group))
+    except ArgumentError as error:
+        raise DamagedError(str(error)) from error
+
+
+def require_attributes(owner: h5py.File | h5py.Group) -> None:
+    """Refuse attributes that take much room.
+
+    Raises
+    ------
+    DamagedError
+        There are too many, or one is too long.
+    """
+    n_attributes = h5py.h5a.get_num_attrs(owner.id)
+    if n_attributes > MAX_ATTRIBUTES:
+        raise DamagedError(f"{owner.name} has {n_attributes} attributes; the limit is {MAX_ATTRIBUTES}")
+    for name in owner.attrs:
+        attribute = owner.attrs.get_id(name)
+        n_bytes = math.prod(attribute.shape) * max(attribute.dtype.itemsize, 1)
+        if max(n_bytes, attribute.get_storage_size()) > MAX_ATTRIBUTE_BYTES:
+            raise DamagedError(
+                f"attribute {name[:80]!r} of {owner.name} has {n_bytes} bytes; the limit is {MAX_ATTRIBUTE_BYTES}"
+            )
+
+
+def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
+    """Refuse variables that are not stored in the file as this package stores them.
+
+    Parameters
+    ----------
+    group : h5py.Group
+        Of a sensor.
+    table : iterable of Variable
+        Those that may be read; the ones that are missing are passed over.
+
+    Raises
+    ------
+    ForeignDataError
+        A variable lies elsewhere or is compressed.
+    DamagedError
+        A variable is not stored whole, or has another type or number of axes.
+    """
+    if len(group) > MAX_MEMBERS:
+        raise DamagedError(f"{group.name} has {len(group)} members; the limit is {MAX_MEMBERS}")
+    require_attributes(group)
+    room = group.file.id.get_filesize()
+    for owner, variable in _members(group, table):
+        dataset = child(owner, variable.name, h5py.Dataset)
+        _require_kind(dataset, variable)
+        room -= stored_bytes(dataset)
+        if room < 0:
+            raise DamagedError(
+                f"{dataset.name} and the variables before it store more bytes than the file has; copy it again"
+            )
+
+
+def _members(group: h5py.Group, table: Iterable[Variable]) -> Iterator[tuple[h5py.Group, Variable]]:
+    """Yield each variable that is there, with its group."""
+    for variable in table:
+        if variable.name in group:
+            yield group, variable
+    if "truth" in group:
+        truth = child(group, "truth", h5py.Group)
+        require_attributes(truth)
+        for variable in TRUTH:
+            if variable.name in truth:
+                yield truth, variable
+
+
+def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
+    """Refuse a type or a number of axes that the table does not name."""
+    dtype, is_text = dataset.dtype, variable.dtype == "str"
+    if is_text:
+        most = MAX_TEXT_BYTES.get(variable.name, MAX_COLUMN_TEXT_BYTES)
+        fits = dtype.kind == "S" and dtype.itemsize <= most
+    else:  # in older files, some have other sizes
+        kinds = "iuf" if not variable.dtype else "iu" if np.dtype(variable.dtype).kind in "iu" else "f"
+        fits = dtype.kind in kinds and dtype.itemsize <= 8
+    if not fits:
+        wanted = f"text of up to {most} bytes" if is_text else variable.dtype or "numbers"
+        raise DamagedError(f"{dataset.name} holds {str(dtype)[:80]}, wanted {wanted}; copy it again")
+    n_axes = len(variable.dims)
+    # A word axis is left out where there is one word.
+    if dataset.shape is None or not (dataset.ndim == n_axes or (variable.dims[2:] and dataset.ndim == n_axes - 1)):
+        raise DamagedError(
+            f"{dataset.name} has shape {dataset.shape}, wanted ({', '.join(variable.dims)}); copy it again"
+        )
+    if dataset.ndim > 1 and math.prod(dataset.shape[1:]) * dtype.itemsize > MAX_ROW_BYTES:
+        raise DamagedError(f"{dataset.name} has rows of {dataset.shape[1:]}; the limit is {MAX_ROW_BYTES} bytes")
+
+
+def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int:
+    """Return the size of a dataset in its file; refuse one that is elsewhere, compressed, or not stored whole.
+
+    Raises
+    ------
+    ForeignDataError
+        It is elsewhere or compressed.
+    DamagedError
+        It is not stored whole.
+    """
+    if dataset.is_virtual or dataset.external:
+        raise ForeignDataError(f"{dataset.name} lies in other files; copy the data into one file")
+    stored, wanted = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize
+    if dataset.id.get_create_plist().get_nfilters():
+        if not may_be_filtered:
+            raise ForeignDataError(f"{dataset.name} is compressed or filtered; write it again without filters")
+        stored *= MAX_COMPRESSION
+    if stored < wanted:
+        raise DamagedError(
+            f"{dataset.name} has {wanted} bytes (shape {dataset.shape}), and the file holds {stored}; copy it again"
+        )
+    return int(stored)
+
+
+def _path(group: h5py.Group, name: str) -> str:
+    return f"{group.name.rstrip('/')}/{name}"
