@@ -6,18 +6,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.arrivals import Arrivals, arrivals, effect
+from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.sources import Noise, Tone
 from ertis_numba.simulation.stopwatch import Stopwatch
 
-__all__ = ["LOUD", "peak_bound"]
+__all__ = ["LOUD", "may_be_loud", "peak_bound"]
 
 Floats = NDArray[np.float64]
 
 LOUD = 0.5
 """Amplitude from which converters take part in A/B renders: 6 dB below full scale."""
-_NODES = 9  # frequencies at which filters are evaluated
+_WEAKENING = frozenset(
+    {"occlusion", "absorption", "doppler", "emitter_response", "emitter_directivity", "microphone_directivity"}
+)
+_RIPPLE = 1.5  # by which spheres, and emitters beside their arrays, make an echo louder at the most
+_NODES = 5  # frequencies at which filters are evaluated
 _CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to their root mean square
+
+
+def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
+    """Return whether the signals may come within 6 dB of full scale with any choice of the effects not given."""
+    if "spreading" not in active:
+        return True
+    return _RIPPLE * peak_bound(shot, frozenset(EFFECTS) - _WEAKENING) >= LOUD
 
 
 def peak_bound(shot: Snapshot, active: frozenset[str]) -> float:

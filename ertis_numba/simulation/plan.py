@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ertis_numba.simulation.loudness import LOUD, peak_bound
+from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
@@ -157,9 +157,13 @@ def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapsho
 
 def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:
     """Return the measurement whose converters may be driven hardest, if they come within 6 dB of full scale."""
-    peaks = [max(peak_bound(shot, active), peak_bound(shot, active | {name})) for _, shot in shots]
-    place = int(np.argmax(peaks))
-    return [shots[place][0]] if peaks[place] >= LOUD else []
+    peaks = [
+        (max(peak_bound(shot, active), peak_bound(shot, active | {name})), index)
+        for index, shot in shots
+        if may_be_loud(shot, active)
+    ]
+    loudest, index = max(peaks, default=(0.0, 0))
+    return [index] if loudest >= LOUD else []
 
 
 def _measured_db(

@@ -1,5 +1,6 @@
 """Echo of a flat disc, near and far."""
 
+import functools
 import math
 
 import numpy as np
@@ -32,10 +33,16 @@ def disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
     near = nearness > _FAR
     if near.any():
         v, u = tilt[near], nearness[near]
-        count = 12 + math.ceil((float(u.max()) / 2 + float(v.max())) / 2)  # four a turn, and some for the ends
-        places, weights = np.polynomial.legendre.leggauss(count)
+        turns = (float(u.max()) / 2 + float(v.max())) / (2 * math.pi)
+        places, weights = _nodes(16 + 8 * math.ceil(turns / 2))  # four a turn, and some for the ends
         total = np.zeros(len(v), dtype=np.complex128)
         for place, weight in zip((places + 1) / 2, weights / 2, strict=True):
             total += weight * scipy.special.j0(v * math.sqrt(place)) * np.exp(-0.5j * u * place)
         found[near] = total
     return found
+
+
+@functools.lru_cache(maxsize=16)
+def _nodes(count: int) -> tuple[Floats, Floats]:
+    places, weights = np.polynomial.legendre.leggauss(count)
+    return places, weights
