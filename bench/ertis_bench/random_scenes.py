@@ -8,10 +8,10 @@ import numpy as np
 from ertis_numba.settings import Air, Array, Call, Processing, Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
 
-__all__ = ["random_scene", "varied_scene"]
+__all__ = ["OCTET", "random_scene", "varied_scene"]
 
 
-_OCTET = Array(
+OCTET = Array(
     layout="octet",
     positions_m=tuple(
         (0.0, 0.004 * (mic - 3.5) + 0.0007 * ((7 * mic) % 5 - 2), 0.004 * ((5 * mic) % 7 - 3)) for mic in range(8)
@@ -129,7 +129,7 @@ def _sensor(dice: _Dice) -> Sensor:
     if dice.chance(0.3):
         emitter["direct_sound_db"] = dice.between(-100, -50)
     return Sensor(
-        array=_OCTET,
+        array=OCTET,
         recording=Recording(n_samples=32_768),
         air=Air(temperature_c=dice.between(-20, 45), humidity_percent=dice.between(0, 100)),
         processing=Processing(directions="2d:61", range_m=(0.3, 1.05) if dice.chance(0.5) else (0.55, 1.05)),

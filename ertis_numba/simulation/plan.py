@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ertis_numba.simulation.limits import near_discs
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
@@ -21,6 +22,7 @@ Rehearse = Callable[[], ABRender]
 
 _INSTANTS, _MOST_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
 _MOST_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
+_PART_ALLOWED = 0.5  # of the tolerance in the rendered measurements of a scene in motion, as others may change more
 _MAX_RENDERED = 3  # measurements of a scene in motion that are rendered for one verdict
 _ROUNDS = 6  # two are the rule; effects that wait for each other take more
 
@@ -55,9 +57,17 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is simulated of a scene, and why."""
+    """What is simulated of a scene, and why.
+
+    Attributes
+    ----------
+    verdicts : tuple of Verdict
+    notes : tuple of str
+        Limits of the models that the scene exceeds.
+    """
 
     verdicts: tuple[Verdict, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def active(self) -> frozenset[str]:
@@ -76,6 +86,7 @@ def make_plan(scene: Scene) -> Plan:
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in near_discs(shot)))
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
     rounds = [_active(verdicts)]
@@ -84,10 +95,11 @@ def make_plan(scene: Scene) -> Plan:
             verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
-            return Plan(tuple(verdicts.values()))
+            return Plan(tuple(verdicts.values()), notes)
     # They go in a circle: one matters only with the other, which matters only without it.
     circle = frozenset.union(*rounds[2:]) - frozenset.intersection(*rounds[2:])
-    return Plan(tuple(_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values()))
+    kept = (_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values())
+    return Plan(tuple(kept), notes)
 
 
 def _kept_on(verdict: Verdict) -> Verdict:
@@ -132,7 +144,7 @@ def _decided(
     worst = estimates[0][0]
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
-    measured_db = None
+    measured_db, moves = None, scene.moves and scene.count > 1
     if worst.change_db / min(worst.sure, _MOST_TOO_HIGH) < scene.tolerance_db:
         indices = [index for estimate, index in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
         indices = [*dict.fromkeys(indices[:_MAX_RENDERED]), *_loudest(name, others, shots)]
@@ -140,7 +152,7 @@ def _decided(
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
         name=name,
-        on=change_db > scene.tolerance_db,
+        on=change_db > (_PART_ALLOWED if measured_db is not None and moves else 1.0) * scene.tolerance_db,
         reason=worst.reason if measured_db is None else f"{worst.reason}; rehearsed",
         estimate_db=change_db,
         rehearsed=measured_db is not None,

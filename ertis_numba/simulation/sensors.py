@@ -19,7 +19,7 @@ _LOUDEST_DB = 120.0
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # what can stand in a file
 _LARGEST_M = 0.2  # of an emitter or a microphone
 _MAX_OFFSET_M = 10.0  # one housing; whatever stands farther away is a sensor of its own
-_QUALITY_FACTORS = 0.1, 200.0  # from a film that sends all alike to a bare crystal
+_QUALITY_FACTORS = 1e-6, 200.0  # from a film that sends all alike to a bare crystal
 _MAX_DRIFT_PPM = 1000.0
 
 
