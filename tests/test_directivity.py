@@ -18,6 +18,7 @@ from tests.scenes import (
     NARROW,
     SENSOR,
     SPEED_M_S,
+    error_db,
     filtered,
     heard,
     line_array,
@@ -146,7 +147,7 @@ def test_first_side_lobe_of_a_line_array():
 @pytest.mark.parametrize("turned_deg", [0, 5, 15, 30, 60])
 def test_a_disc_mirrors_like_a_piston(turned_deg):
     """Both legs lie on one line, so that the phase over the disc runs twice: v = π d f · 2 sin θ / c."""
-    disc = Point(range_m=0.5, diameter_m=0.02, facing_deg=(180 - turned_deg, 0))
+    disc = Point(range_m=1.0, diameter_m=0.02, facing_deg=(180 - turned_deg, 0))
     scene = scene_of(disc, sensor=EAR)
     found = filtered(heard(scene), heard(scene, "target_size"))
     argument = 2 * math.pi * 0.02 * BAND_HZ / SPEED_M_S * math.sin(math.radians(turned_deg))
@@ -175,5 +176,8 @@ def test_a_disc_sends_nothing_from_its_back():
 
 
 def test_a_disc_faces_the_origin_where_nothing_is_said():
-    scene = scene_of(Point(azimuth_deg=40, elevation_deg=20, range_m=0.5, diameter_m=0.1), sensor=EAR)
-    assert_allclose(heard(scene, "target_size"), heard(scene), atol=1e-12)
+    disc = Point(azimuth_deg=40, elevation_deg=20, range_m=0.5, diameter_m=0.1)
+    facing, turned = (disc.replace(facing_deg=facing_deg) for facing_deg in ((-140.0, -20.0), (-130.0, -20.0)))
+    found, wanted, other = (heard(scene_of(each, sensor=EAR), "target_size") for each in (disc, facing, turned))
+    assert_allclose(found, wanted, atol=1e-12)
+    assert error_db(other, wanted) > -10

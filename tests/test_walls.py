@@ -209,7 +209,7 @@ def test_patterns_count_at_each_end_of_a_way_over_wall_and_point(end):
 def test_signals_hold_all_images():
     """Rendered, against calls written out at the places of the images."""
     floor = Wall(position_m=(0.0, 0.0, -0.4), facing_deg=(0.0, 90.0), reflection_db=-2)
-    sphere = Sphere(position_m=(0.6, 0.1, 0.0), radius_m=0.05)
+    sphere = Sphere(position_m=(0.85, 0.1, 0.0), radius_m=0.3)  # so large that it is a mirror at all frequencies
     scene = scene_of(Point(position_m=(0.5, -0.2, 0.1)), walls=(floor,), spheres=(sphere,))
     names = ("walls", "occlusion", "spreading", "target_size")
     found = ways(scene, *names)

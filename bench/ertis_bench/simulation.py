@@ -45,8 +45,16 @@ def free_field() -> Scene:
         azimuth_deg=48.0, range_m=3.95, strength_db=-2.0, diameter_m=1e-4, velocity_m_s=(0.0, 0.0, 1e-7)
     )
     sensor = Sensor(
-        emitter=Emitter(diameter_m=1e-5, direct_sound_db=weak),
-        electronics=Electronics(noise_dbfs=-150.0, gain_spread_db=1e-7, microphone_diameter_m=1e-5),
+        emitter=Emitter(
+            diameter_m=1e-5,
+            direct_sound_db=weak,
+            position_m=(0.0, 0.0, 1e-9),
+            resonance_hz=40_000.0,
+            quality_factor=1e-6,
+        ),
+        electronics=Electronics(
+            noise_dbfs=-150.0, gain_spread_db=1e-7, microphone_diameter_m=1e-5, clock_drift_ppm=1e-6
+        ),
     )
     return Scene(
         sensors=(sensor, Sensor(name="far", position_m=(300.0, 0.0, 0.0), emitter=Emitter(level_db=weak))),

@@ -92,14 +92,38 @@ def scaling(**given: Any) -> None:
 
 @bench.command()
 @_count(30)
+@click.option(
+    "--verdicts",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Instead of timing, add each effect that was left out of N random scenes; fail if one changes an image.",
+)
 @_update
 @options.quiet
 @options.as_json
-def simulation(**given: Any) -> None:
+def simulation(*, verdicts: int | None, **given: Any) -> None:
     """Scene to bits, with the effects that a scene calls for and with all."""
     from ertis_bench import simulation as benchmark
 
-    _run("simulation", benchmark, **given)
+    if verdicts is None:
+        _run("simulation", benchmark, **given)
+        return
+    from ertis_bench.verdicts import run
+
+    from ertis_numba.errors import DataError
+
+    if given["targets"]:
+        raise click.UsageError("--verdicts makes no table; leave out --update")
+    report = run(count=verdicts, say=lambda text: options.say(text, quiet=given["quiet"]))
+    if given["as_json"]:
+        options.print_json(report)
+    else:
+        click.echo(
+            f"{report['verdicts']} verdicts in {report['scenes']} scenes, {report['rendered']} of them by A/B renders; "
+            f"effects left out that change an image by more than the tolerance: {len(report['wrong'])}"
+        )
+    if report["wrong"]:
+        raise DataError(f"verdicts are wrong: {report['wrong']}; report these scenes")
 
 
 @bench.command()

@@ -104,6 +104,8 @@ def simulate(
                 f"follow up to {followed:g}; lower emitter.level_db or move things away",
                 quiet=quiet,
             )
+    for note in plan.notes:
+        options.say(f"note: {note}", quiet=quiet)
     effects = _effects(plan, simulators)
     if as_json:
         options.print_json(_report(target, scene, truth) | ({"effects": effects} if explain else {}))

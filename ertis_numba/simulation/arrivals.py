@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,15 @@ from ertis_numba.settings import Call
 from ertis_numba.simulation.mirrors import images
 from ertis_numba.simulation.paths import Paths, by_targets, without_target
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.snapshot import Mouth, Snapshot
 from ertis_numba.simulation.stopwatch import Stopwatch
 
-__all__ = ["Arrivals", "arrivals", "echoes", "effect", "gains", "responses"]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "mouth_of", "responses"]
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 _TICK_S = 1e-12
+_LONGEST_STRETCH = 2.0  # of a call, as nothing moves at more than a third of the speed of sound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,16 +32,19 @@ class Arrivals:
     call : Call
     delay_s : (path, mic) float64
         From the start of the record, the microphone's own lateness included.
-    amplitude : (path, mic, node) float64
+    amplitude : (path, mic, node) float64 or complex128
         At the frequencies of the nodes, or one node for all; the microphone's sensitivity included.
     stretch : (path, mic) float64 or None
-        How long a second of the call lasts, where something moves.
+        How long a second of the call lasts, where something moves or clocks differ.
+    emitter : Emitter or None
+        Whose transducer filters the call, where it does.
     """
 
     call: Call
     delay_s: Floats
-    amplitude: Floats
+    amplitude: Floats | Complexes
     stretch: Floats | None = None
+    emitter: Emitter | None = None
 
 
 def effect(name: str, function: str | None = None) -> Any:
@@ -76,26 +81,35 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
             amplitude = level * responses(shot, active, paths, sensor.emitter, frequency_hz, clock)
             with clock("doppler" if "doppler" in active else own):
                 delay_s, stretch = _times(shot, active, paths)
-            found.append(_arrivals(sensor.call, delay_s + start_s + late_s, gain[:, None] * amplitude, stretch))
+            amplitude = gain[:, None] * amplitude
+            found.append(_arrivals(shot, active, number, delay_s + start_s, amplitude, late_s, stretch))
     direct_db = shot.sensor.emitter.direct_sound_db
     if "direct_sound" in active and direct_db is not None and not shot.sensor.emitter.silent:
         with clock("direct_sound"):
-            paths = effect("direct_sound")(shot)
-            amplitude = _linear(direct_db) * effect("spreading")(paths)
+            paths = effect("direct_sound")(shot, mouth_of(shot, active, shot.number))
+            amplitude = (_linear(direct_db) * gain * effect("spreading")(paths))[..., None]
             delay_s = effect("propagation")(paths, shot.speed_m_s)
-            found.append(_arrivals(shot.sensor.call, delay_s + late_s, (gain * amplitude)[..., None], None))
+            found.append(_arrivals(shot, active, shot.number, delay_s, amplitude, late_s))
     if "interference" in active:
         with clock("interference"):
             found += _sonars(shot, gain, late_s)
     return found
 
 
+def mouth_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Mouth:
+    """Return the emitter of a sensor, at the sensor's origin or beside it."""
+    if "emitter_offset" in active:
+        return cast("Mouth", effect("emitter_offset")(shot, number))
+    return shot.mouths[number]
+
+
 def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch) -> list[Paths]:
     """Return the paths of an emitter's call over targets and walls, and straight from another sensor's."""
-    mouth = shot.mouths[number]
+    mouth = mouth_of(shot, active, number)
     if "walls" in active:
+        key = "walls", number, "emitter_offset" in active
         with clock("walls"):
-            firsts, seconds, specular = shot.once(("walls", number), lambda: effect("walls")(shot, mouth))
+            firsts, seconds, specular = shot.once(key, lambda: effect("walls")(shot, mouth))
     else:
         firsts = tuple(images(mouth, shot.targets.positions_m, (), 0))
         seconds = tuple(images(shot.ear, shot.targets.positions_m, (), 0))
@@ -128,17 +142,19 @@ def responses(
     emitter: Emitter,
     frequency_hz: Floats,
     clock: Stopwatch,
-) -> Floats:
-    """Return what distance, air, walls, targets and directions leave of a call: (path, mic, node) float64."""
+) -> Floats | Complexes:
+    """Return what distance, air, walls, targets and directions leave of a call: (path, mic, node).
+
+    float64, or complex128 where a target turns the phase. The transducer's own response is left to `emitted`.
+    """
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
     if "spreading" in active:
         with clock("spreading"):
             amplitude *= effect("spreading")(paths)[..., None]
-    if "target_size" in active and np.any(paths.targets.diameter_m):
+    if "target_size" in active and len(paths.targets):
         with clock("target_size"):
-            pattern = effect("target_size", "disc_pattern")(paths, frequency_hz, shot.speed_m_s)
-            amplitude = amplitude * pattern
+            amplitude = amplitude * effect("target_size", "patterns")(paths, frequency_hz, shot.speed_m_s)
     if "absorption" in active:
         with clock("absorption"):
             amplitude = amplitude * effect("absorption")(paths, shot.sensor.air, frequency_hz)
@@ -152,6 +168,13 @@ def responses(
             pattern = effect("microphone_directivity")(paths, diameter_m, frequency_hz, shot.speed_m_s)
             amplitude = amplitude * pattern
     return amplitude
+
+
+def emitted(active: AbstractSet[str], emitter: Emitter, frequency_hz: Floats) -> Floats | Complexes:
+    """Return what the transducer makes of each frequency of a call: (node,) float64 or complex128."""
+    if "emitter_response" in active and emitter.resonance_hz is not None:
+        return cast("Complexes", effect("emitter_response")(emitter, frequency_hz))
+    return np.ones(len(frequency_hz))
 
 
 def gains(shot: Snapshot, active: AbstractSet[str], clock: Stopwatch) -> tuple[Floats, Floats]:
@@ -199,14 +222,41 @@ def _sonars(shot: Snapshot, gain: Floats, late_s: Floats) -> list[Arrivals]:
         starts_s = effect("interference", "calls_of")(shot, sonar)
         if len(starts_s):
             delay_s = way_s + starts_s[:, None] + late_s
-            found.append(
-                _arrivals(sonar.call, delay_s, np.repeat((gain * amplitude)[..., None], len(starts_s), axis=0), None)
-            )
+            amplitude = np.repeat((gain * amplitude)[..., None], len(starts_s), axis=0)
+            found.append(Arrivals(sonar.call, _ticks(delay_s), amplitude))
     return found
 
 
-def _arrivals(call: Call, delay_s: Floats, amplitude: Floats, stretch: Floats | None) -> Arrivals:
-    return Arrivals(call, np.rint(delay_s / _TICK_S) * _TICK_S, amplitude, stretch)
+def _arrivals(
+    shot: Snapshot,
+    active: AbstractSet[str],
+    number: int,
+    delay_s: Floats,
+    amplitude: Floats | Complexes,
+    late_s: Floats,
+    stretch: Floats | None = None,
+) -> Arrivals:
+    """Return copies of a sensor's call, by the clock of the sensor that listens.
+
+    What is over before the record begins, as it may be with clocks that differ, is left out.
+    """
+    sensor = shot.scene.sensors[number]
+    if "clock_drift" in active:
+        delay_s, stretch = effect("clock_drift")(shot, number, delay_s, stretch)
+    emitter, lasts_s = None, sensor.call.duration_s
+    if "emitter_response" in active and sensor.emitter.resonance_hz is not None:
+        emitter = sensor.emitter
+        lasts_s += effect("emitter_response", "ringing_s")(emitter)
+    delay_s = delay_s + late_s
+    heard = np.max(delay_s, axis=1) > -_LONGEST_STRETCH * lasts_s
+    if not heard.all():
+        delay_s, amplitude = delay_s[heard], amplitude[heard]
+        stretch = None if stretch is None else stretch[heard]
+    return Arrivals(sensor.call, _ticks(delay_s), amplitude, stretch, emitter)
+
+
+def _ticks(delay_s: Floats) -> Floats:
+    return np.asarray(np.rint(delay_s / _TICK_S) * _TICK_S)
 
 
 def _linear(level_db: float) -> float:

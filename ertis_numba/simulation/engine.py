@@ -1,6 +1,7 @@
 """From a scene and its effects to words: PDM bits, or PCM numbers."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,22 +100,47 @@ class Engine:
         checks.whole("index", index, 0)
         return snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
 
+    def converted(self, signals: NDArray[np.float64], draw: int) -> NDArray[Any]:
+        """Return the words that modulators or converters make of signals, which hold all noise but their own.
+
+        Parameters
+        ----------
+        signals : (mic, sample) float64
+            Full scale 1.
+        draw : int
+            Decides the dither of modulators.
+        """
+        form = word_format(self._settings)
+        words = np.zeros(form.rows, form.dtype)
+        keys = np.arange(len(signals), dtype=np.uint64) + np.uint64(draw * len(signals))
+        if self.sensor.recording.is_pdm:
+            self._modulator(self._layout, keys, 0.0).process(signals, out=words)
+            return words
+        numbers = np.empty((len(words), len(signals)), form.dtype)
+        Converter(self.sensor.recording, keys, 0.0).process(signals, out=numbers)
+        words[:, np.flatnonzero(self._layout.enabled)] = numbers
+        return words
+
+    def _modulator(self, layout: Layout, keys: NDArray[np.uint64], noise_rms: float) -> Modulator:
+        electronics, recording = self.sensor.electronics, self.sensor.recording
+        return Modulator(
+            layout,
+            keys,
+            np.full(len(keys), noise_rms),
+            order=electronics.modulator_order,
+            dither=electronics.dither,
+            band=min(self.sensor.call.high_frequency_hz / recording.sample_rate_hz, 0.25),
+            threads=self._threads,
+        )
+
     def _modulate(self, shot: Snapshot, index: int, part: slice, out: NDArray[np.unsignedinteger]) -> None:
         """Fill the words of some channels."""
         mics = np.flatnonzero((shot.channels >= part.start) & (shot.channels < part.stop))
         if not len(mics):
             return
         chosen = slice(mics[0], mics[-1] + 1)
-        electronics, recording = self.sensor.electronics, self.sensor.recording
-        modulator = Modulator(
-            _part(self._layout, part),
-            self._keys(index, len(shot.channels))[chosen],
-            np.full(len(mics), self._noise_rms()),
-            order=electronics.modulator_order,
-            dither=electronics.dither,
-            band=min(self.sensor.call.high_frequency_hz / recording.sample_rate_hz, 0.25),
-            threads=self._threads,
-        )
+        keys = self._keys(index, len(shot.channels))[chosen]
+        modulator = self._modulator(_part(self._layout, part), keys, self._noise_rms())
         for first, block in zip(_begins(len(out)), self._signals(shot.of_mics(chosen), index), strict=True):
             words = np.empty_like(out[first : first + synthesis.BLOCK], order="C")
             with self.clock("modulation"):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import absorption_db_m
-from ertis_numba.simulation.arrivals import effect
+from ertis_numba.simulation.arrivals import effect, mouth_of
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.sight import Echoes, Sight, change_db
 from ertis_numba.simulation.sources import Sonar
@@ -45,6 +45,51 @@ def _spreading(sight: Sight) -> Estimate | None:
         return None
     longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
     return _filtered(sight, "spreading", f"on ways of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
+
+
+def _emitter_offset(sight: Sight) -> Estimate | None:
+    """Compare paths from emitters at their places with those from the centres of their arrays."""
+    sensors = sight.shot.scene.sensors
+    if not any(any(sensors[number].emitter.position_m) for number in sight.emitters(sight.active)):
+        return None
+    return replace(
+        _filtered(sight, "emitter_offset", "the emitter's place changes {name} by {change:.2f} dB"), sure=200.0
+    )
+
+
+def _clock_drift(sight: Sight) -> Estimate | None:
+    """Compute the shift of echoes by the clocks of sensors."""
+    shot = sight.shot
+    sensors = shot.scene.sensors
+    heard = [shot.number, *sight.emitters(sight.active)]
+    if not any(sensors[number].electronics.clock_drift_ppm for number in heard):
+        return None
+    worst = Estimate(change_db=0.0, reason="nothing is heard")
+    for number in sight.emitters(sight.active):
+        seen = sight.of_emitter(number, sight.active)
+        if not len(seen):
+            continue
+        counted_s, _ = effect("clock_drift")(shot, number, seen.delay_s[:, None], None)
+        moved = replace(seen, delay_s=counted_s[:, 0])
+        shift_s = moved.delay_s - seen.delay_s
+        reach = np.maximum(sight.reach(seen.delay_s), sight.reach(moved.delay_s))
+        change = change_db(sight.envelope_change(seen, moved) * reach, sight.beside(seen.delay_s))
+        if change >= worst.change_db:
+            most = shift_s[np.argmax(np.abs(shift_s))]
+            reason = f"clocks shift what {sensors[number].name} sends by up to {1e9 * most:+.3g} ns"
+            worst = Estimate(change_db=change, reason=reason, sure=200.0)
+    return worst
+
+
+def _emitter_response(sight: Sight) -> Estimate | None:
+    """Compare echoes with those of a transducer that sends all frequencies alike."""
+    shot = sight.shot
+    emitters = [shot.scene.sensors[number].emitter for number in sight.emitters(sight.active)]
+    resonances_hz = [emitter.resonance_hz for emitter in emitters if emitter.resonance_hz is not None]
+    if not (resonances_hz and len(sight.heard)):
+        return None
+    reason = f"a resonance at {resonances_hz[0] / 1000:.3g} kHz changes {{name}} by {{change:.2f}} dB"
+    return replace(_filtered(sight, "emitter_response", reason), sure=200.0)
 
 
 def _walls(sight: Sight) -> Estimate | None:
@@ -214,7 +259,7 @@ def _direct_sound(sight: Sight) -> Estimate | None:
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
-    paths = effect("direct_sound")(sight.shot)
+    paths = effect("direct_sound")(sight.shot, mouth_of(sight.shot, sight.active, sight.shot.number))
     amplitude = 10 ** (emitter.direct_sound_db / 20) * effect("spreading")(paths)[0]
     time_s, level = sight.near_field(amplitude, paths.length_m[0] / sight.shot.speed_m_s)
     over_m = sight.settings.call.duration_s * sight.shot.speed_m_s / 2
@@ -326,12 +371,16 @@ def _emitter(name: str, own: str) -> str:
 
 def _filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
     """Return what a filter on each path, or the effect of that name, changes in the image."""
+    name = after if isinstance(after, str) else None
     if isinstance(after, str):
         after = sight.echoes(sight.active | {after})
     if not len(sight.heard):
         return Estimate(change_db=0.0, reason="nothing arrives")
     own = sight.heard
-    ratio = sight.envelope_change(own, after) * sight.reach(own.delay_s) / sight.beside(own.delay_s, after)
+    reach = sight.reach(own.delay_s)
+    if name is not None:  # by ringing, an echo may reach into the window that did not before
+        reach = np.maximum(reach, Sight.of(sight.shot, sight.active | {name}).reach(own.delay_s))
+    ratio = sight.envelope_change(own, after) * reach / sight.beside(own.delay_s, after)
     worst = int(np.argmax(ratio))
     found = 20 * math.log10(1 + ratio[worst])
     if not ratio[worst]:
@@ -361,15 +410,18 @@ def _unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estim
 
 ESTIMATES: Final[dict[str, Callable[[Sight], Estimate | None]]] = {
     "spreading": _spreading,
+    "emitter_offset": _emitter_offset,
     "walls": _walls,
     "occlusion": _occlusion,
     "target_size": _target_size,
     "absorption": _absorption,
+    "emitter_response": _emitter_response,
     "emitter_directivity": _emitter_directivity,
     "microphone_directivity": _microphone_directivity,
     "doppler": _doppler,
     "cross_emission": _cross_emission,
     "sync_delay": _sync_delay,
+    "clock_drift": _clock_drift,
     "direct_sound": _direct_sound,
     "interference": _interference,
     "ambient_noise": _ambient_noise,

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ertis_numba.simulation.limits import near_discs
+from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
@@ -15,8 +17,13 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
 __all__ = ["Plan", "Verdict", "make_plan"]
 
+ABRender = Callable[[int, frozenset[str], str], float | None]
+Rehearse = Callable[[], ABRender]
+
 _INSTANTS, _MOST_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
 _MOST_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
+_PART_ALLOWED = 0.5  # of the tolerance in the rendered measurements of a scene in motion, as others may change more
+_MAX_RENDERED = 3  # measurements of a scene in motion that are rendered for one verdict
 _ROUNDS = 6  # two are the rule; effects that wait for each other take more
 
 
@@ -50,9 +57,17 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is simulated of a scene, and why."""
+    """What is simulated of a scene, and why.
+
+    Attributes
+    ----------
+    verdicts : tuple of Verdict
+    notes : tuple of str
+        Limits of the models that the scene exceeds.
+    """
 
     verdicts: tuple[Verdict, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def active(self) -> frozenset[str]:
@@ -66,11 +81,12 @@ def make_plan(scene: Scene) -> Plan:
     All sensors are asked, at the beginning, at the end, in between and at way points; the greatest change
     counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
     what filters echoes, then what adds to them; and again in the light of all others, until nothing changes. Where
-    an estimate is not sure enough, the measurement where it is greatest is rendered and processed with the effect
-    and without.
+    an estimate is not sure enough, the measurements where it is greatest are rendered and processed with the effect
+    and without. So is the loudest measurement, where converters may answer to what an estimate does not see.
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in near_discs(shot)))
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
     rounds = [_active(verdicts)]
@@ -79,10 +95,11 @@ def make_plan(scene: Scene) -> Plan:
             verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
-            return Plan(tuple(verdicts.values()))
+            return Plan(tuple(verdicts.values()), notes)
     # They go in a circle: one matters only with the other, which matters only without it.
     circle = frozenset.union(*rounds[2:]) - frozenset.intersection(*rounds[2:])
-    return Plan(tuple(_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values()))
+    kept = (_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values())
+    return Plan(tuple(kept), notes)
 
 
 def _kept_on(verdict: Verdict) -> Verdict:
@@ -92,14 +109,21 @@ def _kept_on(verdict: Verdict) -> Verdict:
 
 
 def _indices(scene: Scene) -> list[int]:
-    """Return the measurements that are asked: of a scene in motion several, those at its way points among them."""
-    if not scene.moves or scene.count == 1:
-        return [0]
+    """Return the measurements that are asked.
+
+    The first; of a scene in motion several more, those at its way points among them; of clocks that drift, the last
+    before a SYNC.
+    """
     last = scene.count - 1
-    corners_s = sorted({time_s for thing in scene.things() for time_s, *_ in thing.waypoints})
-    between_s = [(a + b) / 2 for a, b in itertools.pairwise(corners_s)]
-    corners = np.clip(np.rint(np.array([*corners_s, *between_s][:_MOST_CORNERS]) * scene.rate_hz), 0, last)
-    return [int(index) for index in np.unique([*np.linspace(0, last, _INSTANTS).round(), *corners])]
+    indices = [0]
+    if scene.moves and scene.count > 1:
+        corners_s = sorted({time_s for thing in scene.things() for time_s, *_ in thing.waypoints})
+        between_s = [(a + b) / 2 for a, b in itertools.pairwise(corners_s)]
+        corners = np.clip(np.rint(np.array([*corners_s, *between_s][:_MOST_CORNERS]) * scene.rate_hz), 0, last)
+        indices = [int(index) for index in np.unique([*np.linspace(0, last, _INSTANTS).round(), *corners])]
+    if any(sensor.electronics.clock_drift_ppm for sensor in scene.sensors):
+        indices.append(min(last, scene.sync_every - 1))
+    return sorted(set(indices))
 
 
 def _decided(
@@ -107,42 +131,68 @@ def _decided(
     name: str,
     others: frozenset[str],
     shots: list[tuple[int, Snapshot]],
-    rehearse: Callable[[], Callable[[int, frozenset[str], str], float | None]],
+    rehearse: Rehearse,
 ) -> Verdict:
     """Return the verdict on one effect beside others."""
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     forced = scene.effects.get(name)
-    worst, index = _worst(name, others, shots)
-    if worst is None:
+    estimates = _estimates(name, others, shots)
+    if not estimates:
         reason = f"the scene has nothing for it: {EFFECTS[name]}"
         return Verdict(name=name, on=bool(forced), reason=reason, forced=forced is not None)
+    worst = estimates[0][0]
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
-    high_db, low_db = worst.change_db * worst.sure, worst.change_db / min(worst.sure, _MOST_TOO_HIGH)
-    unsure = low_db < scene.tolerance_db < high_db
-    measured_db = rehearse()(index, others, name) if unsure else None
+    measured_db, moves = None, scene.moves and scene.count > 1
+    if worst.change_db / min(worst.sure, _MOST_TOO_HIGH) < scene.tolerance_db:
+        indices = [index for estimate, index in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
+        indices = [*dict.fromkeys(indices[:_MAX_RENDERED]), *_loudest(name, others, shots)]
+        measured_db = _measured_db(scene, rehearse, indices, others, name)
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
         name=name,
-        on=change_db > scene.tolerance_db,
+        on=change_db > (_PART_ALLOWED if measured_db is not None and moves else 1.0) * scene.tolerance_db,
         reason=worst.reason if measured_db is None else f"{worst.reason}; rehearsed",
         estimate_db=change_db,
         rehearsed=measured_db is not None,
     )
 
 
-def _worst(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> tuple[Estimate | None, int]:
-    """Return the estimate of the greatest change, and the measurement it is about."""
-    worst, where = None, 0
-    for index, shot in shots:
-        estimate = ESTIMATES[name](Sight.of(shot, active))
-        if estimate is not None and (worst is None or estimate.change_db > worst.change_db):
-            worst, where = estimate, index
-    return worst, where
+def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
+    """Return the estimates of all shots, the greatest change first, and the measurements they are about."""
+    found = [(ESTIMATES[name](Sight.of(shot, active)), index) for index, shot in shots]
+    return sorted(
+        ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
+    )
 
 
-def _rehearsals(scene: Scene) -> Callable[[int, frozenset[str], str], float | None]:
+def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:
+    """Return the measurement whose converters may be driven hardest, if they come within 6 dB of full scale."""
+    peaks = [
+        (max(peak_bound(shot, active), peak_bound(shot, active | {name})), index)
+        for index, shot in shots
+        if may_be_loud(shot, active)
+    ]
+    loudest, index = max(peaks, default=(0.0, 0))
+    return [index] if loudest >= LOUD else []
+
+
+def _measured_db(
+    scene: Scene, rehearse: Rehearse, indices: list[int], others: frozenset[str], name: str
+) -> float | None:
+    """Return the greatest change of some measurements, up to the first that exceeds the tolerance."""
+    worst_db: float | None = None
+    for index in dict.fromkeys(indices):
+        change_db = rehearse()(index, others, name)
+        if change_db is not None:
+            worst_db = max(change_db, worst_db or 0.0)
+            if worst_db > scene.tolerance_db:
+                break
+    return worst_db
+
+
+def _rehearsals(scene: Scene) -> ABRender:
     # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
     from ertis_numba.simulation.rehearsal import Rehearsal  # noqa: PLC0415
 

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.settings import Call, Settings
+from ertis_numba.simulation.arrivals import effect
+from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, matched_filter
 
 __all__ = ["N_NODES", "band", "baseband", "envelope", "match", "matched"]
@@ -25,32 +27,42 @@ def match(settings: Settings) -> tuple[MatchedFilter, float, int]:
     return matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz), rate_hz, n_fft
 
 
-def matched(settings: Settings, call: Call) -> NDArray[np.complex128]:
-    """Return a call, 1 at the microphones, after the filter of the own call: (lag,) complex128, from lag 0 on."""
+def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
+    """Return a call, 1 at the microphones, after the filter of the own call: (lag,) complex128, from lag 0 on.
+
+    The response of the emitter's transducer is included where one is given.
+    """
     rate_hz = settings.signal_rate_hz
-    n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s) * rate_hz))
+    rings_s = 0.0 if emitter is None else effect("emitter_response", "ringing_s")(emitter)
+    n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s + rings_s) * rate_hz))
     mine = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
     bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
     spectrum = np.zeros(n_fft, dtype=np.complex128)
     spectrum[bins] = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins] * mine.values
+    if emitter is not None:
+        spectrum[bins] *= effect("emitter_response")(emitter, np.arange(bins.start, bins.stop) * rate_hz / n_fft)
     return np.asarray(np.fft.ifft(spectrum))
 
 
 @functools.lru_cache(maxsize=16)
-def baseband(settings: Settings) -> tuple[Floats, NDArray[np.complex128]]:
+def baseband(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, NDArray[np.complex128]]:
     """Return the matched call without its carrier, by lag: (lag,) float64 seconds, (lag,) complex128."""
-    pulse = np.fft.fftshift(matched(settings, settings.call))
+    pulse = np.fft.fftshift(matched(settings, settings.call, emitter))
     lag_s = (np.arange(len(pulse)) - len(pulse) // 2) / settings.signal_rate_hz
     frequency_hz, power = band(settings)
     return lag_s, pulse * np.exp(-2j * math.pi * float(frequency_hz @ power) * lag_s)
 
 
 @functools.lru_cache(maxsize=16)
-def envelope(settings: Settings) -> tuple[Floats, Floats]:
-    """Return the envelope of the matched call, by lags from 0 on: both (lag,) float64."""
-    lag_s, pulse = baseband(settings)
+def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, Floats]:
+    """Return the envelope of the matched call, by lags from 0 on: both (lag,) float64.
+
+    Where its emitter rings, relative to its peak.
+    """
+    lag_s, pulse = baseband(settings, emitter)
     middle = len(lag_s) // 2
-    return lag_s[middle:], np.abs(pulse[middle:])
+    after = np.abs(pulse[middle:])
+    return lag_s[middle:], after if emitter is None else after / after.max()
 
 
 @functools.lru_cache(maxsize=16)

@@ -11,6 +11,7 @@ from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
@@ -19,6 +20,7 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["Rehearsal", "image_change_db"]
 
+Image = NDArray[np.float32]
 
 _KEPT = 24  # images: most verdicts are about the same effects with one more or less
 
@@ -26,7 +28,8 @@ _KEPT = 24  # images: most verdicts are about the same effects with one more or 
 class Rehearsal:
     """Renders and processes measurements of a scene with some effects and with others.
 
-    The modulators are left out: they answer to any change with other noise, which is no change of the image.
+    Modulators and converters take part where a signal comes within 6 dB of full scale. Elsewhere they are left out:
+    they answer to any change with other noise, which is no change of the image.
 
     Parameters
     ----------
@@ -35,7 +38,9 @@ class Rehearsal:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._image = functools.lru_cache(maxsize=_KEPT)(self._rendered)
+        self._signals = functools.lru_cache(maxsize=2)(self._rendered)
+        self._image = functools.lru_cache(maxsize=_KEPT)(self._imaged)
+        self._images = functools.lru_cache(maxsize=_KEPT)(self._converted)
         self._chain = functools.lru_cache(maxsize=8)(_chain)
         # All renderings have the same noise, which takes as long as the rest of one.
         self._noise = functools.lru_cache(maxsize=1)(_noise)
@@ -43,7 +48,8 @@ class Rehearsal:
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
         """Return by how much an effect changes the images of all sensors at the most, in decibels.
 
-        None where a sensor's settings give no image, as with a range window beyond the end of its record.
+        Sensors whose settings give no image, as with a range window beyond the end of their records, are left out;
+        None where no sensor gives one.
 
         Parameters
         ----------
@@ -59,28 +65,54 @@ class Rehearsal:
             try:
                 self._chain(sensor.settings())
             except ArgumentError:
-                return None
-            before, after = (self._image(sensor.name, index, active) for active in both)
+                continue
             shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
             spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
             floor = min(Sight(shot, active).floor for active in both)
+            (before, one), (after, other) = (self._image(sensor.name, index, active) for active in both)
             changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
-        return max(changes_db)
+            if max(one, other) >= LOUD:
+                pairs = [self._images(sensor.name, index, active) for active in both]
+                noise = np.min([_local(np.abs(pair[1] - pair[0]), spacing_m) for pair in pairs], axis=0)
+                change_db = image_change_db(pairs[0][0], pairs[1][0], spacing_m=spacing_m, floor=floor, noise=noise)
+                changes_db.append(change_db)
+        return max(changes_db, default=None)
 
-    def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float32]:
+    def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
+        """Return what modulators or converters receive, noise included: (mic, sample) float64."""
         sensor = self._scene.sensor(name)
         signals = Engine(self._scene, sensor, active).signals(index)
         dbfs = sensor.electronics.noise_dbfs
         if "microphone_noise" in active and dbfs is not None:
             signals += 10 ** (dbfs / 20) * self._noise(self._scene.seed, signals.shape)
-        chain = self._chain(sensor.settings())
+        return signals
+
+    def _imaged(self, name: str, index: int, active: frozenset[str]) -> tuple[Image, float]:
+        """Return the image of the signals themselves, and their highest amplitude."""
+        signals = self._signals(name, index, active)
+        chain = self._chain(self._scene.sensor(name).settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
         chain.process_signals(signals, image)
-        return image
+        return image, float(np.abs(signals).max())
+
+    def _converted(self, name: str, index: int, active: frozenset[str]) -> list[Image]:
+        """Return two images of what modulators or converters make of the signals, with different dither."""
+        sensor = self._scene.sensor(name)
+        engine, signals = Engine(self._scene, sensor, active), self._signals(name, index, active)
+        chain = self._chain(sensor.settings())
+        images = [np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32) for _ in range(2)]
+        for draw, image in enumerate(images):
+            chain.process(engine.converted(signals, draw), image)
+        return images
 
 
 def image_change_db(
-    before: NDArray[np.float32], after: NDArray[np.float32], *, spacing_m: float, floor: float
+    before: Image,
+    after: Image,
+    *,
+    spacing_m: float,
+    floor: float,
+    noise: Image | float = 0.0,
 ) -> float:
     """Return by how much two images differ at the most.
 
@@ -95,11 +127,19 @@ def image_change_db(
         Of the ranges.
     floor : float
         The weakest reflector that is to be kept.
+    noise : float or (range,) float32
+        Difference that noise alone makes, which is no change.
     """
-    both = np.minimum(before, after).max(axis=0)
-    near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(both))) + 1
-    beside = np.maximum(scipy.ndimage.maximum_filter1d(both, near), floor)
-    return float(20 * np.log10(1 + np.max(np.abs(after - before) / beside, initial=0.0)))
+    beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
+    change = np.maximum(np.abs(after - before) - noise, 0.0)
+    return float(20 * np.log10(1 + np.max(change / beside, initial=0.0)))
+
+
+def _local(image: Image, spacing_m: float) -> Image:
+    """Return the strongest over all directions and 5 cm of range: (range,) float32."""
+    strongest = image.max(axis=0)
+    near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(strongest))) + 1
+    return np.asarray(scipy.ndimage.maximum_filter1d(strongest, near))
 
 
 def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -36,6 +36,8 @@ class Scene(Document, frozen=True, kw_only=True):
         Measurements per second.
     count : int
         Number of measurements.
+    sync_every : int
+        Measurements from one SYNC to the next; between them the sample clocks run free.
     tolerance_db : float
         Effects that change no image by more are left out.
     max_reflections : int
@@ -55,6 +57,7 @@ class Scene(Document, frozen=True, kw_only=True):
     seed: int = 0
     rate_hz: float = 20.0
     count: int = 1
+    sync_every: int = 1
     tolerance_db: float = 0.1
     max_reflections: int = 2
     effects: dict[str, bool] = msgspec.field(default_factory=dict)
@@ -73,6 +76,7 @@ class Scene(Document, frozen=True, kw_only=True):
         checks.whole("seed", self.seed, 0, 2**63 - 1)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
         checks.whole("count", self.count, 1, 10**9)
+        checks.whole("sync_every", self.sync_every, 1, 10**9)
         checks.between("tolerance_db", self.tolerance_db, 1e-6, 60.0)
         checks.whole("max_reflections", self.max_reflections, 0, _MOST_REFLECTIONS)
         for name, wanted in self.effects.items():

@@ -11,17 +11,20 @@ from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
-from ertis_numba.simulation.placed import Placed, Vector
+from ertis_numba.simulation.placed import Placed, Vector, check_vector
 
 __all__ = ["Electronics", "Emitter", "Sensor"]
 
 _LOUDEST_DB = 120.0
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # what can stand in a file
 _LARGEST_M = 0.2  # of an emitter or a microphone
+_MAX_OFFSET_M = 10.0  # one housing; whatever stands farther away is a sensor of its own
+_QUALITY_FACTORS = 1e-6, 200.0  # from a film that sends all alike to a bare crystal
+_MAX_DRIFT_PPM = 1000.0
 
 
 class Emitter(Table, frozen=True, kw_only=True):
-    """The loudspeaker, which sits at the sensor's origin and faces forward.
+    """The loudspeaker, which faces forward.
 
     Attributes
     ----------
@@ -34,15 +37,28 @@ class Emitter(Table, frozen=True, kw_only=True):
         Level 1 m from the emitter of what goes to the sensor's own microphones; they hear nothing by default.
     silent : bool
         The sensor only listens.
+    position_m : (x, y, z)
+        In the sensor frame, whose origin is the centroid of the enabled microphones.
+    resonance_hz : float, optional
+        Of the transducer, which then filters the call and rings; it sends all frequencies alike by default.
+    quality_factor : float
+        Of that resonance: its bandwidth is ``resonance_hz / quality_factor``.
     """
 
     level_db: float = 0.0
     diameter_m: float = 0.0
     direct_sound_db: float | None = None
     silent: bool = False
+    position_m: Vector = (0.0, 0.0, 0.0)
+    resonance_hz: float | None = None
+    quality_factor: float = 5.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_vector("emitter.position_m", self.position_m, _MAX_OFFSET_M)
+        if self.resonance_hz is not None:
+            checks.between("emitter.resonance_hz", self.resonance_hz, 1e3, 1e6)
+        checks.between("emitter.quality_factor", self.quality_factor, *_QUALITY_FACTORS)
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
         checks.between("emitter.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
         if self.direct_sound_db is not None:
@@ -69,6 +85,8 @@ class Electronics(Table, frozen=True, kw_only=True):
         Microphones that hear nothing; their modulators run on silence.
     stuck_low, stuck_high : tuple of int
         Channels whose bit is always 0 or always 1, or whose number is that at either end of the scale.
+    clock_drift_ppm : float
+        Microseconds that the sensor's sample clock gains per second.
     """
 
     noise_dbfs: float | None = None
@@ -80,6 +98,7 @@ class Electronics(Table, frozen=True, kw_only=True):
     dead_channels: tuple[int, ...] = ()
     stuck_low: tuple[int, ...] = ()
     stuck_high: tuple[int, ...] = ()
+    clock_drift_ppm: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,6 +109,7 @@ class Electronics(Table, frozen=True, kw_only=True):
         checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, _LARGEST_M)
         checks.between("electronics.gain_spread_db", self.gain_spread_db, 0.0, 20.0)
         checks.between("electronics.delay_spread_s", self.delay_spread_s, 0.0, 1e-4)
+        checks.between("electronics.clock_drift_ppm", self.clock_drift_ppm, -_MAX_DRIFT_PPM, _MAX_DRIFT_PPM)
         both = set(self.stuck_low) & set(self.stuck_high)
         if both:
             raise ArgumentError(

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import pulse
-from ertis_numba.simulation.arrivals import echoes, effect, responses
+from ertis_numba.simulation.arrivals import echoes, effect, emitted, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
@@ -22,7 +22,7 @@ from ertis_numba.simulation.stopwatch import Stopwatch
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
-_GEOMETRY = frozenset({"walls", "occlusion", "target_size"})  # on which ways of the sound depend
+_GEOMETRY = frozenset({"walls", "occlusion", "target_size", "emitter_offset"})  # on which ways of the sound depend
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among side lobes
@@ -43,7 +43,7 @@ class Echoes:
     Attributes
     ----------
     names : tuple of str
-    gain : (path, node) float64
+    gain : (path, node) float64 or complex128
     delay_s : (path,) float64
         To the middle of the array.
     direction : (path, axis) float64
@@ -51,7 +51,7 @@ class Echoes:
     """
 
     names: tuple[str, ...]
-    gain: Floats
+    gain: NDArray[np.inexact[Any]]
     delay_s: Floats
     direction: Floats
 
@@ -90,6 +90,7 @@ class Sight:
         self.active = active
         self.settings = shot.sensor.settings()
         self.frequency_hz, self.power = pulse.band(self.settings)
+        self._rings = shot.sensor.emitter if "emitter_response" in active else None
 
     @classmethod
     def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
@@ -152,10 +153,11 @@ class Sight:
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
         emitter = self.shot.scene.sensors[number].emitter
-        gain = responses(self._middle, active, paths, emitter, self.frequency_hz, Stopwatch())
+        level = 10 ** (emitter.level_db / 20) * emitted(active, emitter, self.frequency_hz)
+        gain = level * responses(self._middle, active, paths, emitter, self.frequency_hz, Stopwatch())[:, 0]
         return Echoes(
             names=paths.names,
-            gain=10 ** (emitter.level_db / 20) * np.broadcast_to(gain[:, 0], (len(paths), pulse.N_NODES)),
+            gain=np.asarray(np.broadcast_to(gain, (len(paths), pulse.N_NODES))),
             delay_s=paths.length_m[:, 0] / self.shot.speed_m_s,
             direction=-paths.arriving[:, 0] @ paths.ear.axes.T,
         )
@@ -205,7 +207,7 @@ class Sight:
 
     def _lobe(self, lag_s: Floats) -> Floats:
         """Return the highest range side lobe of the call at a lag and beyond, 1 at its peak."""
-        lags_s, envelope = pulse.envelope(self.settings)
+        lags_s, envelope = pulse.envelope(self.settings, self._rings)
         return np.asarray(np.interp(lag_s, lags_s, np.maximum.accumulate(envelope[::-1])[::-1]))
 
     def coverage(self, direction: Floats) -> Floats:
@@ -268,7 +270,7 @@ class Sight:
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
         every = max(1, len(_directions(self.settings)) // _LAG_DIRECTIONS)
         early_s = _directions(self.settings)[::every] @ self._positions_m.T / self.shot.speed_m_s
-        lag_s, sound = pulse.baseband(self.settings)
+        lag_s, sound = pulse.baseband(self.settings, self._rings)
         at_s = time_s[:, None, None] - (delay_s + early_s)
         carrier = np.exp(2j * math.pi * float(self.frequency_hz @ self.power) * at_s)
         heard = (np.interp(at_s, lag_s, sound.real) + 1j * np.interp(at_s, lag_s, sound.imag)) * carrier

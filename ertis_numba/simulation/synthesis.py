@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.settings import Call
-from ertis_numba.simulation.arrivals import Arrivals
+from ertis_numba.simulation.arrivals import Arrivals, effect
 from ertis_numba.simulation.stopwatch import Stopwatch
 from ertis_numba.waveform import call_at
 
@@ -91,7 +91,8 @@ def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_h
     step = 1
     for entry, delay in zip(arrived, delay_samples, strict=True):
         stretch = 1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0))
-        call = max(call, math.ceil(stretch * entry.call.duration_s * rate_hz))
+        rings_s = 0.0 if entry.emitter is None else effect("emitter_response", "ringing_s")(entry.emitter)
+        call = max(call, math.ceil(stretch * (entry.call.duration_s + rings_s) * rate_hz))
         spread = max(spread, math.ceil(np.ptp(delay, axis=1).max(initial=0.0)))
         if entry.stretch is not None:
             step = math.lcm(step, _step(entry.call, rate_hz))
@@ -118,18 +119,31 @@ def _add(
     out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
     turns, amplitude = delay_samples / n_fft, np.ascontiguousarray(entry.amplitude[chosen])
     kernel_set, nodes_per_bin = kernels.load("cpu"), rate_hz / n_fft / NODE_HZ
+
+    def add(call: NDArray[np.complex128], paths: NDArray[np.intp]) -> None:
+        """Add some paths; the kernel takes real amplitudes, so that imaginary ones go with a call turned by 90°."""
+        turned = paths[amplitude[paths].imag.any(axis=(1, 2))]
+        with kernel_set.threads(threads):
+            kernel_set.add_paths(call, turns[paths], amplitude[paths].real.copy(), 0, nodes_per_bin, out)
+            if len(turned):
+                part = amplitude[turned].imag.copy()
+                kernel_set.add_paths(1j * call, turns[turned], part, 0, nodes_per_bin, out)
+
     still = np.ones(len(turns), dtype=np.bool_)
     if entry.stretch is not None:
         stretch = entry.stretch[chosen]
         still = np.abs(stretch - 1).max(axis=1) < _STILL
         for path in np.flatnonzero(~still):
             call = _stretched(entry.call, stretch[path], rate_hz, n_fft, n_bins)
-            with kernel_set.threads(threads):
-                kernel_set.add_paths(call, turns[[path]], amplitude[[path]], 0, nodes_per_bin, out)
+            if entry.emitter is not None:
+                at_hz = np.outer(stretch[path], np.arange(n_bins) * rate_hz / n_fft)
+                call = call * effect("emitter_response")(entry.emitter, at_hz)
+            add(call, np.array([path]))
     if still.any():
         call = _spectrum(entry.call, rate_hz, n_fft)[None, :n_bins]
-        with kernel_set.threads(threads):
-            kernel_set.add_paths(call, turns[still], amplitude[still], 0, nodes_per_bin, out)
+        if entry.emitter is not None:
+            call = call * effect("emitter_response")(entry.emitter, np.arange(n_bins) * rate_hz / n_fft)
+        add(call, np.flatnonzero(still))
     spectra[:, :n_bins] += out
     return n_bins
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Reflector
-from ertis_numba.simulation.arrivals import echoes, responses
+from ertis_numba.simulation.arrivals import echoes, emitted, responses
 from ertis_numba.simulation.paths import Paths, unit
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
@@ -51,7 +51,9 @@ def _levels(shot: Snapshot, sight: Sight) -> Floats:
     if not emitter.silent:
         ways = echoes(shot, sight.active, shot.number, Stopwatch())
     parts = [
-        responses(shot, sight.active, paths, emitter, sight.frequency_hz, Stopwatch()) * sight.power for paths in ways
+        responses(shot, sight.active, paths, emitter, sight.frequency_hz, Stopwatch())
+        * (emitted(sight.active, emitter, sight.frequency_hz) * sight.power)
+        for paths in ways
     ]
     return np.concatenate([np.zeros(0), *(np.abs(np.sum(part, axis=2)).mean(axis=1) for part in parts)])
 

@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from ertis_numba.simulation.paths import Paths
 
-__all__ = ["spreading"]
+__all__ = ["NEAREST_M", "spreading"]
 
-_NEAREST_M = 0.01  # emitters, reflectors and microphones have a size: amplitudes stop growing here
+NEAREST_M = 0.01
+"""Emitters, reflectors and microphones have a size: amplitudes stop growing here."""
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:
@@ -20,8 +21,8 @@ def spreading(paths: Paths) -> NDArray[np.float64]:
     """
     first_m, second_m = paths.first_m, paths.second_m
     if not len(paths.targets):
-        return np.asarray(1 / np.maximum(first_m + second_m, _NEAREST_M))
-    first_m, second_m = np.maximum(first_m, _NEAREST_M), np.maximum(second_m, _NEAREST_M)
+        return np.asarray(1 / np.maximum(first_m + second_m, NEAREST_M))
+    first_m, second_m = np.maximum(first_m, NEAREST_M), np.maximum(second_m, NEAREST_M)
     amplitude = 1 / (first_m * second_m)
     if not paths.surface:
         return np.asarray(amplitude)

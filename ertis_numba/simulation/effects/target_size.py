@@ -5,12 +5,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.effects.disc import disc
+from ertis_numba.simulation.effects.rigid_sphere import LARGE, rigid_sphere
+from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.paths import Paths, turning, unit
 from ertis_numba.simulation.snapshot import Ear, Mouth, Targets
 
-__all__ = ["disc_pattern", "over_surfaces"]
+__all__ = ["over_surfaces", "patterns"]
+
+Floats = NDArray[np.float64]
 
 
 def over_surfaces(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: NDArray[np.intp]) -> Paths:
@@ -28,20 +32,33 @@ def over_surfaces(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chose
     return turning(first, second, targets, chosen, turns_m, surface=True)
 
 
-def disc_pattern(paths: Paths, frequency_hz: NDArray[np.float64], speed_m_s: float) -> NDArray[np.float64]:
-    """Return what discs send towards the ear of what reaches them: (path, 1, frequency) float64.
+def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | NDArray[np.complex128]:
+    """Return what the size of targets makes of their echoes: (path, mic, frequency), 1 for points.
 
-    The far field of a plane circular mirror, ``2 J₁(v) / v`` with ``v = π d f |s| / c``, s being the sum of the
-    unit vectors towards both ends without its part along the normal (Kirchhoff's approximation without its
-    obliquity; both
-    ends on the facing side, else nothing).
+    Spheres of a few wavelengths scatter as `rigid_sphere` says, larger ones are mirrors. Discs echo as `disc` says,
+    into the half space that they face; both ends must lie in it. float64, or complex128 where phases turn.
     """
-    towards_ear = unit(np.mean(paths.arriving, axis=1))
-    towards_mouth = unit(-np.mean(paths.leaving, axis=1))
-    normal = paths.targets.normals
-    both = towards_ear + towards_mouth
+    wave = 2 * math.pi / speed_m_s * frequency_hz
+    targets = paths.targets
+    found = np.ones((*paths.second_m.shape, len(wave)), dtype=np.complex128)
+    lowest = float(wave.min(initial=math.inf, where=wave > 0))
+    small = (targets.radius_m > 0) & (targets.radius_m * lowest < LARGE)
+    if small.any():
+        cos_turn = np.sum(paths.leaving[small] * paths.arriving[small], axis=-1)
+        found[small] = rigid_sphere(targets.radius_m[small, None] * wave, cos_turn)
+    is_disc = targets.diameter_m > 0
+    if is_disc.any():
+        found[is_disc] = _disc_pattern(paths, is_disc, wave)
+    return found if found.imag.any() else found.real
+
+
+def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDArray[np.complex128]:
+    """Return what discs send to each microphone of what reaches them: (disc, mic, frequency) complex128."""
+    to_ear, to_mouth = paths.arriving[chosen], -paths.leaving[chosen]
+    normal, radius_m = paths.targets.normals[chosen, None], paths.targets.diameter_m[chosen, None] / 2
+    both = to_ear + to_mouth
     aside = np.linalg.norm(both - np.sum(both * normal, axis=-1, keepdims=True) * normal, axis=-1)
-    pattern = piston(math.pi / speed_m_s * (paths.targets.diameter_m * aside)[:, None] * frequency_hz)
-    seen = (np.sum(towards_ear * normal, axis=-1) > 0) & (np.sum(towards_mouth * normal, axis=-1) > 0)
-    is_disc = paths.targets.diameter_m > 0
-    return np.asarray(np.where((is_disc & ~seen)[:, None], 0.0, pattern)[:, None, :])
+    bent_m = 1 / np.maximum(paths.first_m[chosen], NEAREST_M) + 1 / np.maximum(paths.second_m[chosen], NEAREST_M)
+    pattern = disc((radius_m * aside)[..., None] * wave, (radius_m**2 * bent_m)[..., None] * wave)
+    seen = (np.sum(to_ear * normal, axis=-1) > 0) & (np.sum(to_mouth * normal, axis=-1) > 0)
+    return np.where(seen[..., None], pattern, 0.0)

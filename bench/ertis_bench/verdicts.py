@@ -1,0 +1,169 @@
+"""Verdicts on effects, tried on random scenes: each effect put in and left out, and the images compared."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.random_scenes import varied_scene
+from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Accuracy, Settings
+from ertis_numba.simulation import Scene, Sensor
+from ertis_numba.simulation.loudness import LOUD
+from ertis_numba.simulation.plan import Plan, make_plan
+from ertis_numba.simulation.rehearsal import image_change_db
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
+from ertis_numba.simulation.snapshot import Snapshot, snapshot
+from ertis_numba.stages.fast import FastChain
+
+__all__ = ["Trial", "run", "with_one"]
+
+_SURE = 300  # times the noise of modulators: it changes such a reflector by less than 0.03 dB
+_PLAN = Accuracy(
+    precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=60.0, zones=1
+)
+
+
+def run(*, count: int, say: Callable[[str], None], first: int = 0) -> dict[str, Any]:
+    """Try the verdicts on some random scenes.
+
+    Parameters
+    ----------
+    count : int
+        Scenes.
+    say : callable
+        Called with what is under way.
+    first : int
+        Seed of the first scene.
+
+    Returns
+    -------
+    dict
+        Number of verdicts, and those effects that were left out and change an image by more than the tolerance.
+    """
+    tried, rendered, wrong = 0, 0, []
+    for seed in range(first, first + count):
+        say(f"scene {seed}")
+        scene = varied_scene(seed)
+        plan = make_plan(scene)
+        tried += sum(verdict.estimate_db is not None for verdict in plan.verdicts)
+        rendered += sum(verdict.rehearsed for verdict in plan.verdicts)
+        index = int(np.random.default_rng(seed).integers(scene.count))
+        found = Trial(scene, index).left_out(plan)
+        wrong += [{"scene": seed, **each} for each in found if each["change_db"] > scene.tolerance_db]
+    return {"scenes": count, "verdicts": tried, "rendered": rendered, "wrong": wrong}
+
+
+def with_one(plan: Plan, name: str, *, on: bool) -> Plan:
+    """Return a plan with another verdict on one effect."""
+    return Plan(
+        tuple(dataclasses.replace(verdict, on=on) if verdict.name == name else verdict for verdict in plan.verdicts)
+    )
+
+
+class Trial:
+    """Compares images of one measurement of a scene with different effects.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : int
+        Of the measurement.
+    """
+
+    def __init__(self, scene: Scene, index: int = 0) -> None:
+        self.scene, self.index = scene, index
+        self._signals = functools.lru_cache(maxsize=8)(self._rendered)
+        self._image = functools.lru_cache(maxsize=8)(self._imaged)
+
+    def left_out(self, plan: Plan) -> list[dict[str, Any]]:
+        """Return by how much each effect that the plan leaves out changes the images."""
+        return [
+            {
+                "effect": verdict.name,
+                "measurement": self.index,
+                "estimate_db": verdict.estimate_db,
+                "rehearsed": verdict.rehearsed,
+                "change_db": self.total_change_db(plan, verdict.name),
+            }
+            for verdict in plan.verdicts
+            if not verdict.on and verdict.estimate_db is not None
+        ]
+
+    def total_change_db(self, plan: Plan, name: str) -> float:
+        """Return by how much an effect changes the images, those from loud signals as words."""
+        changed_db = self.change_db(plan, name)
+        other = with_one(plan, name, on=name not in plan.active)
+        if max(self.loudest(each) for each in (plan, other)) < LOUD:
+            return changed_db
+        return max(changed_db, *(self.reflector_change_db(sensor, plan, other) for sensor in self.scene.sensors))
+
+    def loudest(self, plan: Plan) -> float:
+        """Return the highest amplitude that modulators or converters receive."""
+        return max(float(np.abs(self._signals(sensor.name, plan)).max()) for sensor in self.scene.sensors)
+
+    def change_db(self, plan: Plan, name: str) -> float:
+        """Return by how much an effect changes images before modulators, which add other noise each time."""
+        other = with_one(plan, name, on=name not in plan.active)
+        changes_db = []
+        for sensor in self.scene.sensors:
+            before, after = (self._image(sensor.name, each) for each in (plan, other))
+            shot = self._shot(sensor)
+            floor = min(Sight(shot, plan.active | {name}).floor, Sight(shot, plan.active - {name}).floor)
+            spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+            changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
+        return max(changes_db)
+
+    def reflector_change_db(self, sensor: Sensor, one: Plan, other: Plan) -> float:
+        """Return by how much the levels of reflectors far above the noise differ in images from words.
+
+        What another draw of the noise changes as much is no difference.
+        """
+        pipeline = Pipeline(sensor.settings())
+        shown = Sight(self._shot(sensor), one.active)
+        sure = shown.shown & (shown.levels(shown.heard) > _SURE * shown.noise)
+        ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
+
+        def levels_db(seed: int, plan: Plan) -> NDArray[np.float64]:
+            scene = self.scene.replace(seed=seed)
+            words = Simulator(scene, sensor=sensor.name, plan=plan).render(self.index)
+            image = pipeline.process(words).energy
+            near = [np.abs(pipeline.range_m - range_m) < SAME_RANGE_M for range_m in ranges_m]
+            return np.array([20 * math.log10(image[:, places].max()) for places in near if places.any()])
+
+        seed = self.scene.seed
+        before, after, again = (levels_db(*each) for each in ((seed, one), (seed, other), (seed + 1, one)))
+        return float(np.max(np.abs(after - before) - np.abs(again - before), initial=0.0))
+
+    def _shot(self, sensor: Sensor) -> Snapshot:
+        return snapshot(self.scene, sensor, self.index / self.scene.rate_hz)
+
+    def _rendered(self, name: str, plan: Plan) -> NDArray[np.float64]:
+        signals = Simulator(self.scene, sensor=name, plan=plan).signals(self.index)
+        dbfs = self.scene.sensor(name).electronics.noise_dbfs
+        if "microphone_noise" in plan.active and dbfs is not None:
+            signals += 10 ** (dbfs / 20) * _white_noise(self.scene.seed, signals.shape)
+        return signals
+
+    def _imaged(self, name: str, plan: Plan) -> NDArray[np.float32]:
+        chain = _chain(self.scene.sensor(name).settings())
+        image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+        chain.process_signals(self._signals(name, plan), image)
+        return image
+
+
+@functools.lru_cache(maxsize=4)
+def _chain(settings: Settings) -> FastChain:
+    kernel_set = kernels.load("cpu")
+    return FastChain(settings.replace(accuracy=_PLAN), kernel_set, threads=kernel_set.max_threads)
+
+
+@functools.lru_cache(maxsize=2)
+def _white_noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).standard_normal(shape)

@@ -1,0 +1,42 @@
+"""Sample clocks that run fast or slow."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.snapshot import Snapshot
+
+__all__ = ["clock_drift", "since_sync_s"]
+
+Floats = NDArray[np.float64]
+
+
+def clock_drift(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | None) -> tuple[Floats, Floats | None]:
+    """Return delays and stretches of an emitter's call as the clock of the listening sensor counts them.
+
+    Both clocks start with the SYNC, T before the measurement. A clock that is fast by d counts ``(1 + d)`` seconds per
+    second, so that what an emitter with drift e sends after its own T arrives ``T (d - e) / (1 + e) + (1 + d) τ``
+    after the listener's own T. The call lasts ``(1 + d) / (1 + e)`` times as long. Of its own echoes, a sensor thus
+    counts every delay too long by d.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    number : int
+        Of the sensor that emits.
+    delay_s : (path, mic) float64
+    stretch : (path, mic) float64 or None
+    """
+    sensors = shot.sensor, shot.scene.sensors[number]
+    listener, emitter = (1e-6 * sensor.electronics.clock_drift_ppm for sensor in sensors)
+    late_s = since_sync_s(shot) * (listener - emitter) / (1 + emitter)
+    counted_s = (1 + listener) * delay_s + late_s
+    if listener == emitter:
+        return counted_s, stretch
+    longer = (1 + listener) / (1 + emitter)
+    return counted_s, np.full(delay_s.shape, longer) if stretch is None else longer * stretch
+
+
+def since_sync_s(shot: Snapshot) -> float:
+    """Return the time from the last SYNC to the start of the measurement, in seconds."""
+    scene = shot.scene
+    return (round(shot.time_s * scene.rate_hz) % scene.sync_every) / scene.rate_hz

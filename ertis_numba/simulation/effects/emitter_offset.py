@@ -1,0 +1,19 @@
+"""Position of the emitter beside the centre of its array."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ertis_numba.simulation.snapshot import Mouth, Snapshot
+
+__all__ = ["emitter_offset"]
+
+
+def emitter_offset(shot: Snapshot, number: int) -> Mouth:
+    """Return a sensor's emitter at its mounting place, ``o + R p``.
+
+    ``o`` is the sensor's origin, ``R`` its rotation and ``p`` the setting ``emitter.position_m``. A path is then
+    bistatic: its length is ``|x - (o + R p)| + |x - m|`` for a target x and a microphone m.
+    """
+    sensor, mouth = shot.scene.sensors[number], shot.mouths[number]
+    return replace(mouth, position_m=mouth.position_m + sensor.rotation() @ np.array(sensor.emitter.position_m))
