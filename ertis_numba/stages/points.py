@@ -251,7 +251,7 @@ class _Spread:
     @classmethod
     def of(cls, settings: Settings, *, is_planar: bool) -> "_Spread":
         """Return that of an array and its call."""
-        frequency_hz, power = matched_spectrum(settings.call, n_waves=_WAVES)
+        frequency_hz, power = matched_spectrum(settings, n_waves=_WAVES)
         mean_square = float(power @ frequency_hz**2)
         positions_m = microphones(settings.array).enabled_positions_m
         return cls(
