@@ -15,6 +15,7 @@ from ertis_bench.network.tables import network, network_faults
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.reliability_tables import reliability
+from ertis_bench.verification import form as verification
 from ertis_numba.errors import ArgumentError
 from ertis_numba.verification import PEAKS
 
@@ -325,5 +326,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "network-faults": {"network-faults": network_faults},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
+    "verification": {"verification": verification},
 }
 """What each command writes between which markers: a file chooses a form by the marker that it has."""

@@ -12,7 +12,7 @@ from ertis_numba.stages.detect import find_peaks
 from ertis_numba.verification._exact import ExactImage
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
 
-__all__ = ["Measured", "error_db", "exact_image", "measure"]
+__all__ = ["Measured", "error_db", "exact_image", "measure", "sampled_directions"]
 
 _MAX_OPERATIONS = 8e9  # complex multiplications: some ten seconds
 
@@ -56,7 +56,7 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
             n_directions=len(wanted),
             peaks=peak_errors(image, find_peaks(image.replace(energy=wanted.astype(np.float32)), top=PEAKS)),
         )
-    chosen, weights = _sample(image.energy, most)
+    chosen, weights = sampled_directions(image.energy, most)
     wanted = np.stack([exact.amplitudes(direction) for direction in chosen.tolist()])
     scale = np.sqrt(weights)[:, None]
     return Measured(
@@ -94,7 +94,7 @@ def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float
     return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf
 
 
-def _sample(energy: NDArray[np.float32], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def sampled_directions(energy: NDArray[np.float32], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return directions and their weights in a sum over all: (direction,) intp, (direction,) float64.
 
     Systematic sampling with probabilities half even and half by brightness: neighbours are alike, so drawing at equal
