@@ -70,7 +70,7 @@ def test_exact_image_agrees_with_referee(settings):
     measurement = measurement_of(settings)
     image = Pipeline(settings, "cpu", 1, max_error_db=0.0).process(measurement)
     exact = ExactImage(image, measurement)
-    found = np.stack([exact.amplitudes(direction) for direction in range(5)])
+    found = np.stack([exact.amplitudes(direction, np.arange(len(image.range_m))) for direction in range(5)])
     assert reference.error_db(found, wanted_of(image, measurement)) < -140
 
 
@@ -122,33 +122,36 @@ def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer):
 def test_silence_gives_amplitudes_of_zero(beamformer):
     settings = small(recording=PCM, processing=FIVE.replace(range_decimation=10, beamformer=beamformer))
     measurement = Measurement(np.zeros((PCM.n_samples, 32), dtype=np.int16), settings)
-    exact = ExactImage(Pipeline(settings, "cpu", 1, max_error_db=0).process(measurement), measurement)
-    assert not exact.amplitudes(2).any()
+    image = Pipeline(settings, "cpu", 1, max_error_db=0).process(measurement)
+    assert not ExactImage(image, measurement).amplitudes(2, np.arange(len(image.range_m))).any()
 
 
-def test_sampled_directions_stand_for_all(monkeypatch):
-    """A few of many directions measure the error of all, as bright ones are drawn more often."""
+@pytest.mark.parametrize(("wavefront", "n_sampled"), [("plane", 80), ("spherical", 8)])
+def test_sampled_places_stand_for_all(monkeypatch, wavefront, n_sampled):
+    """A few of many places measure the error of all, as bright ones are drawn more often."""
     with open_recording(REFLECTORS) as recording:
         measurement = recording[0]
-    settings = measurement.settings
-    settings = settings.replace(processing=settings.processing.replace(directions="2d:361", range_m=(0.5, 2.0)))
-    image = Pipeline(settings).process(measurement)
+    directions, range_m = ("2d:361", (0.5, 2.0)) if wavefront == "plane" else ("2d:25", (0.9, 1.3))
+    processing = measurement.settings.processing.replace(directions=directions, range_m=range_m, wavefront=wavefront)
+    image = Pipeline(measurement.settings.replace(processing=processing)).process(measurement)
     whole = verification.measure(image, measurement)
-    assert (whole.n_directions, whole.peaks.lost) == (361, 0)
-    monkeypatch.setattr(_measured, "_MAX_OPERATIONS", 60 * ExactImage(image, measurement).operations_per_direction)
+    assert whole.n_directions == len(image.energy)
+    assert whole.peaks.lost == 0
+    operations = ExactImage(image, measurement).operations_per_direction
+    monkeypatch.setattr(_measured, "_MAX_OPERATIONS", n_sampled * operations)
     some = verification.measure(image, measurement)
-    assert 30 < some.n_directions <= 60
     assert some.peaks is None
+    assert (some.n_directions <= n_sampled) == (wavefront == "plane")
     assert some.error_db == pytest.approx(whole.error_db, abs=0.5)
 
 
-def test_sample_weights_add_up_to_all_directions():
-    power = np.random.default_rng(1).uniform(0, 1, (50, 4)).astype(np.float32) ** 4
-    chosen, weights = _measured.sampled_directions(power, 500)
+def test_sample_weights_add_up_to_all():
+    power = np.random.default_rng(1).uniform(0, 1, 50) ** 4
+    chosen, weights = _measured.sampled(power, 500)
     assert chosen.tolist() == list(range(50))
     assert weights == pytest.approx(1.0, abs=0.15)
-    for energy in (np.zeros((50, 4), np.float32), np.full((50, 4), np.nan, np.float32)):
-        chosen, weights = _measured.sampled_directions(energy, 10)
+    for unknown in (np.zeros(50), np.full(50, np.nan)):
+        chosen, weights = _measured.sampled(unknown, 10)
         assert len(chosen) == 10
         assert weights.sum() == pytest.approx(50)
 

@@ -28,7 +28,8 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     """
     chosen = np.unique(np.linspace(0, len(image.energy) - 1, _DIRECTIONS + 2).astype(int)[1:-1])
     exact = ExactImage(image, measurement)
-    expected = np.stack([exact.amplitudes(direction) for direction in chosen.tolist()])
+    ranges = np.arange(image.energy.shape[1])
+    expected = np.stack([exact.amplitudes(direction, ranges) for direction in chosen.tolist()])
     difference = np.linalg.norm(image.energy[chosen] - expected)
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
     if not error_db <= max_error_db:

@@ -90,7 +90,7 @@ def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
     )
     peaks = verified["peaks"]
     if peaks is None:
-        yield "  reflectors were not compared, as the exact image of all directions would take too long"
+        yield "  reflectors were not compared, as the whole exact image would take too long"
         return
     line = f"  {peaks['wanted'] - peaks['lost']} of the strongest {options.counted(peaks['wanted'], 'reflector')} found"
     if peaks["level_db"] is not None:

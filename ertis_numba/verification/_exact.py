@@ -79,10 +79,18 @@ class ExactImage:
             count += len(self._range_m) * n_mics**2 * (n_mics // 3 + self._settings.processing.snapshots)
         return int(count)
 
-    def amplitudes(self, direction: int) -> NDArray[np.float64]:
-        """Return the exact amplitudes of one direction: (range,) float64."""
-        spherical = self._settings.processing.wavefront == "spherical"
-        return combine((self._spherical if spherical else self._plane)(direction), self._settings.processing)
+    def amplitudes(self, direction: int, ranges: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the exact amplitudes of some ranges of one direction: (range,) float64.
+
+        Parameters
+        ----------
+        direction : int
+        ranges : (range,) intp
+        """
+        processing = self._settings.processing
+        if processing.wavefront == "spherical":
+            return combine(self._spherical(direction, self._range_m[ranges]), processing)
+        return combine(self._plane(direction), processing)[ranges]  # Capon needs the neighbours of a range, too.
 
     def _plane(self, direction: int) -> NDArray[np.complex128]:
         """Return the signals delayed as plane waves are: (mic, range) complex128.
@@ -105,10 +113,10 @@ class ExactImage:
             scipy.fft.ifft(folded, axis=1, norm="forward")[:, : len(self._range_m)] * carrier, np.complex128
         )
 
-    def _spherical(self, direction: int) -> NDArray[np.complex128]:
+    def _spherical(self, direction: int, range_m: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the signals delayed as the echo of a point at each range is: (mic, range) complex128."""
-        points_m = self._range_m[:, None] * self._directions[direction]
-        paths_m = np.linalg.norm(points_m - self._positions_m[:, None], axis=2) + self._range_m  # (mic, range)
+        points_m = range_m[:, None] * self._directions[direction]
+        paths_m = np.linalg.norm(points_m - self._positions_m[:, None], axis=2) + range_m  # (mic, range)
         at_s = paths_m / self._speed_m_s
         # Σ_k Y_k exp(jω_k t) with k = a·n + b: a sum over a by a matrix product, then one over b. Both are exact.
         n = self._tabled.shape[2]
