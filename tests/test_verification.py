@@ -17,7 +17,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Call, Processing, Recording
-from ertis_numba.storage import open_recording, write_recording
+from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 from ertis_numba.verification import ExactImage, _measured
 from tests import reference
 from tests.files import SMALL, noise
@@ -72,6 +72,26 @@ def test_exact_image_agrees_with_referee(settings):
     exact = ExactImage(image, measurement)
     found = np.stack([exact.amplitudes(direction, np.arange(len(image.range_m))) for direction in range(5)])
     assert reference.error_db(found, wanted_of(image, measurement)) < -140
+
+
+def test_default_band_edges_are_5_khz_outside_the_call():
+    measurement = measurement_of(small())
+    images = [
+        Pipeline(small(processing=FIVE.replace(band_edges_hz=edges_hz)), "cpu", 1).process(measurement).energy
+        for edges_hz in (None, (20e3, 55e3))
+    ]
+    np.testing.assert_array_equal(*images)
+
+
+def test_band_edges_go_from_a_settings_file_into_the_energyscape_file(tmp_path):
+    recording = write_recording(tmp_path / "rec.h5", noise(count=1))
+    (tmp_path / "wide.toml").write_text("[processing]\nband_edges_hz = [5000, 90000]\n", "utf-8")
+    arguments = ["-o", str(tmp_path / "a.h5"), "--settings", str(tmp_path / "wide.toml"), "--verify", "--json"]
+    done = CliRunner().invoke(cli, ["process", str(recording), *arguments])
+    assert done.exit_code == 0, done.stderr
+    assert json.loads(done.stdout)["sensors"][0]["verified"]["error_db"] < -35
+    with open_energyscapes(tmp_path / "a.h5") as images:
+        assert images.settings.processing.band_edges_hz == (5e3, 90e3)
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,42 @@ def test_matched_filter_scales_with_the_echo_and_nothing_else():
     assert image[3000] == pytest.approx(-0.25, abs=1e-12)
 
 
+@pytest.mark.parametrize("call", [LOW, Call(duration_s=2e-4, ramp_fraction=0.0)], ids=["default", "short, no ramp"])
+def test_matched_filter_of_decimated_signals_has_the_bins_of_the_record(call):
+    """At the decimated rate a call that is short or has no ramp would alias."""
+    made = Settings(call=call)
+    assert made.decimation == 20
+    decimated = matched_filter(made, n_fft=2_000)
+    whole = matched_filter(made, n_fft=40_000, decimation=1)
+    assert decimated.first_bin == whole.first_bin
+    assert_allclose(decimated.values, whole.values, rtol=1e-12, atol=1e-12 * np.abs(whole.values).max())
+
+
+@pytest.mark.parametrize(
+    ("call", "band_edges_hz", "difference_db"),
+    [
+        (LOW, None, -58.0),
+        (LOW, (5e3, 90e3), -81.2),
+        (Call(duration_s=2e-4), None, -24.1),
+        (Call(duration_s=2e-4), (5e3, 90e3), -37.6),
+    ],
+    ids=["default", "default, wide band", "0.2 ms", "0.2 ms, wide band"],
+)
+def test_band_edges_change_an_echo_by_what_the_documentation_says(call, band_edges_hz, difference_db):
+    """Relative to the textbook matched filter, which has no band."""
+    n_fft = 2**17
+    spectrum = np.fft.rfft(call_samples(call, rate_hz=4.5e6), n_fft)
+    textbook = np.fft.ifft(np.append(np.abs(spectrum) ** 2, np.zeros(n_fft - len(spectrum))))
+    textbook = np.abs(textbook) / np.abs(textbook[0])
+    made = Settings(call=call, processing=Processing(band_edges_hz=band_edges_hz))
+    matched = matched_filter(made, n_fft=n_fft, decimation=1)
+    bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    filtered = np.zeros(n_fft, dtype=complex)
+    filtered[bins] = spectrum[bins] * matched.values
+    difference = np.linalg.norm(np.abs(np.fft.ifft(filtered)) - textbook) / np.linalg.norm(textbook)
+    assert 20 * np.log10(difference) == pytest.approx(difference_db, abs=0.2)
+
+
 # ---- the decimation filter -------------------------------------------------------------------------
 
 
