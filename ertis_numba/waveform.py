@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Call
+from ertis_numba.settings import Call, Settings
 
 __all__ = [
     "MatchedFilter",
     "call_at",
     "call_samples",
+    "call_spectrum",
     "decimation_taps",
     "filter_response",
     "matched_band_hz",
@@ -67,6 +68,29 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
     return 2 * math.pi / period_rise * np.log1p(time_s * period_rise / period_s)
 
 
+def call_spectrum(
+    call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
+) -> NDArray[np.complex128]:
+    """Return the one-sided spectrum of a call as decimated signals have it: (bin,) complex128.
+
+    The call is sampled at the rate of the record. At the decimated rate a call that is short, or has no ramp, would
+    alias: it has power beyond half of that rate, which the decimation filter takes from the signals.
+
+    Parameters
+    ----------
+    call : Call
+    settings : Settings
+        Settings of the record.
+    n_fft : int
+        Length of the transform of decimated signals, at least that of the call.
+    decimation : int, optional
+        Samples of the record per signal sample; that of the settings by default.
+    """
+    decimation = settings.decimation if decimation is None else decimation
+    samples = call_samples(call, rate_hz=settings.recording.sample_rate_hz)
+    return np.asarray(np.fft.rfft(samples, n_fft * decimation)[: n_fft // 2 + 1] / decimation)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFilter:
     """The matched filter of a call as the occupied bins of a one-sided spectrum.
@@ -85,22 +109,27 @@ class MatchedFilter:
     centre_hz: float
 
 
-def matched_band_hz(call: Call) -> tuple[float, float]:
-    """Return the band outside which the matched filter is 0: the call's, and its window's edges."""
+def matched_band_hz(settings: Settings) -> tuple[float, float]:
+    """Return the band outside which the matched filter is 0: `processing.band_edges_hz`, or 5 kHz around the call's."""
+    call, given = settings.call, settings.processing.band_edges_hz
+    if given is not None:
+        return given
     edge_hz = min(_TRANSITION_HZ, call.low_frequency_hz / 2)
     return call.low_frequency_hz - edge_hz, call.high_frequency_hz + edge_hz
 
 
-def matched_guard_s(call: Call, *, down_db: float = 60.0) -> float:
+def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
     """Return how long the matched filter rings before the call and after it, until it is ``down_db`` down.
 
     The edges of its band are raised cosines, whose transform falls with the third power of time.
     """
-    return 2 / (call.low_frequency_hz - matched_band_hz(call)[0]) * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
+    low_hz, high_hz = matched_band_hz(settings)
+    narrowest_hz = min(settings.call.low_frequency_hz - low_hz, high_hz - settings.call.high_frequency_hz)
+    return 2 / narrowest_hz * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
 
 
-def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
-    """Return the matched filter for spectra of ``n_fft`` points at ``rate_hz``.
+def matched_filter(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilter:
+    """Return the matched filter for spectra of ``n_fft`` points of decimated signals.
 
     ``H(f) = g conj(S(f)) W(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
     window that is 1 over the call's band and falls to 0 outside it as a raised cosine, and g such
@@ -108,22 +137,30 @@ def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
 
     Parameters
     ----------
-    call : Call
+    settings : Settings
+        Settings with the call, the rate of the record and the edges of the band.
     n_fft : int
         Even or odd, at least as long as the call.
-    rate_hz : float
+    decimation : int, optional
+        Samples of the record per signal sample; that of the settings by default.
 
     Returns
     -------
     MatchedFilter
     """
-    low_hz, high_hz = matched_band_hz(call)
-    last_bin = min(math.floor(high_hz * n_fft / rate_hz), n_fft // 2)  # the paper's rates may leave the edge no room
-    bins = np.arange(math.ceil(low_hz * n_fft / rate_hz), last_bin + 1)
-    frequency_hz = bins * rate_hz / n_fft
-    spectrum = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins]
-    outside_hz = np.maximum(call.low_frequency_hz - frequency_hz, frequency_hz - call.high_frequency_hz)
-    window = np.cos(math.pi / 2 * np.clip(outside_hz / (call.low_frequency_hz - low_hz), 0.0, 1.0)) ** 2
+    call = settings.call
+    decimation = settings.decimation if decimation is None else decimation
+    spacing_hz = settings.recording.sample_rate_hz / decimation / n_fft
+    low_hz, high_hz = matched_band_hz(settings)
+    last_bin = min(math.floor(high_hz / spacing_hz), n_fft // 2)  # the paper's rates may leave the edge no room
+    bins = np.arange(math.ceil(low_hz / spacing_hz), last_bin + 1)
+    frequency_hz = bins * spacing_hz
+    spectrum = call_spectrum(call, settings, n_fft=n_fft, decimation=decimation)[bins]
+    outside = np.maximum(
+        (call.low_frequency_hz - frequency_hz) / (call.low_frequency_hz - low_hz),
+        (frequency_hz - call.high_frequency_hz) / (high_hz - call.high_frequency_hz),
+    )
+    window = np.cos(math.pi / 2 * np.clip(outside, 0.0, 1.0)) ** 2
     power = np.abs(spectrum) ** 2 * window
     return MatchedFilter(
         first_bin=int(bins[0]),
@@ -132,14 +169,14 @@ def matched_filter(call: Call, *, n_fft: int, rate_hz: float) -> MatchedFilter:
     )
 
 
-def matched_spectrum(call: Call, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def matched_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the power of white noise after the matched filter: frequencies in hertz and shares, both (wave,) float64.
 
     The shares add up to 1. Of an echo, whose own spectrum comes on top, the band is a little narrower.
     """
-    rate_hz = 4 * call.high_frequency_hz
-    n_fft = max(8 * math.ceil(call.duration_s * rate_hz), 1024)
-    matched = matched_filter(call, n_fft=n_fft, rate_hz=rate_hz)
+    rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
+    n_fft = round(max(8 * math.ceil(settings.call.duration_s * fine_hz), 1024) * rate_hz / fine_hz)
+    matched = matched_filter(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
     power = np.abs(matched.values) ** 2
     # Parts of the band rather than single bins: the spectrum of a sweep has ripples.

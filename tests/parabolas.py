@@ -48,7 +48,7 @@ def amplitude(settings, direction_offset, range_offset_m):
 def waves_of(settings):
     """Wave numbers and power of the call, and where microphones are."""
     n_fft = 2048
-    matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=settings.signal_rate_hz)
+    matched = matched_filter(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
     power = np.abs(matched.values) ** 2
     positions_m = microphones(settings.array).enabled_positions_m

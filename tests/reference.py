@@ -7,11 +7,12 @@ algorithm. The plain functions below them say what each kernel should do.
 
 import functools
 import hashlib
-import itertools
+import math
 
 import numpy as np
-import scipy.fft
 import scipy.signal
+from ertis_bench import referee
+from ertis_bench.referee import signals_of
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
@@ -60,49 +61,20 @@ class _Same:
 @functools.lru_cache(maxsize=32)
 def _exact(words, directions, range_m, array, call, recording, air, spherical, delay_rate_hz):
     words, directions, range_m = words.values, directions.values, range_m.values
-    layout = microphones(array)
-    speed_m_s = sound_speed_m_s(air)
-    signals = signals_of(words, np.flatnonzero(layout.enabled), recording)
-    spectra, frequency_hz = _matched_spectra(signals, call, recording.sample_rate_hz)
-    spectra = spectra * np.exp(2j * np.pi * frequency_hz * layout.delay_s[layout.enabled][:, None])
-    spectra /= layout.gain[layout.enabled][:, None] * len(spectra)
-    positions_m = layout.enabled_positions_m
+    spectra, frequency_hz = referee.calibrated_spectra(words, array, call, recording, None)
+    positions_m, speed_m_s = microphones(array).enabled_positions_m, sound_speed_m_s(air)
     at_range = np.exp(2j * np.pi * frequency_hz * (2 * range_m / speed_m_s)[:, None])  # (range, bin)
     image = np.empty((len(directions), len(range_m)))
     for index, direction in enumerate(directions):
+        delay_s = referee.delays_s(positions_m, direction, range_m if spherical else None, speed_m_s)
         if spherical:
-            points_m = range_m[:, None, None] * direction - positions_m
-            delay_s = (np.linalg.norm(points_m, axis=-1) - range_m[:, None]) / speed_m_s
-            beam = sum(
-                (at_range * np.exp(2j * np.pi * frequency_hz * delay_s[:, mic, None])) @ spectra[mic]
-                for mic in range(len(spectra))
-            )
-        else:
-            delay_s = -(positions_m @ direction) / speed_m_s
-            if delay_rate_hz:
-                delay_s = np.rint(delay_s * delay_rate_hz) / delay_rate_hz
-            beam = at_range @ (spectra * np.exp(2j * np.pi * frequency_hz * delay_s[:, None])).sum(axis=0)
-        image[index] = np.abs(beam)
+            image[index] = referee.amplitudes(referee.delayed(spectra, frequency_hz, at_range, delay_s))
+            continue
+        if delay_rate_hz:
+            delay_s = np.rint(delay_s * delay_rate_hz) / delay_rate_hz
+        image[index] = np.abs(at_range @ (spectra * np.exp(2j * np.pi * frequency_hz * delay_s)).mean(axis=0))
     image.flags.writeable = False
     return image
-
-
-def _matched_spectra(signals, call, rate_hz):
-    """One-sided spectra of the signals after the matched filter, and their frequencies.
-
-    ``y(t) = Σ_f Y(f) exp(2πjft)`` is analytic, with an envelope of 1 where the signal is the call itself.
-    """
-    n_fft = scipy.fft.next_fast_len(2 * signals.shape[1] + int(0.02 * rate_hz))  # nothing wraps around
-    frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
-    width_hz = min(5_000.0, call.low_frequency_hz / 2)
-    outside_hz = np.maximum(call.low_frequency_hz - frequency_hz, frequency_hz - call.high_frequency_hz)
-    inside = outside_hz < width_hz
-    frequency_hz, outside_hz = frequency_hz[inside], outside_hz[inside]
-    window = np.where(outside_hz > 0, 0.5 + 0.5 * np.cos(np.pi * outside_hz / width_hz), 1.0)
-    emitted = call_at(call, np.arange(int(call.duration_s * rate_hz) + 2) / rate_hz)
-    response = np.conj(scipy.fft.rfft(emitted, n_fft)[inside]) * window
-    response /= np.sum(np.abs(response) ** 2 / np.where(window > 0, window, 1.0))
-    return scipy.fft.rfft(signals, n_fft)[:, inside] * response, frequency_hz
 
 
 def paper(words, settings: Settings, directions):
@@ -161,24 +133,6 @@ def _paper_low_pass(settings):
     return sections, round(float(np.arange(len(impulse)) @ impulse / impulse.sum()))  # delay of its centre of mass
 
 
-def signals_of(words, channels, recording):
-    """The signals of bits or numbers, full scale 1: (mic, sample) float64."""
-    return unpack_bits(words, channels) if recording.is_pdm else words[:, channels].T / recording.full_scale
-
-
-def unpack_bits(words, channels):
-    """The signals of +1 and -1: (mic, sample) float64."""
-    words = words.reshape(len(words), -1)
-    word_bits = words.dtype.itemsize * 8
-    return np.stack(
-        [
-            ((words[:, channel // word_bits] >> words.dtype.type(channel % word_bits)) & words.dtype.type(1)) * 2.0
-            - 1.0
-            for channel in channels
-        ]
-    )
-
-
 def decimate(signals, taps, factor):
     """Every factor-th sample of the filtered signals, late by the filter's group delay."""
     filtered = [np.convolve(signal.astype(float), taps.astype(float))[: len(signal)] for signal in signals]
@@ -203,31 +157,18 @@ def delayed(signals, offsets, weights, n_ranges):
 
 def coherence_factor(signals, offsets, weights, n_ranges):
     """Delay-and-sum times the coherent by the total power: (direction, range) float64; no silence, please."""
-    y = delayed(signals, offsets, weights, n_ranges)
-    beams = np.abs(y.sum(axis=1))
-    return beams * beams**2 / (y.shape[1] * (np.abs(y) ** 2).sum(axis=1))
+    return np.stack([referee.coherence_factor(y) for y in delayed(signals, offsets, weights, n_ranges)])
 
 
 def dmas(signals, offsets, weights, order, n_ranges):
     """The products of all choices of microphones, written out: (direction, range) float64; no silence, please."""
     z = delayed(signals / np.abs(signals).astype(float) ** (1 - 1 / order), offsets, weights, n_ranges)
-    choices = np.array(list(itertools.combinations(range(z.shape[1]), order)))
-    return np.stack([np.abs(np.prod(rows[choices], axis=1).sum(axis=0)) for rows in z])
+    return np.stack([math.comb(len(rows), order) * referee.dmas(rows, order) for rows in z])
 
 
 def capon(signals, offsets, weights, n_snapshots, loading, n_ranges):
     """The weights of least variance from the whole covariance: (direction, range) float64; no silence, please."""
-    image = np.empty((len(offsets), n_ranges))
-    n_mics, n_snapshots = offsets.shape[1], min(n_snapshots, n_ranges)
-    for direction, y in enumerate(delayed(signals, offsets, weights, n_ranges)):
-        for place in range(n_ranges):
-            first = min(max(place - n_snapshots // 2, 0), n_ranges - n_snapshots)
-            window = y[:, first : first + n_snapshots]
-            covariance = window @ window.conj().T / n_snapshots
-            covariance += loading * np.trace(covariance) / n_mics * np.eye(n_mics)
-            w = np.linalg.solve(covariance, np.ones(n_mics))
-            image[direction, place] = np.abs((w / w.sum()).conj() @ y[:, place])
-    return image
+    return np.stack([referee.capon(y, n_snapshots, loading) for y in delayed(signals, offsets, weights, n_ranges)])
 
 
 def interpolated_beams(signals, offsets, weights, places, tap_weights, rows, n_ranges):

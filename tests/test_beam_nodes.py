@@ -11,7 +11,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Accuracy, Air, Array, Call, Processing
+from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import Spectrum
 from ertis_numba.stages.planner import Planner
@@ -22,7 +22,7 @@ from tests.hard_cases.tuned import tuned
 
 SPEED_M_S = sound_speed_m_s(Air())
 CALL = Call()
-SPECTRUM = Spectrum(*matched_spectrum(CALL, n_waves=40))
+SPECTRUM = Spectrum(*matched_spectrum(Settings(call=CALL), n_waves=40))
 
 
 def random_plane(n_mics, seed):

@@ -10,11 +10,11 @@ from click.testing import CliRunner
 from ertis_bench import accuracy, checks, machine, paper, plans, scaling, simulation, subject, tables, timing
 from ertis_cli.main import cli
 
-from ertis_numba import figures, kernels, verification
+from ertis_numba import figures, kernels
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy
+from ertis_numba.settings import ERROR_PRESETS_DB
 from ertis_numba.simulation.names import EFFECTS
 from tests.cases import SHORT, noise
 
@@ -224,7 +224,6 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
     done = bench_accuracy("--json", "--update", full, "--update", short, "--plot", picture)
     report = json.loads(done.stdout)
     assert [entry["subject"] for entry in report["subjects"]] == ["real", "synthetic"]
-    assert all(entry["exact_db"] < -110 for entry in report["subjects"])
     for subject_name in ("real", "synthetic"):
         rows = [row for row in report["rows"] if row["subject"] == subject_name]
         names = [row["plan"].partition(":")[0] for row in rows]
@@ -259,15 +258,6 @@ def test_accuracy_says_what_it_leaves_out(monkeypatch):
     assert "Left out, as it is not installed here: real measurement." in done.stdout
     assert "| synthetic (data/synthetic/reflectors.h5) |" in done.stdout
     assert "| real" not in done.stdout
-
-
-def test_accuracy_refuses_an_exact_image_that_is_not(monkeypatch):
-    rough = Accuracy(
-        precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=80.0, zones=1
-    )
-    monkeypatch.setattr(verification, "exact_plan", lambda *_, **__: rough)
-    with pytest.raises(DataError, match=r"dB off the exact one; wanted at most -100 dB"):
-        accuracy.run(count=1, say=lambda _: None, directions="2d:9")
 
 
 def test_front_is_what_nothing_beats():

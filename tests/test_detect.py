@@ -20,7 +20,7 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0):
     positions_m = microphones(settings.array).enabled_positions_m
     speed_m_s = sound_speed_m_s(settings.air)
     ranges_m = np.arange(*range_m, speed_m_s / 90_000)
-    matched = matched_filter(settings.call, n_fft=2048, rate_hz=450_000)
+    matched = matched_filter(settings, n_fft=2048, decimation=10)
     wave_1_m = 2 * np.pi * (matched.first_bin + np.arange(len(matched.values))) * 450_000 / 2048 / speed_m_s
     power = np.abs(matched.values) ** 2 / np.sum(np.abs(matched.values) ** 2)
     beams = np.zeros((len(grid), len(ranges_m)), dtype=complex)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from ertis_numba.settings import INTERPOLATIONS, Call
+from ertis_numba.settings import INTERPOLATIONS, Call, Settings
 from ertis_numba.stages.fitting import DelayFit, Spectrum, fit, weights_of
 from ertis_numba.waveform import matched_spectrum
 
@@ -23,7 +23,7 @@ rates = st.floats(1.8, 50.0)  # by the bandwidth; plans have 1.8 and more
 
 
 def spectrum_of(call):
-    return Spectrum(*matched_spectrum(call, n_waves=40))
+    return Spectrum(*matched_spectrum(Settings(call=call), n_waves=40))
 
 
 def step_s_of(call, rate):

@@ -13,13 +13,11 @@ from ertis_numba import kernels, verification
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy
 from ertis_numba.storage import open_energyscapes, write_recording
+from ertis_numba.verification import _peaks
 from tests import reference
 from tests.files import SMALL, noise
-
-THREADS = {"kernels": kernels.load("cpu"), "threads": 1}
 
 
 def run(*arguments, code=0):
@@ -151,33 +149,10 @@ def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
         (["--max-error", "good"], "'good' is no error, give dB as in -40, or draft, standard, fine, exact"),
         (["--method", "paper", "--explain"], "--explain is for --method fast; the paper's method has no plan"),
         (["--method", "paper", "--max-error", "fine"], "--max-error is for --method fast"),
-        (["--verify", "--beamformer", "capon"], "--verify knows the exact image of delay_and_sum only, not of capon"),
     ],
 )
 def test_refuses_what_has_no_plan(recording, arguments, told):
     assert told in run(recording, *arguments, code=2).stderr
-
-
-def test_some_directions_stand_for_many(monkeypatch):
-    monkeypatch.setattr(verification, "_MOST_BEAMS", 4)
-    (measurement,) = noise(count=1)
-    image = Pipeline(SMALL, threads=1).process(measurement)
-    some = verification.measure(image, measurement, **THREADS)
-    assert (some.n_directions, some.peaks) == (4, None)
-    vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)[[0, 2, 4, 6]]
-    wanted = reference.exact(measurement.words, SMALL, vectors, image.range_m)
-    assert some.error_db == pytest.approx(reference.error_db(image.energy[[0, 2, 4, 6]], wanted), abs=0.1)
-
-
-def test_exact_plan_has_more_samples_where_ranges_lie_far_apart():
-    assert verification.exact_plan(SMALL, **THREADS).oversampling == 6
-    coarse = SMALL.replace(processing=SMALL.processing.replace(range_decimation=200))
-    plan = verification.exact_plan(coarse, **THREADS)
-    assert plan.oversampling > 6
-    (measurement,) = noise(coarse, count=1)
-    image = Pipeline(coarse.replace(accuracy=plan), threads=1).process(measurement)
-    vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    assert reference.error_db(image.energy, reference.exact(measurement.words, coarse, vectors, image.range_m)) < -100
 
 
 def test_silence_has_no_error():
@@ -194,7 +169,7 @@ def test_peaks_are_compared_with_the_nearest(monkeypatch):
         return Peak(azimuth_deg=azimuth_deg, elevation_deg=0.0, range_m=range_m, level_db=level_db)
 
     found = [peak(0.5, 1.001, 0.0), peak(3.0, 1.0, -1.0), peak(40.0, 2.05, -3.0)]
-    monkeypatch.setattr(verification, "find_peaks", lambda *_, **__: found)
+    monkeypatch.setattr(_peaks, "find_peaks", lambda *_, **__: found)
     errors = verification.peak_errors(None, [peak(0.0, 1.0, 0.0), peak(40.0, 2.0, -2.0), peak(4.0, 1.0, -3.0)])
     assert (errors.wanted, errors.lost) == (3, 1)  # five centimetres off is another reflector
     assert errors.level_db == pytest.approx(2.0)

@@ -103,6 +103,12 @@ def test_settings_survive_toml(made):
     assert hash(made) == hash(Settings.from_toml(made.to_toml()))
 
 
+def test_band_edges_survive_toml_and_raise_the_signal_rate():
+    made = Settings(processing=Processing(band_edges_hz=(5e3, 120e3)))
+    assert Settings.from_toml(made.to_toml()) == made
+    assert (Settings().decimation, made.decimation) == (20, 10)
+
+
 def test_an_empty_file_is_the_default_measurement():
     assert Settings.from_toml("") == Settings() == Settings.from_preset("default_25_50")
 
@@ -187,6 +193,19 @@ def test_nothing_can_be_changed_in_place():
         ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
         ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
         ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; give a number from"),
+        (
+            "[processing]\nband_edges_hz = [25000, 60000]",
+            r"band_edges_hz is 25000 to 60000 Hz, but the call sweeps over .*; give at most 24900 and at least 50100",
+        ),
+        (
+            "[processing]\nband_edges_hz = [5000, 120000]\ndecimation = 20",
+            r"processing\.band_edges_hz ends at 120000 Hz, but signals at 225000 Hz hold 112500 Hz; give a lower edge",
+        ),
+        (
+            "[processing]\nmethod = 'paper'\nband_edges_hz = [20000, 55000]",
+            r"processing\.band_edges_hz is for the fast method only; leave it out",
+        ),
+        ("[processing]\nband_edges_hz = [-1, 55000]", r"processing\.band_edges_hz is -1; give a number from 0 to"),
         (
             "[processing]\ndecimation = 50",
             r"processing\.decimation 50 leaves signals at 90000 Hz; give one that leaves",

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Call, Settings
+from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.waveform import (
     call_at,
     call_samples,
@@ -21,6 +21,7 @@ from ertis_numba.waveform import (
 )
 
 RATE_HZ = 450_000.0
+PCM = Recording(sample_rate_hz=RATE_HZ, encoding="float32")
 LOW = Call()
 HIGH = Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0)
 UP = Call(start_frequency_hz=25_000.0, stop_frequency_hz=50_000.0)
@@ -37,9 +38,14 @@ calls = st.builds(
 )
 
 
+def settings_of(call, **others):
+    """Settings of a record that is not decimated."""
+    return Settings(call=call, recording=PCM, processing=Processing(range_decimation=10, decimation=1, **others))
+
+
 def compressed(signal, call, n_fft):
     """Return the analytic signal behind the matched filter: (sample,) complex."""
-    matched = matched_filter(call, n_fft=n_fft, rate_hz=RATE_HZ)
+    matched = matched_filter(settings_of(call), n_fft=n_fft)
     bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
     spectrum = np.zeros(n_fft, dtype=complex)
     spectrum[bins] = np.fft.rfft(signal, n_fft)[bins] * matched.values
@@ -114,8 +120,8 @@ def test_matched_filter_turns_the_call_into_one_peak(call):
 @settings(max_examples=60, deadline=None)
 @given(calls, st.integers(2500, 9000))
 def test_matched_filter_of_any_call(call, n_fft):
-    low_hz, high_hz = matched_band_hz(call)
-    matched = matched_filter(call, n_fft=n_fft, rate_hz=RATE_HZ)
+    low_hz, high_hz = matched_band_hz(settings_of(call))
+    matched = matched_filter(settings_of(call), n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * RATE_HZ / n_fft
     assert 0 < low_hz <= frequency_hz[0]
     assert frequency_hz[-1] <= high_hz < RATE_HZ / 2
@@ -132,7 +138,7 @@ def test_matched_filter_has_ended_after_its_guard(call):
     impulse = np.zeros(n_fft)
     impulse[at] = 1.0
     ringing = np.abs(compressed(impulse, call, n_fft))
-    guard = int(matched_guard_s(call) * RATE_HZ)
+    guard = int(matched_guard_s(settings_of(call)) * RATE_HZ)
     length = int(call.duration_s * RATE_HZ)
     outside = np.r_[ringing[: at - length - guard], ringing[at + guard + 1 :]]
     assert 20 * np.log10(outside.max() / ringing.max()) < -50
@@ -145,6 +151,42 @@ def test_matched_filter_scales_with_the_echo_and_nothing_else():
     image = compressed(late, LOW, 8192)
     assert np.abs(image).argmax() == 3000
     assert image[3000] == pytest.approx(-0.25, abs=1e-12)
+
+
+@pytest.mark.parametrize("call", [LOW, Call(duration_s=2e-4, ramp_fraction=0.0)], ids=["default", "short, no ramp"])
+def test_matched_filter_of_decimated_signals_has_the_bins_of_the_record(call):
+    """At the decimated rate a call that is short or has no ramp would alias."""
+    made = Settings(call=call)
+    assert made.decimation == 20
+    decimated = matched_filter(made, n_fft=2_000)
+    whole = matched_filter(made, n_fft=40_000, decimation=1)
+    assert decimated.first_bin == whole.first_bin
+    assert_allclose(decimated.values, whole.values, rtol=1e-12, atol=1e-12 * np.abs(whole.values).max())
+
+
+@pytest.mark.parametrize(
+    ("call", "band_edges_hz", "difference_db"),
+    [
+        (LOW, None, -58.0),
+        (LOW, (5e3, 90e3), -81.2),
+        (Call(duration_s=2e-4), None, -24.1),
+        (Call(duration_s=2e-4), (5e3, 90e3), -37.6),
+    ],
+    ids=["default", "default, wide band", "0.2 ms", "0.2 ms, wide band"],
+)
+def test_band_edges_change_an_echo_by_what_the_documentation_says(call, band_edges_hz, difference_db):
+    """Relative to the textbook matched filter, which has no band."""
+    n_fft = 2**17
+    spectrum = np.fft.rfft(call_samples(call, rate_hz=4.5e6), n_fft)
+    textbook = np.fft.ifft(np.append(np.abs(spectrum) ** 2, np.zeros(n_fft - len(spectrum))))
+    textbook = np.abs(textbook) / np.abs(textbook[0])
+    made = Settings(call=call, processing=Processing(band_edges_hz=band_edges_hz))
+    matched = matched_filter(made, n_fft=n_fft, decimation=1)
+    bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    filtered = np.zeros(n_fft, dtype=complex)
+    filtered[bins] = spectrum[bins] * matched.values
+    difference = np.linalg.norm(np.abs(np.fft.ifft(filtered)) - textbook) / np.linalg.norm(textbook)
+    assert 20 * np.log10(difference) == pytest.approx(difference_db, abs=0.2)
 
 
 # ---- the decimation filter -------------------------------------------------------------------------
@@ -171,7 +213,7 @@ def test_decimation_filter_keeps_its_promises(decimation, share, sample_rate_hz)
 def test_decimation_filter_of_the_default_measurement():
     made = Settings()
     taps = decimation_taps(
-        sample_rate_hz=made.recording.sample_rate_hz, decimation=10, pass_hz=matched_band_hz(made.call)[1]
+        sample_rate_hz=made.recording.sample_rate_hz, decimation=10, pass_hz=matched_band_hz(made)[1]
     )
     assert len(taps) == 61
     folding = filter_response(taps, np.linspace(395e3, 505e3, 500) / 4.5e6)

@@ -24,16 +24,12 @@ _PART = "  {name:52}  {safe:>8}  {texture:>14}"
 
 
 def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error_db: float | None) -> None:
-    """Refuse what only plans have where there is none, or where its error is no sum's."""
+    """Refuse options that are about plans where the method has none."""
     asked = {"--explain": explain, "--verify": verify, "--max-error": max_error_db is not None}
     context = click.get_current_context()
     for name, given in asked.items():
         if given and settings.processing.method == "paper":
             raise click.UsageError(f"{name} is for --method fast; the paper's method has no plan", context)
-    if verify and settings.processing.beamformer != "delay_and_sum":
-        raise click.UsageError(
-            f"--verify knows the exact image of delay_and_sum only, not of {settings.processing.beamformer}", context
-        )
 
 
 def said_of(sensor: str, told: dict[str, Any]) -> Iterator[str]:
@@ -94,7 +90,7 @@ def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
     )
     peaks = verified["peaks"]
     if peaks is None:
-        yield "  reflectors were not compared, as the exact image of all directions would take too long"
+        yield "  reflectors were not compared, as the whole exact image would take too long"
         return
     line = f"  {peaks['wanted'] - peaks['lost']} of the strongest {options.counted(peaks['wanted'], 'reflector')} found"
     if peaks["level_db"] is not None:

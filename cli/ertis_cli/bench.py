@@ -79,6 +79,23 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 
 
 @bench.command()
+@click.option(
+    "--count", type=click.IntRange(min=1), default=200, show_default=True, metavar="N", help="Random settings to try."
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Seed of the first setting."
+)
+@_update
+@options.quiet
+@options.as_json
+def verification(**given: Any) -> None:
+    """Compare what --verify measures with a slow float64 referee, over random settings; nothing is timed."""
+    from ertis_bench import verification as benchmark
+
+    _run("verification", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

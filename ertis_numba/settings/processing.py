@@ -26,6 +26,9 @@ class Processing(Table, frozen=True, kw_only=True):
         Window of the range axis.
     range_decimation : int
         Samples of the record per range of the energyscape.
+    band_edges_hz : (low, high), optional
+        Frequencies below and above the call's band at which the matched filter reaches 0. The default lies 5 kHz
+        outside the band, or half of its lowest frequency where that is less; see ``docs/accuracy.md``.
     decimation : int, optional
         Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest that
         suits the method and the call's band; see `Settings.decimation`.
@@ -50,6 +53,7 @@ class Processing(Table, frozen=True, kw_only=True):
     elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
     range_m: tuple[float, float] = (0.5, 5.0)
     range_decimation: int = 100
+    band_edges_hz: tuple[float, float] | None = None
     decimation: int | None = None
     wavefront: Literal["plane", "spherical"] = "plane"
     beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
@@ -65,6 +69,13 @@ class Processing(Table, frozen=True, kw_only=True):
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
         checks.whole("processing.range_decimation", self.range_decimation, 1, 10_000)
+        if self.band_edges_hz is not None:
+            checks.interval("processing.band_edges_hz", self.band_edges_hz, 0.0, 1e9)
+            if self.method == "paper":
+                raise ArgumentError(
+                    "processing.band_edges_hz is for the fast method only; leave it out, or give processing.method "
+                    "'fast'"
+                )
         if self.decimation is not None:
             checks.whole("processing.decimation", self.decimation, 1, 1000)
             if self.range_decimation % self.decimation:

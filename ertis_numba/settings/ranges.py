@@ -13,6 +13,7 @@ __all__ = ["largest_decimation", "suit_ranges"]
 _SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
 _RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth
 _LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+_RATE_BY_EDGE = 2.5  # signal rate relative to the upper edge of the matched filter's band
 _MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
 _MOST_STEP = 10_000
 
@@ -42,14 +43,16 @@ def suit_ranges(processing: Processing, recording: Recording, call: Call) -> Pro
         changes["range_m"] = (first_m if first_m < last_m else 0.0, last_m)
     least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
     if recording.sample_rate_hz / processing.range_decimation < least_hz * (1 - 1e-9):
-        suits = largest_decimation(recording.sample_rate_hz, call, processing.method)
+        suits = largest_decimation(recording.sample_rate_hz, call, processing)
         changes |= {"range_decimation": _step(recording.sample_rate_hz / least_hz, suits), "decimation": None}
     return processing.replace(**changes)
 
 
-def largest_decimation(sample_rate_hz: float, call: Call, method: str) -> int:
+def largest_decimation(sample_rate_hz: float, call: Call, processing: Processing) -> int:
     """Return the largest decimation whose low pass needs few taps."""
-    least_hz = _LEAST_RATE[method] * call.high_frequency_hz
+    least_hz = _LEAST_RATE[processing.method] * call.high_frequency_hz
+    if processing.band_edges_hz is not None:
+        least_hz = max(least_hz, _RATE_BY_EDGE * processing.band_edges_hz[1])
     return min(max(1, math.floor(sample_rate_hz / least_hz)), _MOST_DECIMATION)
 
 

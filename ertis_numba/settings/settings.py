@@ -52,6 +52,7 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
                 f"give {_NARROWEST_HZ:g} Hz or more, or method 'fast'"
             )
+        self._check_band()
         self._check_adaptive()
         step = self.processing.range_decimation
         if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
@@ -59,6 +60,25 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"processing.range_decimation {step} has no divisor near "
                 f"{self._largest_decimation}, the decimation that suits the call; give one that has, such as a "
                 f"multiple of {self._largest_decimation}, or give processing.decimation"
+            )
+
+    def _check_band(self) -> None:
+        """Refuse edges of the matched filter's band that cut into the call's band, or that the signals cannot hold."""
+        given = self.processing.band_edges_hz
+        if given is None:
+            return
+        highest_hz = self.call.low_frequency_hz - _NARROWEST_HZ
+        lowest_hz, nyquist_hz = self.call.high_frequency_hz + _NARROWEST_HZ, self.signal_rate_hz / 2
+        if given[0] > highest_hz or given[1] < lowest_hz:
+            raise ArgumentError(
+                f"processing.band_edges_hz is {given[0]:g} to {given[1]:g} Hz, but the call sweeps over "
+                f"{self.call.low_frequency_hz:g} to {self.call.high_frequency_hz:g} Hz; give at most {highest_hz:g} "
+                f"and at least {lowest_hz:g}"
+            )
+        if given[1] > nyquist_hz:
+            raise ArgumentError(
+                f"processing.band_edges_hz ends at {given[1]:g} Hz, but signals at {self.signal_rate_hz:g} Hz hold "
+                f"{nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
             )
 
     def _check_adaptive(self) -> None:
@@ -155,7 +175,7 @@ class Settings(Document, frozen=True, kw_only=True):
 
     @property
     def _largest_decimation(self) -> int:
-        return largest_decimation(self.recording.sample_rate_hz, self.call, self.processing.method)
+        return largest_decimation(self.recording.sample_rate_hz, self.call, self.processing)
 
     @property
     def output_decimation(self) -> int:

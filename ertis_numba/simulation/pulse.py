@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation.arrivals import effect
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.waveform import MatchedFilter, call_samples, matched_band_hz, matched_filter
+from ertis_numba.waveform import MatchedFilter, call_spectrum, matched_band_hz, matched_filter
 
 __all__ = ["N_NODES", "band", "baseband", "envelope", "match", "matched"]
 
@@ -24,7 +24,7 @@ def match(settings: Settings) -> tuple[MatchedFilter, float, int]:
     """Return the matched filter of the own call, the rate of its signals and the length of its transform."""
     rate_hz = settings.signal_rate_hz
     n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * rate_hz))
-    return matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz), rate_hz, n_fft
+    return matched_filter(settings, n_fft=n_fft), rate_hz, n_fft
 
 
 def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
@@ -35,10 +35,10 @@ def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> N
     rate_hz = settings.signal_rate_hz
     rings_s = 0.0 if emitter is None else effect("emitter_response", "ringing_s")(emitter)
     n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s + rings_s) * rate_hz))
-    mine = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
+    mine = matched_filter(settings, n_fft=n_fft)
     bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
     spectrum = np.zeros(n_fft, dtype=np.complex128)
-    spectrum[bins] = np.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins] * mine.values
+    spectrum[bins] = call_spectrum(call, settings, n_fft=n_fft)[bins] * mine.values
     if emitter is not None:
         spectrum[bins] *= effect("emitter_response")(emitter, np.arange(bins.start, bins.stop) * rate_hz / n_fft)
     return np.asarray(np.fft.ifft(spectrum))
@@ -69,9 +69,9 @@ def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats
 def band(settings: Settings) -> tuple[Floats, Floats]:
     """Return some frequencies of the call's band, and the share of the matched call's power at each."""
     rate_hz, n_fft = settings.signal_rate_hz, 32_768  # bins much narrower than a node
-    mine = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
+    mine = matched_filter(settings, n_fft=n_fft)
     frequency_hz = (mine.first_bin + np.arange(len(mine.values))) * rate_hz / n_fft
-    edges = np.linspace(*matched_band_hz(settings.call), N_NODES + 1)
+    edges = np.linspace(*matched_band_hz(settings), N_NODES + 1)
     # S H is what the image sums; between the edges of its window H is conj(S).
     power, _ = np.histogram(frequency_hz, edges, weights=np.abs(mine.values) ** 2)
     return (edges[:-1] + edges[1:]) / 2, power / power.sum()

@@ -92,7 +92,7 @@ class Texture:
     @classmethod
     def unknown(cls, settings: Settings) -> "Texture":
         """Return the texture that is assumed where none was measured: on the safe side."""
-        _, shares = matched_spectrum(settings.call, n_waves=WAVES)
+        _, shares = matched_spectrum(settings, n_waves=WAVES)
         if not settings.recording.is_pdm:  # beyond the band there may be as much sound as within
             return cls(shares, _SAFE_GAIN, _SAFE_CREST, np.ones(2), 1.0, np.ones(1), colour=_SAFE_COLOUR)
         frequency_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, 1025)
@@ -103,7 +103,7 @@ class Texture:
     @classmethod
     def echo(cls, settings: Settings, n_mics: int) -> "Texture":
         """Return the texture of a single echo, whose image is as bright as microphones in phase make it."""
-        _, shares = matched_spectrum(settings.call, n_waves=WAVES)
+        _, shares = matched_spectrum(settings, n_waves=WAVES)
         power = shares**2  # that of the echo, beside that of the filter
         return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
 
@@ -121,7 +121,7 @@ class ErrorModel:
     def __init__(self, settings: Settings, texture: Texture | None = None) -> None:
         self._settings = settings
         self.texture = texture or Texture.unknown(settings)
-        self.frequency_hz, _ = matched_spectrum(settings.call, n_waves=WAVES)
+        self.frequency_hz, _ = matched_spectrum(settings, n_waves=WAVES)
 
     def delays(self, fit: DelayFit) -> float:
         """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
@@ -221,7 +221,7 @@ class ErrorModel:
         everywhere, and where the image is darker than that, it changes magnitudes by all of itself.
         """
         settings, noise = self._settings, self.texture.noise
-        low_hz, high_hz = matched_band_hz(settings.call)
+        low_hz, high_hz = matched_band_hz(settings)
         n_fft = 2 * (len(noise) - 1)
         n_fft *= max(1, -(-8 * len(taps) // n_fft))  # fine enough for the filter's side lobes
         gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2

@@ -183,7 +183,7 @@ class _Lobe:
         positions_m = microphones(settings.array).enabled_positions_m
         rate_hz = settings.signal_rate_hz
         n_fft = math.ceil(settings.call.duration_s * rate_hz) + 1
-        centre_hz = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz).centre_hz
+        centre_hz = matched_filter(settings, n_fft=n_fft).centre_hz
         wave_1_m = 2 * math.pi * centre_hz / sound_speed_m_s(settings.air)
         self._reach = wave_1_m / _HALF_AMPLITUDE / math.sqrt(len(positions_m)) * positions_m
         largest = float(np.linalg.norm(self._reach, ord=2))

@@ -17,7 +17,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet, Lane
-from ertis_numba.settings import Call, Settings
+from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import Buffers, beamform
@@ -37,13 +37,16 @@ _SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
 
 def spectrum_of(settings: Settings) -> Spectrum:
     """Return where the matched filter has its power, as if its input were white."""
-    return _spectrum_of(settings.call)
+    step, edges_hz = settings.decimation, settings.processing.band_edges_hz
+    processing = Processing(range_decimation=step, decimation=step, band_edges_hz=edges_hz)
+    recording = Recording(sample_rate_hz=settings.recording.sample_rate_hz)
+    return _spectrum_of(Settings(call=settings.call, recording=recording, processing=processing))
 
 
 @functools.lru_cache(maxsize=8)
-def _spectrum_of(call: Call) -> Spectrum:
-    """Return the same spectrum for the same call, so that what is fitted to it can be kept as well."""
-    return Spectrum(*matched_spectrum(call, n_waves=WAVES))
+def _spectrum_of(settings: Settings) -> Spectrum:
+    """Return the same spectrum for the same call and rates, so that what is fitted to it can be kept as well."""
+    return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
@@ -54,7 +57,7 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
     taps = decimation_taps(
         sample_rate_hz=settings.recording.sample_rate_hz,
         decimation=settings.decimation,
-        pass_hz=matched_band_hz(settings.call)[1],
+        pass_hz=matched_band_hz(settings)[1],
         stop_band_db=stop_band_db,
     )
     return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)

@@ -54,7 +54,7 @@ class MatchedFilter:
         gain: Gain,
     ) -> None:
         rate_hz = settings.signal_rate_hz
-        matched = matched_filter(settings.call, n_fft=window.n_fft, rate_hz=rate_hz)
+        matched = matched_filter(settings, n_fft=window.n_fft)
         n_phases = settings.accuracy.oversampling or 1
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
         flat = matched.values / filter_response(

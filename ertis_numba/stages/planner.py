@@ -427,7 +427,7 @@ class Planner:
 
     @functools.cached_property
     def _n_bins(self) -> int:
-        low_hz, high_hz = matched_band_hz(self._settings.call)
+        low_hz, high_hz = matched_band_hz(self._settings)
         return math.ceil((high_hz - low_hz) * self._window.n_fft / self._settings.signal_rate_hz)
 
     def _reach_s(self) -> float:

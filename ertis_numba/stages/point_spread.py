@@ -41,7 +41,7 @@ class PointSpread:
         # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
         spacing_hz = self._speed_m_s / (6 * self.reach_m)
         n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
-        matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=rate_hz)
+        matched = matched_filter(settings, n_fft=n_fft)
         thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
         bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]
         wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / self._speed_m_s

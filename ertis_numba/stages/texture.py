@@ -32,7 +32,7 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
 
     A rough image is enough, since what is wanted are its mean power, and that of what it is summed from.
     """
-    low_hz, high_hz = matched_band_hz(settings.call)
+    low_hz, high_hz = matched_band_hz(settings)
     rough = settings.replace(
         accuracy=Accuracy(
             precision="float32",
@@ -79,7 +79,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
     edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
     taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
     found = np.sum(np.abs(scipy.fft.fft(series * taper, axis=1)) ** 2, axis=0)
-    centres_hz, nominal = matched_spectrum(settings.call, n_waves=WAVES)
+    centres_hz, nominal = matched_spectrum(settings, n_waves=WAVES)
     # Sampling at this rate has moved the band by a multiple of it.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
     half = max(1, int(np.min(np.diff(bins)) // 2)) if len(bins) > 1 else 1
@@ -92,7 +92,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
 def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.complex128]:
     """Return what microphones have in common, tile by tile: (tile, wave, mic, mic) complex128."""
     layout = microphones(settings.array)
-    centres_hz, _ = matched_spectrum(settings.call, n_waves=WAVES)
+    centres_hz, _ = matched_spectrum(settings, n_waves=WAVES)
     mics = estimated_mics(len(series))
     length = max(8, round(_TILE * rate_hz / settings.output_rate_hz))
     half = length // 2
@@ -114,7 +114,7 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
 def _white_power(settings: Settings) -> float:
     """Return the power of white bits after the matched filter."""
     n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * settings.signal_rate_hz + 256))
-    matched = matched_filter(settings.call, n_fft=n_fft, rate_hz=settings.signal_rate_hz)
+    matched = matched_filter(settings, n_fft=n_fft)
     return float(np.sum(np.abs(matched.values) ** 2) / n_fft / settings.decimation)
 
 

@@ -71,7 +71,7 @@ class PositionUncertainty:
     """
 
     def __init__(self, settings: Settings, *, is_planar: bool) -> None:
-        frequency_hz, power = matched_spectrum(settings.call, n_waves=_WAVES)
+        frequency_hz, power = matched_spectrum(settings, n_waves=_WAVES)
         mean_square = float(power @ frequency_hz**2)
         positions_m = microphones(settings.array).enabled_positions_m
         self._settings, self._is_planar = settings, is_planar

@@ -69,7 +69,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     step_m = speed_m_s / (2 * output_rate_hz)
     n_ranges = math.floor((last_m - first_m) / step_m * (1 + 1e-12)) + 1
     lead = math.ceil(largest_delay_s * output_rate_hz) + 1
-    guard_s = matched_guard_s(settings.call, down_db=ringing_db)
+    guard_s = matched_guard_s(settings, down_db=ringing_db)
     start_s = 2 * first_m / speed_m_s - lead / output_rate_hz
     stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
     spanned_s = stop_s - start_s + settings.call.duration_s + 2 * guard_s

@@ -93,7 +93,7 @@ def test_idle_tone_of_all_channels_is_as_strong_as_the_filter_lets_it_be(rate_hz
     """Compression spreads a tone over the length of the call: within 0.3 dB of the filter's gain there."""
     image = image_of(pulses(rate_hz) * ALL)
     n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz
-    matched = matched_filter(SETTINGS.call, n_fft=n_fft, rate_hz=signal_rate_hz)
+    matched = matched_filter(SETTINGS, n_fft=n_fft)
     gain = np.abs(matched.values[round(rate_hz * n_fft / signal_rate_hz) - matched.first_bin]) / 2
     amplitude = 4 * rate_hz / SETTINGS.recording.sample_rate_hz  # of the first harmonic of short pulses from -1 to 1
     ahead = image.energy[np.argmin(np.abs(image.azimuth_rad))]

@@ -21,7 +21,7 @@ LINE = SHORT.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8)
 CALL = int(LINE.call.duration_s * LINE.recording.sample_rate_hz)  # 11,250 samples
 N_TAPS = len(
     decimation_taps(
-        sample_rate_hz=LINE.recording.sample_rate_hz, decimation=LINE.decimation, pass_hz=matched_band_hz(LINE.call)[1]
+        sample_rate_hz=LINE.recording.sample_rate_hz, decimation=LINE.decimation, pass_hz=matched_band_hz(LINE)[1]
     )
 )
 LENGTHS = {

@@ -1,0 +1,109 @@
+"""`ertis process --verify` against a slow referee, over random settings of every kind."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ertis_bench import machine, referee
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+from ertis_bench.random_settings import random_measurement
+from ertis_numba import verification
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+
+__all__ = ["MAX_DIFFERENCE_DB", "compared", "form", "run"]
+
+MAX_DIFFERENCE_DB = 1.0
+"""Largest difference of verified and true errors that is not reported as wrong."""
+
+_FLOOR_DB = -100.0  # below, single precision is most of the error
+_SHORT_CALL_S = 5e-4
+
+_GROUPS: dict[str, Callable[[Settings], bool]] = {
+    "all": lambda _: True,
+    "calls without a ramp": lambda settings: settings.call.ramp_fraction == 0,
+    "calls of less than 0.5 ms": lambda settings: settings.call.duration_s < _SHORT_CALL_S,
+    "PDM": lambda settings: settings.recording.is_pdm,
+    "PCM": lambda settings: not settings.recording.is_pdm,
+    "spherical wavefronts": lambda settings: settings.processing.wavefront == "spherical",
+    "other edges of the band": lambda settings: settings.processing.band_edges_hz is not None,
+    **{
+        f"`{name}`": lambda settings, name=name: settings.processing.beamformer == name  # type: ignore[misc]
+        for name in ("delay_and_sum", "coherence_factor", "dmas", "capon")
+    },
+}
+
+
+def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Compare verified and true errors of ``count`` random settings, and return the report.
+
+    Parameters
+    ----------
+    count : int
+    seed : int
+        Seed of the first setting; the others have the seeds after it.
+    say : callable
+        Called with lines about what happens.
+    """
+    rows = []
+    for each in range(seed, seed + count):
+        rows.append(compared(each))
+        if rows[-1]["wrong"]:
+            say(f"seed {each}: verified {rows[-1]['verified_db']:.2f} dB, true {rows[-1]['true_db']:.2f} dB")
+    return {"machine": machine.describe(), "count": count, "seed": seed, "rows": rows}
+
+
+def compared(seed: int) -> dict[str, Any]:
+    """Return the verified and the true error of the image of one random measurement."""
+    measurement = random_measurement(seed)
+    image = _image(measurement)
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    exact = referee.exact(measurement.words, image.settings, directions, image.range_m)
+    true_db = verification.error_db(image.energy, exact)
+    verified_db = verification.measure(image, measurement).error_db
+    return {
+        "seed": seed,
+        "true_db": true_db,
+        "verified_db": verified_db,
+        "audible": true_db > _FLOOR_DB,
+        "wrong": true_db > _FLOOR_DB and not abs(verified_db - true_db) <= MAX_DIFFERENCE_DB,
+        "groups": [name for name, belongs in _GROUPS.items() if belongs(image.settings)],
+    }
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return the report as Markdown."""
+    header = ["settings", "tried", "errors above -100 dB", "more than 1 dB off", "largest difference"]
+    lines = list(_lines(report["rows"]))
+    return (
+        f"{table(header, lines)}\n\n{report['count']} random settings from seed {report['seed']}. Verified: by "
+        "`--verify`. True: by a float64 referee that sums bin by bin, in all directions and ranges. "
+        f"{sentence(report['machine'])}"
+    )
+
+
+def _image(measurement: Measurement) -> Energyscape:
+    """Return the image by the plan for the drawn budget, or by the best plan for any error where none keeps it."""
+    try:
+        pipeline = Pipeline(measurement.settings, "cpu", 1)
+    except ArgumentError:
+        pipeline = Pipeline(measurement.settings, "cpu", 1, max_error_db=0.0)
+    with pipeline:
+        image = pipeline.process(measurement)
+    if not np.any(image.energy):
+        raise DataError(f"the image of {measurement.settings} is silent; draw louder words")
+    return image
+
+
+def _lines(rows: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
+    for name in _GROUPS:
+        mine = [row for row in rows if name in row["groups"]]
+        audible = [row for row in mine if row["audible"]]
+        largest_db = max((abs(row["verified_db"] - row["true_db"]) for row in audible), default=0.0)
+        wrong = sum(row["wrong"] for row in mine)
+        yield [name, str(len(mine)), str(len(audible)), str(wrong), f"{largest_db:.3f} dB"]

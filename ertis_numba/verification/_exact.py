@@ -1,0 +1,190 @@
+"""The exact image in float64, which shares no approximation with the images that it is compared to.
+
+The samples of the record go through one transform at the record's own rate, long enough that nothing wraps around.
+Each bin is multiplied by the matched filter of the call, sampled at that rate, and turned by the exact delay of each
+microphone. There is no decimation, no interpolation, no zone of ranges, no plan and no rounding but that of float64.
+"""
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.settings import Settings
+from ertis_numba.verification._beamformers import combine
+from ertis_numba.waveform import call_samples, matched_band_hz
+from ertis_numba.words import word_format
+
+__all__ = ["ExactImage"]
+
+_RINGING = 100.0  # The ringing of a raised cosine of width w is below -160 dB after 100 / w.
+
+
+class ExactImage:
+    """The exact counterpart of an image, computed direction by direction.
+
+    Parameters
+    ----------
+    image : Energyscape
+        Image whose axes and settings count; its energies are not used.
+    measurement : Measurement
+        Measurement that the image was made from.
+
+    Attributes
+    ----------
+    operations_per_direction : int
+        Estimated count of complex multiplications.
+
+    Raises
+    ------
+    DataError
+        The words are not those of the settings.
+    """
+
+    def __init__(self, image: Energyscape, measurement: Measurement) -> None:
+        settings = self._settings = image.settings
+        layout = microphones(settings.array)
+        self._positions_m = layout.enabled_positions_m
+        self._directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+        self._range_m = image.range_m
+        self._speed_m_s = sound_speed_m_s(settings.air)
+        self._step = settings.processing.range_decimation
+        self._n_fft = _transform_length(settings)
+        self._bins, response = _matched_response(settings, self._n_fft)
+        self._wave_rad_s = 2 * math.pi * self._bins * settings.recording.sample_rate_hz / self._n_fft
+        words = word_format(settings).checked(measurement.words)
+        spectra = [
+            scipy.fft.rfft(_signal(words, channel, settings), self._n_fft)[self._bins] * response
+            for channel in np.flatnonzero(layout.enabled).tolist()
+        ]
+        calibration = np.exp(1j * self._wave_rad_s * layout.delay_s[layout.enabled][:, None])
+        self._spectra = np.stack(spectra) * calibration / layout.gain[layout.enabled][:, None]
+
+    @property
+    def operations_per_direction(self) -> int:
+        """See the class."""
+        n_mics, n_bins = self._spectra.shape
+        if self._settings.processing.wavefront == "spherical":
+            count = n_mics * n_bins * len(self._range_m)
+        else:
+            n_outputs = self._n_fft // self._step
+            count = n_mics * (n_bins + round(n_outputs * math.log2(n_outputs)))
+        if self._settings.processing.beamformer == "capon":
+            count += len(self._range_m) * n_mics**2 * (n_mics // 3 + self._settings.processing.snapshots)
+        return int(count)
+
+    def amplitudes(self, direction: int, ranges: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the exact amplitudes of some ranges of one direction: (range,) float64.
+
+        Parameters
+        ----------
+        direction : int
+        ranges : (range,) intp
+        """
+        processing = self._settings.processing
+        if processing.wavefront == "spherical":
+            return combine(self._spherical(direction, self._range_m[ranges]), processing)
+        return combine(self._plane(direction), processing)[ranges]  # Capon needs the neighbours of a range, too.
+
+    def _plane(self, direction: int) -> NDArray[np.complex128]:
+        """Return the signals delayed as plane waves are: (mic, range) complex128.
+
+        Ranges lie a whole number of samples apart, so one inverse transform of the bins, folded, gives all of them.
+        """
+        delay_s = far_field_delays(
+            self._positions_m, self._directions[direction : direction + 1], sound_speed_m_s=self._speed_m_s
+        )[0]
+        at_s = delay_s + 2 * self._range_m[0] / self._speed_m_s
+        turned = self._spectra * _powers(at_s, self._wave_rad_s)
+        n_outputs = self._n_fft // self._step
+        folded: NDArray[np.complex128] = np.zeros((len(turned), n_outputs), dtype=np.complex128)
+        for first in range(0, len(self._bins), n_outputs):
+            part = turned[:, first : first + n_outputs]
+            folded[:, : part.shape[1]] += part
+        # Bin 0 of the transform is the first bin of the band, which turns on by this much from range to range.
+        carrier = np.exp(2j * math.pi * (self._bins[0] * np.arange(len(self._range_m)) % n_outputs) / n_outputs)
+        return np.asarray(
+            scipy.fft.ifft(folded, axis=1, norm="forward")[:, : len(self._range_m)] * carrier, np.complex128
+        )
+
+    def _spherical(self, direction: int, range_m: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the signals delayed as the echo of a point at each range is: (mic, range) complex128."""
+        points_m = range_m[:, None] * self._directions[direction]
+        paths_m = np.linalg.norm(points_m - self._positions_m[:, None], axis=2) + range_m  # (mic, range)
+        at_s = paths_m / self._speed_m_s
+        # Σ_k Y_k exp(jω_k t) with k = a·n + b: a sum over a by a matrix product, then one over b. Both are exact.
+        n = self._tabled.shape[2]
+        spacing_rad_s = self._wave_rad_s[1] - self._wave_rad_s[0] if len(self._bins) > 1 else 0.0
+        out: NDArray[np.complex128] = np.empty(at_s.shape, dtype=np.complex128)
+        for mic, (table, time_s) in enumerate(zip(self._tabled, at_s, strict=True)):
+            coarse = _steps(time_s, n * spacing_rad_s, len(table))
+            fine = _steps(time_s, spacing_rad_s, n)
+            beam = np.einsum("bt,bt->t", table @ coarse, fine)
+            out[mic] = beam * np.exp(1j * self._wave_rad_s[0] * time_s)
+        return out
+
+    @cached_property
+    def _tabled(self) -> NDArray[np.complex128]:
+        """The spectra as square tables, filled up with zeros: (mic, b, a) complex128."""
+        n_mics, n_bins = self._spectra.shape
+        n = math.ceil(math.sqrt(n_bins))
+        padded: NDArray[np.complex128] = np.zeros((n_mics, n * n), dtype=np.complex128)
+        padded[:, :n_bins] = self._spectra
+        return np.ascontiguousarray(padded.reshape(n_mics, n, n).transpose(0, 2, 1))
+
+
+def _transform_length(settings: Settings) -> int:
+    """Return a multiple of the samples per range in which record, call and ringing fit: nothing wraps around."""
+    call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
+    edge_hz = min(call.low_frequency_hz - low_hz, high_hz - call.high_frequency_hz)
+    rate_hz, step = settings.recording.sample_rate_hz, settings.processing.range_decimation
+    needed = settings.recording.n_samples + math.ceil((call.duration_s + _RINGING / edge_hz) * rate_hz)
+    return step * int(scipy.fft.next_fast_len(-(-needed // step)))
+
+
+def _matched_response(settings: Settings, n_fft: int) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
+    """Return the bins of the band and the matched filter in them, by which the call has an envelope of 1."""
+    call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
+    rate_hz = settings.recording.sample_rate_hz
+    frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
+    rising = np.clip((frequency_hz - low_hz) / (call.low_frequency_hz - low_hz), 0.0, 1.0)
+    falling = np.clip((high_hz - frequency_hz) / (high_hz - call.high_frequency_hz), 0.0, 1.0)
+    window = (1 - np.cos(math.pi * rising)) / 2 * (1 - np.cos(math.pi * falling)) / 2
+    bins = np.flatnonzero(window)
+    emitted = scipy.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins]
+    response = np.conj(emitted) * window[bins]
+    return bins, response / np.sum(emitted * response).real
+
+
+def _signal(words: NDArray[Any], channel: int, settings: Settings) -> NDArray[np.float64]:
+    """Return the signal of one channel, full scale 1: (sample,) float64."""
+    if not settings.recording.is_pdm:
+        return np.asarray(words[:, channel].astype(np.float64) / settings.recording.full_scale)
+    place, bit = divmod(channel, 8 * words.dtype.itemsize)
+    return np.asarray(((words[:, place] >> bit) & 1) * 2.0 - 1.0)
+
+
+def _powers(time_s: NDArray[np.float64], wave_rad_s: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return ``exp(jωt)`` for evenly spaced ω: (time, wave) complex128."""
+    n_waves = len(wave_rad_s)
+    n = math.ceil(math.sqrt(n_waves))
+    spacing_rad_s = wave_rad_s[1] - wave_rad_s[0] if n_waves > 1 else 0.0
+    coarse = np.exp(1j * np.multiply.outer(time_s, wave_rad_s[::n]))
+    fine = np.exp(1j * np.multiply.outer(time_s, spacing_rad_s * np.arange(n)))
+    return np.asarray((coarse[:, :, None] * fine[:, None, :]).reshape(len(time_s), -1)[:, :n_waves])
+
+
+def _steps(time_s: NDArray[np.float64], spacing_rad_s: float, count: int) -> NDArray[np.complex128]:
+    """Return ``exp(jk·spacing·t)`` for k from 0 to ``count - 1``: (count, time) complex128."""
+    turns: NDArray[np.complex128] = np.empty((count, len(time_s)), dtype=np.complex128)
+    turns[0] = 1.0
+    once = np.exp(1j * spacing_rad_s * time_s)
+    for k in range(1, count):
+        np.multiply(turns[k - 1], once, out=turns[k])
+    return turns

@@ -1,0 +1,126 @@
+"""Measured errors of an image relative to the exact one."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.stages.detect import find_peaks
+from ertis_numba.stages.fitting import one_thread
+from ertis_numba.verification._exact import ExactImage
+from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
+
+__all__ = ["Measured", "error_db", "exact_image", "measure", "sampled"]
+
+_MAX_OPERATIONS = 3e9  # complex multiplications: some ten seconds of one core
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The error of an image.
+
+    Attributes
+    ----------
+    error_db : float
+    n_directions : int
+        On which it was measured.
+    peaks : PeakErrors or None
+        None where that was not all directions.
+    """
+
+    error_db: float
+    n_directions: int
+    peaks: PeakErrors | None
+
+
+def measure(image: Energyscape, measurement: Measurement) -> Measured:
+    """Return the error of the image that ``measurement`` was made into, by the settings of the image.
+
+    The exact image is computed in float64, by the definition of the image's beamformer. Where all of it would take
+    more than some ten seconds, a sample is compared: directions of plane wavefronts, single places of spherical ones.
+    Bright ones are drawn more often, and each counts by the inverse of its probability.
+
+    Raises
+    ------
+    DataError
+        The exact image is silent, or the words are not those of the settings.
+    """
+    exact = ExactImage(image, measurement)
+    share = _MAX_OPERATIONS / exact.operations_per_direction / len(image.energy)
+    if share < 1:
+        return _measured_in_part(image, exact, share)
+    wanted = _whole(image, exact)
+    return Measured(
+        error_db=error_db(image.energy, wanted),
+        n_directions=len(wanted),
+        peaks=peak_errors(image, find_peaks(image.replace(energy=wanted.astype(np.float32)), top=PEAKS)),
+    )
+
+
+def _measured_in_part(image: Energyscape, exact: ExactImage, share: float) -> Measured:
+    """Return the error measured on a share of the directions, or of the places where wavefronts are spherical."""
+    power = np.square(image.energy, dtype=np.float64)
+    by_place = image.settings.processing.wavefront == "spherical"
+    power = power if by_place else power.sum(axis=1, keepdims=True)
+    chosen, weights = sampled(power.ravel(), max(1, int(share * power.size)))
+    directions, ranges = np.divmod(chosen, power.shape[1])
+    pairs = []
+    with one_thread():
+        for direction in np.unique(directions).tolist():
+            mine = directions == direction
+            places = ranges[mine] if by_place else np.arange(image.energy.shape[1])
+            both = np.stack([image.energy[direction, places], exact.amplitudes(direction, places)])
+            pairs.append(np.sqrt(weights[mine]) * both)
+    found, wanted = np.concatenate(pairs, axis=1)
+    return Measured(error_db=error_db(found, wanted), n_directions=len(pairs), peaks=None)
+
+
+def exact_image(image: Energyscape, measurement: Measurement) -> Energyscape:
+    """Return the exact image of a measurement on the axes of another image, whose settings count.
+
+    All directions are computed, however long it takes. Amplitudes are rounded to float32 at the end.
+
+    Raises
+    ------
+    DataError
+        The words are not those of the settings.
+    """
+    return image.replace(energy=_whole(image, ExactImage(image, measurement)).astype(np.float32))
+
+
+def _whole(image: Energyscape, exact: ExactImage) -> NDArray[np.float64]:
+    ranges = np.arange(image.energy.shape[1])
+    with one_thread():
+        return np.stack([exact.amplitudes(direction, ranges) for direction in range(len(image.energy))])
+
+
+def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
+    """Return the norm of the difference by that of the exact image.
+
+    Raises
+    ------
+    DataError
+        The exact image is silent.
+    """
+    wanted = float(np.linalg.norm(exact.astype(np.float64)))
+    if not wanted:
+        raise DataError("the exact image is silent, so no error can be measured by it; give a measurement with echoes")
+    difference = float(np.linalg.norm(energy.astype(np.float64) - exact))
+    return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf
+
+
+def sampled(power: NDArray[np.float64], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return which items stand for all, and their weights in a sum over all: (item,) intp, (item,) float64.
+
+    Systematic sampling with probabilities half even and half by power. Neighbours are alike, so that drawing at equal
+    steps of the cumulated probability errs less than drawing at random.
+    """
+    total = float(power.sum())
+    even = np.full(len(power), 1 / len(power))
+    probability = (even + power / total) / 2 if 0 < total < math.inf else even
+    drawn = np.searchsorted(np.cumsum(probability), (np.arange(count) + 0.5) / count)
+    chosen, times = np.unique(np.minimum(drawn, len(power) - 1), return_counts=True)
+    return chosen, times / (count * probability[chosen])

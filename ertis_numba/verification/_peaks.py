@@ -1,0 +1,67 @@
+"""Errors of the strongest reflectors of an image."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.stages.detect import find_peaks
+
+__all__ = ["PEAKS", "PeakErrors", "peak_errors"]
+
+PEAKS = 10
+"""Of the strongest reflectors, how many are compared."""
+
+_NEAR_DEG, _NEAR_M = 5.0, 0.02  # half a main lobe and half a pulse: what lies further off is another reflector
+
+
+@dataclass(frozen=True, slots=True)
+class PeakErrors:
+    """How the strongest reflectors of the exact image are shown by another one.
+
+    Attributes
+    ----------
+    wanted, lost : int
+        Reflectors that were looked for, and those of which there is none near by.
+    level_db, range_mm, angle_deg : float or None
+        Largest error of what was found, levels being below the strongest; None if nothing was.
+    """
+
+    wanted: int
+    lost: int
+    level_db: float | None
+    range_mm: float | None
+    angle_deg: float | None
+
+
+def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
+    """Return how an image shows the reflectors that the exact one has."""
+    # Twice as many, since those of nearly one level change places, and what was last may be left out.
+    found = find_peaks(image, top=2 * PEAKS, min_level_db=-1000.0)
+    errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
+    level_db, range_m, angle_deg = np.max(np.abs(errors), axis=0).tolist() if errors else (None, None, None)
+    return PeakErrors(
+        wanted=len(wanted),
+        lost=len(wanted) - len(errors),
+        level_db=level_db,
+        range_mm=None if range_m is None else 1000 * range_m,
+        angle_deg=angle_deg,
+    )
+
+
+def _nearest(peak: Peak, found: Sequence[Peak]) -> tuple[float, float, float] | None:
+    """Return errors of level, range and angle of the peak that shows a reflector."""
+    errors = (
+        (other.level_db - peak.level_db, other.range_m - peak.range_m, _angle_deg(peak, other)) for other in found
+    )
+    near = [error for error in errors if abs(error[1]) <= _NEAR_M and error[2] <= _NEAR_DEG]
+    return min(near, key=lambda error: (error[1] / _NEAR_M) ** 2 + (error[2] / _NEAR_DEG) ** 2, default=None)
+
+
+def _angle_deg(one: Peak, other: Peak) -> float:
+    angles_rad = np.radians([[peak.azimuth_deg, peak.elevation_deg] for peak in (one, other)])
+    first, second = unit_vectors(angles_rad[:, 0], angles_rad[:, 1])
+    return math.degrees(2 * math.asin(min(1.0, float(np.linalg.norm(first - second)) / 2)))
