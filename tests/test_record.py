@@ -24,6 +24,7 @@ from tests.journals import ENVIRONMENT, TINY, entries
 
 REPORTED = {
     *("event", "received", "stored", "missing", "recordings", "unsealed", "refused", "seconds", "ack", "commit"),
+    "restarts",
     *("processing", "sensors"),
 }
 

@@ -119,7 +119,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
             most_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
             with record.start(most_lines=most_lines) as node:
                 if most_lines is not None:
-                    by_line += node.ends_within(_LIFE_S)
+                    by_line += until(lambda node=node: _killed_itself(node), timeout_s=_LIFE_S)  # type: ignore[misc]
                 else:
                     if rng.random() < 0.8:  # others are killed while they start
                         node.wait_for("listening")
@@ -127,6 +127,11 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
                 node.kill()
         ended = record.finish([sender])
     return {"kills": count, "before a line": by_line} | ended | judged(folder, record.archive, [diary])
+
+
+def _killed_itself(node: Process) -> bool:
+    """Whether a central node has been killed before a line: it has ended, or was started again."""
+    return not node.running or any(event.get("event") == "restarted" for event in node.events)
 
 
 def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:

@@ -148,10 +148,16 @@ class Process:
         return self._process.poll() is None
 
     @property
+    def node_pid(self) -> int:
+        """Process that does the work: the latest child of a supervisor, as its events name it."""
+        with self._news:
+            return next((each["pid"] for each in reversed(self.events) if each.get("event") == "listening"), self.pid)
+
+    @property
     def memory_bytes(self) -> int:
         """What it holds in memory; 0 where that cannot be told."""
         try:
-            pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
+            pages = Path(f"/proc/{self.node_pid}/statm").read_text("ascii").split()[1]
         except (OSError, IndexError):
             return 0
         return int(pages) * _PAGE_BYTES
