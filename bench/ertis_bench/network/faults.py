@@ -13,6 +13,7 @@ from ertis_bench.network import (
     faults_load,
     faults_peers,
     faults_processing,
+    faults_wire,
 )
 from ertis_bench.reliability import small_disk
 from ertis_bench.trials import Parts, try_parts
@@ -43,6 +44,10 @@ class Extent:
         How long there is too much to do, and how long there are slow applications.
     n_pulses : int
         Of a SYNC chain.
+    n_flips : int
+        Bits flipped in encrypted messages.
+    n_gone : int
+        Sensor nodes killed while the central node is behind with reading.
     """
 
     n_kills: int
@@ -58,15 +63,18 @@ class Extent:
     overload_s: float
     slow_s: float
     n_pulses: int
+    n_flips: int
+    n_gone: int
 
 
 SHORT = Extent(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
-    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40,
+    n_hostile=200, n_fuzzed=10_000, overload_s=3.0, slow_s=8.0, n_pulses=40, n_flips=30, n_gone=5,
 )  # fmt: skip
 LONG = Extent(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
-    n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400,
+    n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, overload_s=600.0, slow_s=240.0, n_pulses=400, n_flips=1_000,
+    n_gone=200,
 )  # fmt: skip
 
 
@@ -136,6 +144,14 @@ PARTS: Parts[Extent] = {
     "fuzzed": (
         "{n_fuzzed} malformed messages",
         lambda extent, folder, seed: faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
+    ),
+    "flips": (
+        "{n_flips} bits flipped in encrypted messages",
+        lambda extent, folder, seed: faults_wire.flips(folder, seed=seed, count=extent.n_flips),
+    ),
+    "gone": (
+        "{n_gone} sensor nodes killed while the central node is behind",
+        lambda extent, folder, seed: faults_wire.gone(folder, seed=seed, count=extent.n_gone),
     ),
     "overload": (
         "{overload_s:g} s of twice as much as can be done",

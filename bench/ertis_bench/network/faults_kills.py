@@ -49,10 +49,11 @@ class Record:
         self.archive.mkdir(exist_ok=True)
         self.address, self.mark = free_address(), secrets.token_hex(8)
 
-    def start(self, *, most_lines: int | None = None) -> Process:
-        """Start it, to be killed after some lines of its code; it need not listen yet."""
+    def start(self, *, most_lines: int | None = None, busy: bool = False) -> Process:
+        """Start it, to be killed after some lines of its code, or to be held by SIGUSR1; it need not listen yet."""
         options = ("-o", str(self.archive), *self._options)
-        return central("record", self.folder, *options, listen=self.address, mark=self.mark, most_lines=most_lines)
+        common: dict[str, Any] = {"listen": self.address, "mark": self.mark}
+        return central("record", self.folder, *options, **common, most_lines=most_lines, busy=busy)
 
     def finish(self, senders: list[Process], *, timeout_s: float = 120.0) -> Found:
         """Start it once more, let senders end, which brings all that they still have, and let it seal.
@@ -131,7 +132,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
 
 def _killed_itself(node: Process) -> bool:
     """Whether a central node has been killed before a line: it has ended, or was started again."""
-    return not node.running or any(event.get("event") == "restarted" for event in node.events)
+    return not node.running or node.restarts > 0
 
 
 def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:
