@@ -12,8 +12,8 @@ from typing import Final
 
 __all__ = ["BUSY_S"]
 
-BUSY_S: Final = 3.0
-"""Time that one signal costs: longer than two heartbeats of a second."""
+BUSY_S: Final = 3.5
+"""Time that one signal costs: kill and two heartbeats of a second fit in."""
 
 
 def _wait(_number: int, _frame: FrameType | None) -> None:

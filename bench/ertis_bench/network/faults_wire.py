@@ -31,7 +31,8 @@ __all__ = ["flips", "gone"]
 _BACKWARDS: Final = 0.1  # share of flips on the way to a client, which needs three seconds to notice
 _FLIPPED_S: Final = 20.0
 _VICTIMS: Final = 5  # nodes that are killed together
-_UNDER_WAY_S: Final = 0.5  # until a node has sent all that it may
+_WINDOW: Final = 16  # measurements that a node may have under way
+_UNDER_WAY_S: Final = 1.0  # at most, until it has
 _RATE_HZ: Final = 20.0
 _RING_BYTES: Final = 500_000_000
 _CABLES: Final = 4  # to each port
@@ -153,11 +154,15 @@ def _ask(address: str, keys: ClientKeys, ended: threading.Event) -> None:
 
 
 def _tcp_sockets(pid: int) -> int:
-    """Return how many TCP sockets a process has open, also those of connections that are over; Linux only."""
+    """Return how many TCP sockets a process has open, also those of connections that are over; Linux only.
+
+    A process that is gone has none.
+    """
     links = set()
-    for each in Path(f"/proc/{pid}/fd").iterdir():
-        with contextlib.suppress(OSError):  # it was closed meanwhile
-            links.add(str(each.readlink()))
+    with contextlib.suppress(FileNotFoundError):
+        for each in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # it was closed meanwhile
+                links.add(str(each.readlink()))
     local = {f"socket:[{line.split()[6]}]" for line in Path("/proc/net/unix").read_text().splitlines()[1:]}
     return sum(link.startswith("socket:") for link in links - local)
 
@@ -212,10 +217,16 @@ def _kill_while_behind(pid: int, job: Job, diaries: list[Path]) -> None:
         until(lambda: all(_all_acked(diary, at_least=1) for diary in diaries))
         begun_s = time.monotonic()
         os.kill(pid, signal.SIGUSR1)
-        time.sleep(_UNDER_WAY_S)
+        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_UNDER_WAY_S)
         for victim in victims:
             victim.kill()
         time.sleep(max(0.0, begun_s + BUSY_S - time.monotonic()))
+
+
+def _n_waiting(diary: Path) -> int:
+    """Return how many measurements a node has taken that are not acked."""
+    sent = read_diaries([diary])
+    return len(sent.kept - sent.acked())
 
 
 def _all_acked(diary: Path, *, at_least: int) -> bool:
