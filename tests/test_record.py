@@ -37,7 +37,8 @@ class Recording:
         self.process = subprocess.Popen(
             [*command, "--json", "-q", *options], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
         )
-        self.address = self.event("listening")["address"]
+        self.started = self.event("listening")
+        self.address = self.started["address"]
 
     def __enter__(self):
         return self

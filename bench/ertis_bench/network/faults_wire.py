@@ -54,8 +54,8 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
     pairs = _listed(folder)
     server = pairs["central"].public
     boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
-    options = ("--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(folder / "allow.toml"))
-    options += ("--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1")
+    options = ["--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(folder / "allow.toml")]
+    options += ["--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1"]
     with ExitStack() as stack:
         node = stack.enter_context(central("serve", folder, *options))
         listening = node.wait_for("listening")
