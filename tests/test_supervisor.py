@@ -21,10 +21,10 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="central nodes a
 ABORTS_AT_START = "import os, sys\nif 'record' in sys.argv:\n    os.register_at_fork(after_in_child=os.abort)\n"
 
 
-def until_gone(pid):
+def until(condition):
     end_s = time.monotonic() + TIMEOUT_S
-    while not is_gone(pid):
-        assert time.monotonic() < end_s, f"process {pid} is still there"
+    while not condition():
+        assert time.monotonic() < end_s, "it has not happened"
         time.sleep(0.01)
 
 
@@ -65,7 +65,7 @@ def test_the_node_ends_with_its_supervisor(tmp_path):
         child = central.started["pid"]
         central.process.kill()
         central.process.wait()
-        until_gone(child)
+        until(lambda: is_gone(child))
 
 
 def test_a_duration_goes_on_after_a_restart_and_all_lines_are_one_stream(tmp_path):
@@ -91,21 +91,16 @@ def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):
     with Recording(tmp_path) as central:
         child = central.started["pid"]
         os.kill(child, signal.SIGSTOP)
+        until(lambda: status_of(child)["State"].startswith("T"))
         central.process.send_signal(signal.SIGTERM)
-        central.process.send_signal(signal.SIGCONT)  # a signal that is not waited for
-        end_s = time.monotonic() + TIMEOUT_S
-        while not has_pending(child, signal.SIGTERM):
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        until(lambda: int(status_of(child)["ShdPnd"], 16) & 1 << signal.SIGTERM - 1)  # it waits for a stopped process
         os.kill(child, signal.SIGKILL)
         assert central.process.wait(TIMEOUT_S) == 1
 
 
-def has_pending(pid, number):
-    """Return whether a signal waits for a process that is stopped."""
+def status_of(pid):
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    pending = next(line for line in lines if line.startswith("ShdPnd:")).split()[1]
-    return bool(int(pending, 16) >> (number - 1) & 1)
+    return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
 
 
 def test_a_life_counts_what_is_left_of_a_duration():
