@@ -106,8 +106,9 @@ class Meddler:
                 (near, far, "to target"),
                 (far, near, "from target"),
             )
+            for end in (near, far):  # before a thread may close them
+                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             for way in ways:
-                way[0].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 threading.Thread(target=self._relay, args=way, daemon=True).start()
 
     def _relay(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
