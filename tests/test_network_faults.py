@@ -16,6 +16,7 @@ from ertis_bench.network import (
     faults_links,
     faults_peers,
     faults_processing,
+    faults_wire,
     serving,
     tables,
     zmtp,
@@ -149,6 +150,23 @@ def test_malformed_messages(tmp_path):
     assert found["answers"] > 100
     assert found["flushed"]
     assert found["memory grew, MB"] < 50
+
+
+def test_flipped_bits_in_encrypted_connections_end_nothing_but_those_connections(tmp_path):
+    found = faults_wire.flips(tmp_path, seed=SEED, count=faults.SHORT.n_flips)
+    assert wrong_in("flips", found) == {}
+    assert (found["flips"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_flips, 0, 0)
+    assert found["flushed"]
+    assert found["exit code"] == 0
+
+
+def test_nodes_killed_while_the_central_node_is_behind_do_not_end_it(tmp_path):
+    found = faults_wire.gone(tmp_path, seed=SEED, count=faults.SHORT.n_gone)
+    assert wrong_in("gone", found) == {}
+    assert (found["kills"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_gone, 0, 0)
+    assert found["promised"] > faults.SHORT.n_gone
+    assert found["flushed"]
+    assert (found["exit code"], found["orphans"]) == (0, 0)
 
 
 def test_a_node_that_loses_and_spoils_is_found_out(tmp_path, monkeypatch):

@@ -24,6 +24,7 @@ from tests.journals import ENVIRONMENT, TINY, entries
 
 REPORTED = {
     *("event", "received", "stored", "missing", "recordings", "unsealed", "refused", "seconds", "ack", "commit"),
+    "restarts",
     *("processing", "sensors"),
 }
 
@@ -36,7 +37,8 @@ class Recording:
         self.process = subprocess.Popen(
             [*command, "--json", "-q", *options], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
         )
-        self.address = self.event("listening")["address"]
+        self.started = self.event("listening")
+        self.address = self.started["address"]
 
     def __enter__(self):
         return self

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from ertis_cli._supervisor import Life
     from ertis_numba.network.central_node import Archive, CentralNode
     from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
@@ -48,33 +49,40 @@ class CentralWatch:
 
     Parameters
     ----------
+    life : Life
+        Of this process.
     quiet, as_json : bool
 
     Attributes
     ----------
+    life : Life
+    quiet, as_json : bool
     recordings : list of str
         That were made.
     """
 
-    def __init__(self, *, quiet: bool, as_json: bool) -> None:
+    def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
 
         self._out, self._err = Lines(sys.stdout), Lines(sys.stderr)  # the loop must not wait for who reads them
         show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
-        self._quiet, self._as_json = quiet, as_json
+        self.life, self.quiet, self.as_json = life, quiet, as_json
         self._line = sys.stderr.isatty() and not quiet
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.recordings: list[str] = []
+        if life.restarts:
+            self.event({"event": "restarted", "restarts": life.restarts, "reason": life.reason})
 
     def event(self, event: dict[str, Any]) -> None:
         """Tell of an event of the central node."""
         if event["event"] == "sealed" and event["recording"] is not None:
             self.recordings.append(event["recording"])
-        if self._as_json:
+        self.life.note(event)
+        if self.as_json:
             self._print(event)
-        if self._quiet:
+        if self.quiet:
             return
         if self._line:
             self._err.write("\r\x1b[K")
@@ -181,34 +189,35 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.0f} MB"
 
 
-def report(status: "Status", recordings: list[str], *, event: str, quiet: bool, as_json: bool) -> None:
+def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
     """Tell what has come of it; leave with an exit code of 1 where journals are left.
 
     Parameters
     ----------
     status : Status
-    recordings : list of str
-        That were made.
+    watch : CentralWatch
     event : str
         Its name.
-    quiet, as_json : bool
     """
     import msgspec
+
+    quiet = watch.quiet
 
     sensors, archive = status.sensors, status.archive
     missing: Counter[str] = Counter()
     for each in sensors.values():
         missing.update(each.missing)
     left = 0 if archive is None else archive.sealing
-    if as_json:
+    if watch.as_json:
         told = {
             "received": sum(each.received for each in sensors.values()),
             "stored": sum(each.stored for each in sensors.values()),
             "missing": missing,
-            "recordings": recordings,
+            "recordings": watch.recordings,
             "unsealed": left,
             "refused": status.refused,
             "seconds": status.uptime_s,
+            "restarts": watch.life.restarts,
             "ack": None if archive is None else archive.ack,
             "commit": None if archive is None else archive.commit,
             "processing": status.processing,

@@ -15,6 +15,7 @@ __all__ = [
     "broken_off_by_signals",
     "interrupt_later",
     "interruption",
+    "is_detached",
     "obey_signals",
     "stopped_by_signals",
 ]
@@ -165,7 +166,7 @@ def broken_off_by_signals() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
-    before = {number: signal.signal(number, handler) for number in _SIGNALS if not _is_detached(number)}
+    before = {number: signal.signal(number, handler) for number in _SIGNALS if not is_detached(number)}
     try:
         yield
     finally:
@@ -173,7 +174,7 @@ def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
             signal.signal(number, earlier)
 
 
-def _is_detached(number: int) -> bool:
+def is_detached(number: int) -> bool:
     """Return whether the process outlives its terminal, as ``nohup`` asks by ignoring SIGHUP."""
     return number == getattr(signal, "SIGHUP", None) and signal.getsignal(number) is signal.SIG_IGN
 

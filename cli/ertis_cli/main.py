@@ -9,7 +9,7 @@ from typing import Any, NoReturn, cast
 
 import click
 
-from ertis_cli import _config, _naming
+from ertis_cli import _config, _naming, _supervisor
 from ertis_cli._signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
@@ -164,6 +164,7 @@ def cli(ctx: click.Context) -> None:
 def main() -> None:
     """Run the command line."""
     obey_signals()
+    _supervisor.allow()
     # Libraries make a hundred thousand objects that stay: to look through them is a twentieth of a command's time.
     gc.set_threshold(100_000)
     try:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from ertis_cli import _central_watch, _network, options
+from ertis_cli import _central_watch, _network, _supervisor, options
 from ertis_cli._saving import taken_back
 
 __all__ = ["record"]
@@ -48,15 +48,16 @@ def record(
     recordings appear there complete, one after the other, and at the end. What a crash leaves is made a recording when
     it is started again, or by 'ertis recover'. Ctrl-C ends it; with --json there is a line for each event.
     """
+    life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN
     from ertis_numba.network.central_node import CentralNode
 
     _network.require_duration(duration)
     served = _network.metrics(metrics, lambda: node.latest)
     archive = _central_watch.archive(folder, name, rotate_size, rotate_every)
-    watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
+    watch = _central_watch.CentralWatch(life, quiet=quiet, as_json=as_json)
     node = CentralNode(
-        listen or DEFAULT_LISTEN,
+        life.addresses.get("address") or listen or DEFAULT_LISTEN,
         keys=_network.server_keys(key, allow),
         archive=archive,
         most_bytes=most_bytes,
@@ -64,5 +65,5 @@ def record(
         on_stored=watch.stored if as_json and every else None,
     )
     with taken_back(folder) as made:
-        _central_watch.run(node, watch, made=made, metrics=served, duration_s=duration)
-    _central_watch.report(node.latest, watch.recordings, event="recorded", quiet=quiet, as_json=as_json)
+        _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
+    _central_watch.report(node.latest, watch, event="recorded")

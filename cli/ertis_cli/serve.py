@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import click
 
-from ertis_cli import _central_watch, _network, options
+from ertis_cli import _central_watch, _network, _supervisor, options
 from ertis_cli._saving import taken_back
 
 __all__ = ["serve"]
@@ -93,6 +93,7 @@ def serve(
     take longer than measurements to come, the oldest are dropped and counted. With --record, what is acknowledged is
     durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
     """
+    life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
     from ertis_numba.network.processing import Options, Processing
@@ -100,7 +101,7 @@ def serve(
 
     _network.require_duration(duration)
     served = _network.metrics(metrics, lambda: node.latest)
-    publish = publish or DEFAULT_PUBLISH
+    publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
     changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
     keys = _network.server_keys(key, allow)
     with taken_back(folder, quarantine) as made:
@@ -123,14 +124,14 @@ def serve(
             )
         )
         archive = None if folder is None else _central_watch.archive(folder, name, rotate_size, rotate_every)
-        watch = _central_watch.CentralWatch(quiet=quiet, as_json=as_json)
+        watch = _central_watch.CentralWatch(life, quiet=quiet, as_json=as_json)
 
         def on_event(event: dict[str, Any]) -> None:
             listening = event["event"] == "listening"
             watch.event(event | ({"publish": at_port(publish, processing.address)} if listening else {}))
 
         node = CentralNode(
-            listen or DEFAULT_LISTEN,
+            life.addresses.get("address") or listen or DEFAULT_LISTEN,
             keys=keys,
             archive=archive,
             processing=processing,
@@ -138,8 +139,8 @@ def serve(
             on_event=on_event,
             on_stored=watch.stored if as_json and every else None,
         )
-        _central_watch.run(node, watch, made=made, metrics=served, duration_s=duration)
-    _central_watch.report(node.latest, watch.recordings, event="served", quiet=quiet, as_json=as_json)
+        _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
+    _central_watch.report(node.latest, watch, event="served")
 
 
 def _make(folder: Path) -> None:

@@ -33,6 +33,7 @@ _LOOK_S: Final = 0.25
 _AT_ONCE: Final = 64
 _LIST_BYTES: Final = 4_000_000
 _SELF_TEST_S: Final = 3.0
+_NO_KEY, _UNKNOWN_KEY = "no key", "unknown key"
 _SUCCEEDED: Final = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 _PROTOCOL: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
 _NO_DETAIL: Final = int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
@@ -130,11 +131,11 @@ class Gate:
         """Return the User-Id of who is let in, or nothing and why."""
         version, _, domain, _, _, mechanism, *credentials = request
         if version != b"1.0" or domain != DOMAIN or mechanism != b"CURVE":
-            return "", "no key"
+            return "", _NO_KEY
         (key,) = credentials
         self._look()
         permission = self._allowed.get(z85.encode(key).decode())
-        return (self._mark + permission.public, "") if permission else ("", "unknown key")
+        return (self._mark + permission.public, "") if permission else ("", _UNKNOWN_KEY)
 
     def who(self, frames: Sequence[zmq.Frame]) -> Permission | None:
         """Return what the sender of a message may do by the list as it is now; None, and counted, if nothing.
@@ -154,7 +155,7 @@ class Gate:
         except zmq.ZMQError:
             user = ""
         if not user.startswith(self._mark):
-            self.refused["no key"] += 1
+            self.refused[_NO_KEY] += 1
             return None
         self._look()
         permission = self._allowed.get(user.removeprefix(self._mark))
@@ -165,7 +166,8 @@ class Gate:
     def tick(self) -> bool:
         """Look at the list again, and count who was turned away; True if the list has changed since it last was."""
         for strangers in self._strangers:
-            self.refused.update(strangers.read())
+            if found := strangers.read():
+                self.refused[_NO_KEY] += found
         self._look()
         changed, self._changed = self._changed, False
         return changed
@@ -207,13 +209,16 @@ class Gate:
         """
         if self._keys is None:
             return
-        self._try(endpoint, "no key")
-        self._try(endpoint, "unknown key")
+        self._try(endpoint, _NO_KEY)
+        self._try(endpoint, _UNKNOWN_KEY)
 
     def _try(self, endpoint: str, reason: str) -> None:
         """See that an attempt to get in fails as it should; it is not counted."""
-        unknown = reason == "unknown key"
+        unknown = reason == _UNKNOWN_KEY
         before, told, end_s = self.refused.copy(), False, time.monotonic() + _SELF_TEST_S
+        if not unknown:
+            for strangers in self._strangers:
+                strangers.discount()
         with zmq.Context(io_threads=1) as context, context.socket(zmq.DEALER) as stranger:
             stranger.setsockopt(zmq.LINGER, 0)
             stranger.setsockopt(zmq.RECONNECT_IVL, -1)  # once: what the server counts of it is to be taken back
@@ -233,9 +238,10 @@ class Gate:
                             raise NetworkError(f"{endpoint} lets in a node with {reason}; do not use this installation")
                         # Who finds first that only one has keys hangs up on the other.
                         told = told or event in ((_AUTH,) if unknown else (_PROTOCOL, _NO_DETAIL))
-                    counted = self.refused[reason] > before[reason]
-                    if told and (counted or not (unknown or self._strangers)):
-                        self.refused.subtract([reason] * counted)
+                    if told and not unknown:
+                        return
+                    if told and self.refused[reason] > before[reason]:
+                        self.refused.subtract([reason])
                         self.refused += Counter()  # without zeros
                         return
         raise NetworkError(

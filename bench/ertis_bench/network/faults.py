@@ -14,6 +14,7 @@ from ertis_bench.network import (
     faults_load,
     faults_peers,
     faults_processing,
+    faults_wire,
     hostile,
 )
 from ertis_bench.reliability import small_disk
@@ -49,6 +50,10 @@ class Extent:
         Of a SYNC chain.
     n_power_cuts : int
         States of a disk after a power cut.
+    n_flips : int
+        Bits flipped in encrypted messages.
+    n_gone : int
+        Sensor nodes killed while the central node is behind with reading.
     """
 
     n_kills: int
@@ -67,16 +72,19 @@ class Extent:
     slow_s: float
     n_pulses: int
     n_power_cuts: int
+    n_flips: int
+    n_gone: int
 
 
 SHORT = Extent(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
     n_hostile=200, n_fuzzed=10_000, n_hellos=60, n_files=60, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
+    n_flips=30, n_gone=5,
 )  # fmt: skip
 LONG = Extent(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
     n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, n_hellos=1_000, n_files=1_000, overload_s=600.0,
-    slow_s=240.0, n_pulses=400, n_power_cuts=4_500,
+    slow_s=240.0, n_pulses=400, n_power_cuts=4_500, n_flips=1_000, n_gone=200,
 )  # fmt: skip
 
 
@@ -154,6 +162,14 @@ PARTS: Parts[Extent] = {
     "files": (
         "hostile files",
         lambda extent, folder, _: hostile.files(folder, count=extent.n_files),
+    ),
+    "flips": (
+        "{n_flips} bits flipped in encrypted messages",
+        lambda extent, folder, seed: faults_wire.flips(folder, seed=seed, count=extent.n_flips),
+    ),
+    "gone": (
+        "{n_gone} sensor nodes killed while the central node is behind",
+        lambda extent, folder, seed: faults_wire.gone(folder, seed=seed, count=extent.n_gone),
     ),
     "overload": (
         "{overload_s:g} s of twice as much as can be done",

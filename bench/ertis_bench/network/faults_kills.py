@@ -49,10 +49,11 @@ class Record:
         self.archive.mkdir(exist_ok=True)
         self.address, self.mark = free_address(), secrets.token_hex(8)
 
-    def start(self, *, most_lines: int | None = None) -> Process:
-        """Start it, to be killed after some lines of its code; it need not listen yet."""
+    def start(self, *, most_lines: int | None = None, busy: bool = False) -> Process:
+        """Start it, to be killed after some lines of its code, or to be held by SIGUSR1; it need not listen yet."""
         options = ("-o", str(self.archive), *self._options)
-        return central("record", self.folder, *options, listen=self.address, mark=self.mark, most_lines=most_lines)
+        common: dict[str, Any] = {"listen": self.address, "mark": self.mark}
+        return central("record", self.folder, *options, **common, most_lines=most_lines, busy=busy)
 
     def finish(self, senders: list[Process], *, timeout_s: float = 120.0) -> Found:
         """Start it once more, let senders end, which brings all that they still have, and let it seal.
@@ -119,7 +120,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
             most_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
             with record.start(most_lines=most_lines) as node:
                 if most_lines is not None:
-                    by_line += node.ends_within(_LIFE_S)
+                    by_line += until(lambda node=node: _killed_itself(node), timeout_s=_LIFE_S)  # type: ignore[misc]
                 else:
                     if rng.random() < 0.8:  # others are killed while they start
                         node.wait_for("listening")
@@ -127,6 +128,11 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
                 node.kill()
         ended = record.finish([sender])
     return {"kills": count, "before a line": by_line} | ended | judged(folder, record.archive, [diary])
+
+
+def _killed_itself(node: Process) -> bool:
+    """Whether a central node has been killed before a line: it has ended, or was started again."""
+    return not node.running or node.restarts > 0
 
 
 def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:

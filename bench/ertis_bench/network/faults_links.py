@@ -1,6 +1,7 @@
 """Disks that are full or fail, central nodes that are away, and messages that get lost on the way."""
 
 import json
+import os
 import resource
 import signal
 import time
@@ -104,7 +105,7 @@ def _faulty(folder: Path, record: Record, free: Callable[[], None] | None, *, se
 
 def _limit(process: Process, most_bytes: int) -> None:
     """Let writes beyond a place in any file fail: with EFBIG, which SQLite takes for a fault of the disk."""
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most_bytes, resource.RLIM_INFINITY))
+    resource.prlimit(process.node_pid, resource.RLIMIT_FSIZE, (most_bytes, resource.RLIM_INFINITY))
 
 
 def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
@@ -131,14 +132,14 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
             if how == "killed":
                 node.kill()
             else:
-                node.signal(signal.SIGSTOP)
+                os.kill(node.node_pid, signal.SIGSTOP)
             time.sleep(away_s)
             found[f"memory grew{name}, MB"] = round((sender.memory_bytes - before) / 1e6, 1)
             if how == "killed":
                 node = stack.enter_context(record.start())
                 node.wait_for("listening")
             else:
-                node.signal(signal.SIGCONT)
+                os.kill(node.node_pid, signal.SIGCONT)
             back_s = time.monotonic()
             acked = len(read_diaries([diary]).acked())
             until(lambda acked=acked: len(read_diaries([diary]).acked()) > acked)  # type: ignore[misc]

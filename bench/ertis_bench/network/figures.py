@@ -133,7 +133,7 @@ def storage(
         for sender in senders:
             sender.wait_for("begun")
         time.sleep(max(0.0, start_s - time.monotonic()))
-        load = _Load(**{"central node": [node.pid], "sensor nodes": [each.pid for each in senders]})
+        load = _Load(**{"central node": [node.node_pid], "sensor nodes": [each.pid for each in senders]})
         time.sleep(max(0.0, start_s + duration_s - 1.0 - time.monotonic()))
         cpu_percent = load.percent()
         for sender in senders:
@@ -199,10 +199,10 @@ def processing(
             job.replace(diary=str(diary), rate_hz=rate_hz, count=round(duration_s * rate_hz)).start()
         )
         sender.wait_for("begun")
-        family = [pid for pid in survivors(serve.mark) if pid != serve.node.pid]
+        family = [pid for pid in survivors(serve.mark) if pid != serve.node.node_pid]
         load = _Load(
             **{
-                "central node": [serve.node.pid],
+                "central node": [serve.node.node_pid],
                 "its workers and publisher": family,
                 "sensor nodes": [sender.pid],
                 "application": [receiver.pid],

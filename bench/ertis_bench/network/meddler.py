@@ -7,13 +7,16 @@ import threading
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, Literal, Self
 
 from ertis_bench.network.zmtp import GREETING, Frame, Frames, host_and_port
 
-__all__ = ["ACKS", "Meddler", "Odds"]
+__all__ = ["ACKS", "Direction", "Meddler", "Odds"]
 
+Direction = Literal["to target", "from target"]
 _READ_BYTES: Final = 262_144
+_HEAD_BYTES: Final = 26  # of a message of CURVE: its length, command, and nonce
+_SHARE_OF_HEAD: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +39,7 @@ class Meddler:
     Parameters
     ----------
     target : str
-        ``tcp://HOST:PORT`` of a node without keys, whose messages can be read.
+        ``tcp://HOST:PORT``. Odds apply to a node without keys only, whose messages can be read.
     seed : int
     odds : mapping of str to Odds
         By the kind of a message.
@@ -56,7 +59,7 @@ class Meddler:
         self._sockets: list[socket.socket] = []
         self._plugged = threading.Event()
         self._plugged.set()
-        self._closed = False
+        self._flips: Counter[Direction] = Counter()
         self._server = socket.create_server(("127.0.0.1", 0))
         self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
@@ -79,6 +82,10 @@ class Meddler:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
 
+    def flip(self, direction: Direction) -> None:
+        """Flip a bit of the next message that goes in a direction; ``did`` counts it."""
+        self._flips[direction] += 1
+
     def _accept(self) -> None:
         while True:
             try:
@@ -95,12 +102,16 @@ class Meddler:
                 near.close()
                 continue
             self._sockets = [each for each in self._sockets if each.fileno() >= 0] + [near, far]
-            for ends in ((near, far), (far, near)):
-                for end in ends:
-                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                threading.Thread(target=self._relay, args=ends, daemon=True).start()
+            ways: tuple[tuple[socket.socket, socket.socket, Direction], ...] = (
+                (near, far, "to target"),
+                (far, near, "from target"),
+            )
+            for end in (near, far):  # before a thread may close them
+                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for way in ways:
+                threading.Thread(target=self._relay, args=way, daemon=True).start()
 
-    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
+    def _relay(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
         """Pass on one direction of a connection until it ends."""
         frames, greeted, body, turn = Frames(), 0, list[Frame](), threading.Lock()
         with contextlib.suppress(OSError):
@@ -114,15 +125,20 @@ class Meddler:
                     if frame.is_command:
                         _send(sink, body.pop().encode(), turn)
                     elif not frame.more:
-                        self._pass(sink, body, turn)
+                        self._pass(sink, body, turn, direction)
                         body = []
         for each in (source, sink):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
 
-    def _pass(self, sink: socket.socket, body: list[Frame], turn: threading.Lock) -> None:
+    def _pass(self, sink: socket.socket, body: list[Frame], turn: threading.Lock, direction: Direction) -> None:
         data = b"".join(frame.encode() for frame in body)
+        if self._flips[direction] > 0:
+            self._flips[direction] -= 1
+            _send(sink, self._flipped(data), turn)
+            self.did[f"flip {direction}"] += 1
+            return
         kind = _kind(body[0].body)
         odds = self._odds.get(kind)
         if odds is None:
@@ -139,6 +155,14 @@ class Meddler:
                 return
             _send(sink, data, turn)
         _send(sink, data, turn)
+
+    def _flipped(self, data: bytes) -> bytes:
+        """Return a message with one bit flipped: of its head in a quarter of the cases, anywhere otherwise."""
+        head = min(len(data), _HEAD_BYTES) if self._random.random() < _SHARE_OF_HEAD else len(data)
+        place = self._random.randrange(8 * head)
+        flipped = bytearray(data)
+        flipped[place // 8] ^= 1 << place % 8
+        return bytes(flipped)
 
     def __enter__(self) -> Self:
         return self

@@ -148,10 +148,22 @@ class Process:
         return self._process.poll() is None
 
     @property
+    def node_pid(self) -> int:
+        """Process that does the work: the latest child of a supervisor, as its events name it."""
+        with self._news:
+            return next((each["pid"] for each in reversed(self.events) if each.get("event") == "listening"), self.pid)
+
+    @property
+    def restarts(self) -> int:
+        """Processes of a central node that its supervisor has replaced."""
+        with self._news:
+            return sum(each.get("event") == "restarted" for each in self.events)
+
+    @property
     def memory_bytes(self) -> int:
         """What it holds in memory; 0 where that cannot be told."""
         try:
-            pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
+            pages = Path(f"/proc/{self.node_pid}/statm").read_text("ascii").split()[1]
         except (OSError, IndexError):
             return 0
         return int(pages) * _PAGE_BYTES
@@ -186,6 +198,7 @@ def central(
     listen: str = "tcp://127.0.0.1:*",
     mark: str = "",
     most_lines: int | None = None,
+    busy: bool = False,
 ) -> Process:
     """Start ``ertis record`` or ``ertis serve``, which says on ``central.txt`` in a folder what is wrong.
 
@@ -199,8 +212,12 @@ def central(
     mark : str
     most_lines : int, optional
         Of its code, after which it is killed.
+    busy : bool
+        SIGUSR1 holds its loop, see `ertis_bench.network.busy`.
     """
     ertis = ERTIS if most_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(most_lines))
+    if busy:
+        ertis = (sys.executable, "-m", "ertis_bench.network.busy")
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return Process(line, said=folder / "central.txt", mark=mark)
 

@@ -112,6 +112,16 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
             "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of a processor), memory + {memory grew, MB:.0f} MB"
         ),
     ),
+    "flips": (
+        "{flips:,} bits flipped in encrypted messages, on both ports",
+        "0 aborts, 0 acked lost; connections are closed",
+        "{restarts} restarts, sockets left over: {sockets left}; {acked:,} acked, " + _STORED,
+    ),
+    "gone": (
+        "kill -9 of {kills:,} sensor nodes while the central node is behind with reading",
+        "0 aborts, 0 acked lost",
+        "{restarts} restarts, sockets left over: {sockets left}; {acked:,} acked, " + _STORED,
+    ),
     "overload": (
         "overload 2×, {capacity per s:.0f} images/s being possible",
         "received = published + dropped; latency bounded",

@@ -1,0 +1,30 @@
+"""A central node that falls behind with reading on demand: ``python -m ertis_bench.network.busy COMMAND …``.
+
+SIGUSR1 holds its loop, as a slow disk or a long computation would. The threads of ZeroMQ go on.
+"""
+
+import runpy
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Final
+
+__all__ = ["BUSY_S"]
+
+BUSY_S: Final = 3.5
+"""Time that one signal costs: kill and two heartbeats of a second fit in."""
+
+
+def _wait(_number: int, _frame: FrameType | None) -> None:
+    time.sleep(BUSY_S)
+
+
+def _main() -> None:
+    sys.argv[:1] = ["ertis"]
+    signal.signal(signal.SIGUSR1, _wait)
+    runpy.run_module("ertis_cli", run_name="__main__")
+
+
+if __name__ == "__main__":
+    _main()

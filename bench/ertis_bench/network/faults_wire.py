@@ -1,0 +1,233 @@
+"""Damage below the protocol: flipped bits in encrypted connections, and nodes that go while their messages wait."""
+
+import contextlib
+import os
+import random
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench.network.busy import BUSY_S
+from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.faults_links import state_of
+from ertis_bench.network.meddler import Direction, Meddler
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import central, until
+from ertis_bench.network.sender import Job
+from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.asking import Asking
+from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.subscriber import Subscriber
+
+__all__ = ["flips", "gone"]
+
+_BACKWARDS: Final = 0.1  # share of flips on the way to a client, which needs three seconds to notice
+_FLIPPED_S: Final = 20.0
+_VICTIMS: Final = 5  # nodes that are killed together
+_WINDOW: Final = 16  # measurements that a node may have under way
+_UNDER_WAY_S: Final = 1.0  # at most, until it has
+_RATE_HZ: Final = 20.0
+_RING_BYTES: Final = 500_000_000
+_CABLES: Final = 4  # to each port
+Found = dict[str, Any]
+
+
+def flips(folder: Path, *, seed: int, count: int) -> Found:
+    """Flip bits in the encrypted connections of a sensor and of an application, while both are served.
+
+    Returns
+    -------
+    dict
+        ``flips``, ``restarts`` of the central node or its publisher, and ``sockets left`` of both together when
+        the clients are gone; and what became of the sensor's measurements.
+    """
+    rng = random.Random(seed)  # noqa: S311  a seed is to give the same faults again
+    archive, diary = folder / "recordings", folder / "sender.ndjson"
+    archive.mkdir()
+    pairs = _listed(folder)
+    server = pairs["central"].public
+    boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
+    options = ["--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(folder / "allow.toml")]
+    options += ["--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1"]
+    with ExitStack() as stack:
+        node = stack.enter_context(central("serve", folder, *options))
+        listening = node.wait_for("listening")
+        pids = [node.node_pid, state_of(listening["address"], *boss)["processing"]["publisher_pid"]]
+        before = [_tcp_sockets(pid) for pid in pids]
+        with ExitStack() as clients:
+            cables = [
+                clients.enter_context(Meddler(listening[name], seed=rng.randrange(2**32)))
+                for name in ("address", "publish") * _CABLES
+            ]
+            job = Job(address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES)
+            sender = clients.enter_context(
+                job.replace(keys=(str(folder / "keys" / "front.secret.toml"), server)).start()
+            )
+            viewer, admin = (ClientKeys(pair=pairs[name], server=server) for name in ("viewer", "boss"))
+            clients.enter_context(_repeating(partial(_watch, cables[1].address, viewer)))
+            for cable in cables[2:]:
+                clients.enter_context(_repeating(partial(_ask, cable.address, admin)))
+            sender.wait_for("begun")
+            with ThreadPoolExecutor(len(cables)) as pool:
+                shares = [len(range(number, count, len(cables))) for number in range(len(cables))]
+                rngs = [random.Random(rng.random()) for _ in cables]  # noqa: S311  as above
+                list(pool.map(_flip, cables, rngs, shares))
+            sender.signal(signal.SIGTERM)
+            flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
+        until(lambda: [_tcp_sockets(pid) for pid in pids] <= before, timeout_s=10.0)
+        left = sum(_tcp_sockets(pid) for pid in pids) - sum(before)
+        restarts = node.restarts + state_of(listening["address"], *boss)["processing"]["publisher_respawned"]
+        code = node.stop()
+    flipped = sum(sum(cable.did.values()) for cable in cables)
+    found = {"flips": flipped, "flushed": flushed, "restarts": restarts, "sockets left": max(0, left)}
+    return found | {"exit code": code} | judged(folder, archive, [diary])
+
+
+def _listed(folder: Path) -> dict[str, KeyPair]:
+    """Make keys of a central node, a sensor, an application and an admin, and the list of those."""
+    pairs = {name: KeyPair.new(name) for name in ("central", "front", "viewer", "boss")}
+    for pair in pairs.values():
+        pair.save(folder / "keys")
+    AllowList(
+        keys=(
+            Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
+            Permission(name="viewer", public=pairs["viewer"].public, role="application"),
+            Permission(name="boss", public=pairs["boss"].public, role="admin"),
+        )
+    ).save(folder / "allow.toml")
+    return pairs
+
+
+def _flip(cable: Meddler, rng: random.Random, count: int) -> None:
+    """Flip one bit after the other in a cable.
+
+    Raises
+    ------
+    DataError
+        Nothing goes through it any more.
+    """
+    for number in range(count):
+        direction: Direction = "from target" if rng.random() < _BACKWARDS else "to target"
+        cable.flip(direction)
+        if not until(lambda number=number: sum(cable.did.values()) > number, timeout_s=_FLIPPED_S):  # type: ignore[misc]
+            raise DataError(f"nothing goes through {cable.address} any more, after {number} flips")
+
+
+@contextmanager
+def _repeating(turn: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Do something again and again until the block ends, whatever becomes of connections."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.is_set():
+            with contextlib.suppress(ErtisError):
+                turn(ended)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _watch(address: str, keys: ClientKeys, ended: threading.Event) -> None:
+    """Receive images."""
+    with Subscriber(address, products=("energyscape",), keys=keys) as images:
+        while not ended.is_set():
+            images.receive(timeout_s=0.1)
+
+
+def _ask(address: str, keys: ClientKeys, ended: threading.Event) -> None:
+    """Ask for the status."""
+    with Asking(address, keys=keys) as asking:
+        while not ended.wait(0.02):
+            asking.ask(patience_s=0.5)
+
+
+def _tcp_sockets(pid: int) -> int:
+    """Return how many TCP sockets a process has open, also those of connections that are over; Linux only.
+
+    A process that is gone has none.
+    """
+    links = set()
+    with contextlib.suppress(FileNotFoundError):
+        for each in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # it was closed meanwhile
+                links.add(str(each.readlink()))
+    local = {f"socket:[{line.split()[6]}]" for line in Path("/proc/net/unix").read_text().splitlines()[1:]}
+    return sum(link.startswith("socket:") for link in links - local)
+
+
+def gone(folder: Path, *, seed: int, count: int) -> Found:
+    """Kill sensor nodes with measurements under way while the central node is behind with reading.
+
+    Returns
+    -------
+    dict
+        ``kills``, ``restarts`` of the central node and ``sockets left``; and what became of the measurements of
+        a node that is left alone, and of those that were killed.
+    """
+    record = Record(folder)
+    steady = folder / "steady.ndjson"
+    job = Job(
+        address=record.address, diary=str(steady), rate_hz=10.0, seed=seed, patience_s=60.0, ring_bytes=_RING_BYTES
+    )
+    diaries = [steady]
+    with ExitStack() as stack:
+        node = stack.enter_context(record.start(busy=True))
+        node.wait_for("listening")
+        pid, before = node.node_pid, _tcp_sockets(node.node_pid)
+        sender = stack.enter_context(job.start())
+        sender.wait_for("begun")
+        for first in range(0, count, _VICTIMS):
+            victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _VICTIMS))]
+            diaries += victims
+            _kill_while_behind(node.node_pid, job, victims)
+        until(lambda: _all_acked(steady, at_least=1))
+        restarts = node.restarts
+        sender.signal(signal.SIGTERM)
+        flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
+        sender.wait()
+        until(lambda: _tcp_sockets(pid) <= before, timeout_s=5.0)
+        left = _tcp_sockets(pid) - before if restarts == 0 else 0
+        code = node.stop()
+    ended = record.finish([])
+    found = {"kills": len(diaries) - 1, "restarts": restarts, "sockets left": max(0, left), "flushed": flushed}
+    return found | {"exit code": code} | ended | judged(folder, record.archive, diaries, kept=[steady])
+
+
+def _kill_while_behind(pid: int, job: Job, diaries: list[Path]) -> None:
+    """Hold the loop of the central node, have nodes send all that they may, and kill them."""
+    with ExitStack() as stack:
+        victims = [
+            stack.enter_context(
+                job.replace(diary=str(diary), sensors=(diary.stem,), rate_hz=100.0, ring_bytes=None).start()
+            )
+            for diary in diaries
+        ]
+        until(lambda: all(_all_acked(diary, at_least=1) for diary in diaries))
+        begun_s = time.monotonic()
+        os.kill(pid, signal.SIGUSR1)
+        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_UNDER_WAY_S)
+        for victim in victims:
+            victim.kill()
+        time.sleep(max(0.0, begun_s + BUSY_S - time.monotonic()))
+
+
+def _n_waiting(diary: Path) -> int:
+    """Return how many measurements a node has taken that are not acked."""
+    sent = read_diaries([diary])
+    return len(sent.kept - sent.acked())
+
+
+def _all_acked(diary: Path, *, at_least: int) -> bool:
+    return diary.exists() and len(read_diaries([diary]).acked()) >= at_least

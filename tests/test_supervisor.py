@@ -1,0 +1,109 @@
+"""Central nodes whose process is ended by a signal: the command starts them again, and nothing acknowledged is lost."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from ertis_cli._supervisor import Life
+
+from tests.central import Node, stored, wanted
+from tests.journals import ENVIRONMENT, entries
+from tests.test_record import Recording
+from tests.test_serve import LOOPBACK, TIMEOUT_S, is_gone, serving
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="central nodes are supervised on Linux")
+
+ABORTS_AT_START = "import os, sys\nif 'record' in sys.argv:\n    os.register_at_fork(after_in_child=os.abort)\n"
+
+
+def until(condition):
+    end_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end_s, "it has not happened"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGKILL])
+def test_record_restarts_at_its_address_without_losing_acknowledged_measurements(number, tmp_path):
+    given = entries(20, first=0)
+    with Recording(tmp_path) as central, Node(central.address) as node:
+        node.hello(first=0)
+        node.measure(*given[:10])
+        assert node.hear_settled(9).settled == 9
+        os.kill(central.started["pid"], number)
+        restarted = central.event("restarted")
+        assert central.event("listening")["address"] == central.address
+        with Node(central.address) as again:
+            assert again.hello(first=10).settled == 9
+            again.measure(*given[10:])
+            again.hear_settled(19)
+            central.process.send_signal(signal.SIGTERM)
+            told = central.event("recorded")
+            assert central.process.wait() == 0
+    assert restarted == {"event": "restarted", "restarts": 1, "reason": signal.Signals(number).name}
+    assert told["restarts"] == 1
+    assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+def test_serve_restarts_with_both_of_its_addresses():
+    with serving(*LOOPBACK, "--workers", "1") as served:
+        os.kill(served.started["pid"], signal.SIGABRT)
+        served.event("restarted")
+        again = served.event("listening")
+        assert (again["address"], again["publish"]) == (served.listen, served.publish)
+        assert again["pid"] != served.started["pid"]
+        assert served.end()["restarts"] == 1
+
+
+def test_the_node_ends_with_its_supervisor(tmp_path):
+    with Recording(tmp_path) as central:
+        child = central.started["pid"]
+        central.process.kill()
+        central.process.wait()
+        until(lambda: is_gone(child))
+
+
+def test_a_duration_goes_on_after_a_restart_and_all_lines_are_one_stream(tmp_path):
+    begun_s = time.monotonic()
+    with Recording(tmp_path, "--duration", "2") as central:
+        os.kill(central.started["pid"], signal.SIGABRT)
+        events = [json.loads(line) for line in central.process.stdout]
+        assert central.process.wait() == 0
+    assert [event["event"] for event in events] == ["restarted", "listening", "recorded"]
+    assert time.monotonic() - begun_s >= 2.0
+
+
+def test_a_node_that_is_ended_before_it_listens_is_not_started_again(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(ABORTS_AT_START)
+    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
+    command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "a")]
+    done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, env=environment)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; what it")
+
+
+def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):
+    with Recording(tmp_path) as central:
+        child = central.started["pid"]
+        os.kill(child, signal.SIGSTOP)
+        until(lambda: status_of(child)["State"].startswith("T"))
+        central.process.send_signal(signal.SIGTERM)
+        until(lambda: int(status_of(child)["ShdPnd"], 16) & 1 << signal.SIGTERM - 1)  # it waits for a stopped process
+        os.kill(child, signal.SIGKILL)
+        assert central.process.wait(TIMEOUT_S) == 1
+
+
+def status_of(pid):
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
+
+
+def test_a_life_counts_what_is_left_of_a_duration():
+    assert Life().remaining_s(None) is None
+    assert Life(elapsed_s=4.0).remaining_s(10.0) == 6.0
+    assert Life(elapsed_s=40.0).remaining_s(10.0) > 0.0
