@@ -41,6 +41,7 @@ PARTS: Final = {
 """Name of each part of the error, and what it is due to."""
 
 _ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
+_ROUNDING = 10 ** (-135 / 10)  # white noise by which single precision errs, relative to all that is transformed
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
@@ -77,6 +78,9 @@ class Texture:
         Of what some microphones hear in each tile of ranges, at the frequencies of an estimate of `BeamNodes`.
     colour : float
         By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
+    loudness : float
+        Power of the signals before the matched filter, at all times and frequencies, relative to ``level``; both are
+        relative to white bits.
     """
 
     shares: NDArray[np.float64]
@@ -87,6 +91,7 @@ class Texture:
     places: NDArray[np.float64]
     covariance: NDArray[np.complex128] | None = None
     colour: float = 1.0
+    loudness: float = 1.0
 
     @classmethod
     def unknown(cls, settings: Settings) -> "Texture":
@@ -115,16 +120,27 @@ class ErrorModel:
         self.texture = texture or Texture.unknown(settings)
         self.frequency_hz, _ = matched_spectrum(settings, n_waves=WAVES)
 
-    def delays(self, fit: DelayFit) -> float:
+    def delays(self, fit: DelayFit, *, n_mics: int, fractions: NDArray[np.float64] | None = None) -> float:
         """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
 
         What samples are wrong by on average is a filter of the image itself, however coherent echoes are; the
         simple ways of interpolation weaken it, which changes magnitudes by all of it. Of the rest no two
-        microphones err alike, so that it has no phase in common with the beam.
+        microphones err alike, so that it has no phase in common with the beam. Few microphones average less: the error
+        of a single one is a filter of its own signal.
+
+        Parameters
+        ----------
+        fit : DelayFit
+        n_mics : int
+        fractions : (delay,) float64, optional
+            Fractions of a step that delays have, where they are too few to be spread evenly.
         """
         texture = self.texture
+        if fractions is not None:
+            return texture.colour * float(fit.errors_at(fractions) @ texture.shares) * max(1.0, 0.5 / texture.gain)
         varying, shared = (float(errors @ texture.shares) for errors in (fit.errors, fit.biases))
-        return texture.colour * (0.5 * varying / texture.gain + (0.5 if fit.is_fitted else 1.0) * shared)
+        independent = 0.5 * (1 + 1 / n_mics) * varying / texture.gain
+        return texture.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
 
     def beams(self, nodes: BeamNodes) -> float:
         """Return the part of interpolated beams, from an estimate of `BeamNodes`.
@@ -229,7 +245,7 @@ class ErrorModel:
 
     def arithmetic(self) -> float:
         """Return the part of single precision."""
-        return _ARITHMETIC / self.texture.gain
+        return (_ARITHMETIC + _ROUNDING * self.texture.loudness) / self.texture.gain
 
     def _of(self, power: float) -> float:
         gain = self.texture.gain
