@@ -10,7 +10,7 @@ import numpy as np
 from click.testing import CliRunner
 from numpy.typing import NDArray
 
-from ertis_bench import machine, referee
+from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.random_settings import Limits, recorded
@@ -18,7 +18,7 @@ from ertis_numba import verification
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry import microphones
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.waveform import call_at
@@ -96,8 +96,8 @@ def tried(seed: int) -> dict[str, Any] | None:
     if not np.any(image.energy):
         return None
     chosen, weights = verification.sampled_directions(image.energy, _DIRECTIONS)
-    directions = unit_vectors(image.azimuth_rad[chosen], image.elevation_rad[chosen])
-    exact = referee.exact(measurement.words, image.settings, directions, image.range_m)
+    verifier = verification.ExactImage(image, measurement)
+    exact = np.stack([verifier.amplitudes(direction) for direction in chosen.tolist()])
     scale = np.sqrt(weights)[:, None]
     error_db = verification.error_db(scale * image.energy[chosen], scale * exact)
     warned = bool(stored) and stored in done.stderr
@@ -205,7 +205,7 @@ def form(report: dict[str, Any]) -> str:
     return (
         f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
         f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
-        f"those of a float64 referee in up to {_DIRECTIONS} directions, bright ones more often. "
+        f"relative to the independent float64 image, in up to {_DIRECTIONS} directions, bright ones more often. "
         f"{sentence(report['machine'])}"
     )
 
