@@ -17,7 +17,7 @@ __all__ = ["Prediction", "planner_of", "predict"]
 UNCERTAINTY_DB: Final = 1.0
 """By which a prediction may be too low: see tests/test_accuracy.py."""
 ADAPTIVE_UNCERTAINTY_DB: Final = 15.0
-"""The same for beamformers that are not linear: too low by up to 13.3 dB in the random settings of `ertis bench budgets`.
+"""The same for beamformers that are not linear: too low by up to 13.3 dB over random settings of `ertis bench budgets`.
 
 Errors of delays are alike over range and between directions, so independent errors of weights underestimate them.
 """
