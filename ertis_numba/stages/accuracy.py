@@ -22,6 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit
@@ -41,7 +42,7 @@ PARTS: Final = {
 """Name of each part of the error, and what it is due to."""
 
 _ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
-_ROUNDING = 10 ** (-114 / 10)  # noise of single precision relative to all that is transformed: measured -115 to -140 dB
+_ROUNDING = 10 ** (-114 / 10)  # single precision, relative to all that is transformed: -115 to -140 dB measured
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
@@ -166,7 +167,8 @@ class ErrorModel:
         """Return the part of delays that hold for a zone of ranges.
 
         Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
-        microphones are late by turns the phase of the beam only.
+        microphones are late by turns the phase of the beam, and shifts its envelope by the rest of their phase after that
+        of the mean frequency is taken out.
 
         Parameters
         ----------
@@ -179,7 +181,11 @@ class ErrorModel:
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
         spread_m4 = float(np.mean(np.var(across_m2, axis=1)))
         turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
-        return self._of(float(turn_2 @ self.texture.shares) * bend_2)
+        shares = self.texture.shares
+        centre_hz = float(self.frequency_hz @ shares)
+        shared_m4 = float(np.mean(np.mean(across_m2, axis=1) ** 2))
+        shift_2 = (2 * math.pi * (self.frequency_hz - centre_hz) / (2 * sound_speed_m_s)) ** 2 * shared_m4
+        return self._of(float(turn_2 @ shares) * bend_2) + float(shift_2 @ shares) * bend_2
 
     def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
         """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
@@ -244,8 +250,13 @@ class ErrorModel:
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
-        """Return the part of single precision."""
-        return (_ARITHMETIC + _ROUNDING * self.texture.loudness) / self.texture.gain
+        """Return the part of single precision.
+
+        Microphones of PCM may hear the same loud sound and round it alike, so that their errors add up in a beam. Bits
+        differ between microphones.
+        """
+        alike = 1 if self._settings.recording.is_pdm else int(microphones(self._settings.array).enabled.sum())
+        return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain
 
     def _of(self, power: float) -> float:
         gain = self.texture.gain

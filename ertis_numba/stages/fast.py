@@ -32,7 +32,7 @@ from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spect
 __all__ = ["FastChain", "ahead_of", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
 
 _TINY = 1e-30
-_PCM_RANGE_DB = 100.0  # dynamic range within which sound outside the window does not harm an image of PCM
+_PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
 _MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
 _SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
 
