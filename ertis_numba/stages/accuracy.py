@@ -81,7 +81,7 @@ class Texture:
         By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
     loudness : float
         Power of the signals before the matched filter, at all times and frequencies, relative to ``level``; both are
-        relative to white bits.
+        relative to white bits. 0 where it was not measured: no plan keeps a budget below any sound.
     """
 
     shares: NDArray[np.float64]
@@ -92,7 +92,7 @@ class Texture:
     places: NDArray[np.float64]
     covariance: NDArray[np.complex128] | None = None
     colour: float = 1.0
-    loudness: float = 1.0
+    loudness: float = 0.0
 
     @classmethod
     def unknown(cls, settings: Settings) -> "Texture":
@@ -167,8 +167,8 @@ class ErrorModel:
         """Return the part of delays that hold for a zone of ranges.
 
         Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
-        microphones are late by turns the phase of the beam, and shifts its envelope by the rest of their phase after that
-        of the mean frequency is taken out.
+        microphones are late by turns the phase of the beam, and shifts its envelope: only the phase at the mean
+        frequency has no effect.
 
         Parameters
         ----------
