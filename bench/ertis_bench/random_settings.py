@@ -15,7 +15,7 @@ from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recordi
 from ertis_numba.waveform import call_at
 from ertis_numba.words import word_format
 
-__all__ = ["Limits", "random_measurement", "random_settings"]
+__all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 
 _DRAWS = 100  # of settings that their constructors refuse, before the limits are to blame
 
@@ -176,10 +176,10 @@ def _words(random: np.random.Generator, settings: Settings) -> NDArray[Any]:
         arrival_s = (range_m + np.linalg.norm(place_m - positions_m, axis=1)) / speed_m_s
         level = 10 ** random.uniform(-2, -0.5)
         signals += level * np.stack([call_at(settings.call, time_s - late_s) for late_s in arrival_s])
-    return _recorded(random, np.clip(signals, -1, 1), settings)
+    return recorded(random, np.clip(signals, -1, 1), settings)
 
 
-def _recorded(random: np.random.Generator, signals: NDArray[np.float64], settings: Settings) -> NDArray[Any]:
+def recorded(random: np.random.Generator, signals: NDArray[np.float64], settings: Settings) -> NDArray[Any]:
     """Return signals as the converters of a sensor would store them: numbers, or dithered bits packed into words."""
     recording, form = settings.recording, word_format(settings)
     if not recording.is_pdm:

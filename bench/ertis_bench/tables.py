@@ -7,6 +7,7 @@ from typing import Any
 
 from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
+from ertis_bench.budgets import form as budgets
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
@@ -327,5 +328,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
     "verification": {"verification": verification},
+    "budgets": {"budgets": budgets},
 }
 """What each command writes between which markers: a file chooses a form by the marker that it has."""

@@ -96,6 +96,23 @@ def verification(**given: Any) -> None:
 
 
 @bench.command()
+@click.option(
+    "--count", type=click.IntRange(min=1), default=300, show_default=True, metavar="N", help="Random settings to try."
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Seed of the first setting."
+)
+@_update
+@options.quiet
+@options.as_json
+def budgets(**given: Any) -> None:
+    """Count random settings that keep their error budget, or exceed it with a warning; nothing is timed."""
+    from ertis_bench import budgets as benchmark
+
+    _run("budgets", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

@@ -124,7 +124,16 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "ranges": len(reader.range_m),
         "range_m": [round(float(reader.range_m[index]), 4) for index in (0, -1)],
         "method": reader.settings.processing.method,
+        **_error(reader),
     }
+
+
+def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
+    """Return the predicted error and the budget, where a file has them."""
+    if reader.predicted_error_db is None:
+        return {}
+    warned = {"error_warning": reader.error_warning} if reader.error_warning else {}
+    return {"predicted_error_db": reader.predicted_error_db, "max_error_db": reader.max_error_db, **warned}
 
 
 def _tell_health(path: Path, *, as_json: bool) -> None:

@@ -14,7 +14,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
 from ertis_numba.stages.beam_nodes import Aperture
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.texture import texture_of
+from ertis_numba.stages.prediction import planner_of
 
 __all__ = ["examine"]
 
@@ -22,7 +22,13 @@ _NEAREST_M: Final = 1e-3  # where range 0 is meant
 
 
 def examine(
-    pipeline: Pipeline, first: Measurement, *, threads: int | None, explain: bool, verify: bool
+    pipeline: Pipeline,
+    first: Measurement,
+    *,
+    threads: int | None,
+    explain: bool,
+    verify: bool,
+    heard: Planner | None = None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield what there is to say of a sensor's plan, as JSON can hold it: ``plan``, then ``verified``.
 
@@ -36,6 +42,8 @@ def examine(
         Yield the plan, its predicted error and its predicted time.
     verify : bool
         Yield the true error of the image of ``first`` beside those that were predicted.
+    heard : Planner, optional
+        From `prediction.planner_of`, where there is one already.
 
     Raises
     ------
@@ -49,10 +57,9 @@ def examine(
         raise ArgumentError("a plan is asked for, and method 'paper' has none; give 'fast', or leave it out")
     kernel_set = kernels.load(pipeline.device)
     n_threads = kernel_set.max_threads if threads is None else threads
-    texture = texture_of(first, settings, kernel_set, threads=n_threads)
     planners = {
         "safe": Planner(settings, kernel_set, threads=n_threads),
-        "texture": Planner(settings, kernel_set, threads=n_threads, texture=texture),
+        "texture": heard or planner_of(first, settings, kernel_set, threads=n_threads),
     }
     if explain:
         yield "plan", _plan(planners, settings)

@@ -6,11 +6,13 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from ertis_numba import kernels
 from ertis_numba.campaign.orders import Options
 from ertis_numba.campaign.sensor_run import SensorRun, faults_of
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
+from ertis_numba.stages.prediction import planner_of, predict
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
 
 __all__ = ["Making", "checked", "making"]
@@ -83,7 +85,7 @@ def making(
     most_bytes : float, optional
         See `SensorRun`.
     warn : callable
-        Called with a line for each sensor that has faulty microphones.
+        Called with a line for each sensor that has faulty microphones, or whose images may exceed the error budget.
     show : callable
         Called with the name of a sensor and what was found out of its plan, as soon as it was.
 
@@ -107,6 +109,8 @@ def making(
         ]
         for run, recording in zip(runs, recordings, strict=True):
             _look_over(run, recording, options, warn, show)
+            if run.prediction is not None:
+                writer.note_error(recording.sensor, **run.prediction.as_dict())
         yield Making(recordings, runs, writer)
 
 
@@ -153,12 +157,22 @@ def _look_over(
         raise DataError(faults)
     if faults:
         warn(faults)
+    first = run.known(recording[0])
+    heard = None
+    if run.pipeline.settings.processing.method != "paper":
+        kernel_set = kernels.load(run.pipeline.device)
+        threads = kernel_set.max_threads if options.threads is None else options.threads
+        heard = planner_of(first, run.pipeline.settings, kernel_set, threads=threads)
+        run.prediction = predict(heard, run.pipeline.settings)
+        if run.prediction.warning:
+            warn(f"{recording.path}: sensor {recording.sensor}: {run.prediction.warning}")
     if not (options.explain or options.verify):
         return
     from ertis_numba.campaign.examination import examine  # noqa: PLC0415  it takes time to load, and few want it
 
-    first = run.known(recording[0])
-    parts = examine(run.pipeline, first, threads=options.threads, explain=options.explain, verify=options.verify)
+    parts = examine(
+        run.pipeline, first, threads=options.threads, explain=options.explain, verify=options.verify, heard=heard
+    )
     for name, part in parts:
         run.told[name] = part
         show(recording.sensor, {name: part})

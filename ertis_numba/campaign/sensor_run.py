@@ -5,7 +5,7 @@ import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ertis_numba.campaign.orders import MOST_BYTES
 from ertis_numba.errors import DataError
@@ -14,6 +14,9 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages.health import health
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader
+
+if TYPE_CHECKING:
+    from ertis_numba.stages.prediction import Prediction
 
 __all__ = ["SensorRun", "faults_of"]
 
@@ -44,12 +47,15 @@ class SensorRun:
     pipeline : Pipeline
     times_ms : list of float
     told : dict
+    prediction : Prediction or None
+        Predicted error of the first measurement's image; None before it is known, and for the paper's method.
     """
 
     def __init__(self, pipeline: Pipeline, *, batch: int, most_bytes: float | None = None) -> None:
         self.pipeline = pipeline
         self.times_ms: list[float] = []
         self.told: dict[str, Any] = {}
+        self.prediction: Prediction | None = None
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
         self._size = max(1, min(batch, int((most_bytes or MOST_BYTES) / image_bytes)))
 
@@ -94,6 +100,7 @@ class SensorRun:
             "directions": len(self.pipeline.grid),
             "ranges": len(self.pipeline.range_m),
             "median_ms": round(statistics.median(self.times_ms), 3),
+            **(self.prediction.as_dict() if self.prediction else {}),
             **self.told,
         }
 

@@ -22,6 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit
@@ -41,6 +42,7 @@ PARTS: Final = {
 """Name of each part of the error, and what it is due to."""
 
 _ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
+_ROUNDING = 10 ** (-114 / 10)  # single precision, relative to all that is transformed: -115 to -140 dB measured
 _SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
 _SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
 _SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
@@ -78,6 +80,9 @@ class Texture:
         Of what some microphones hear in each tile of ranges, at the frequencies of an estimate of `BeamNodes`.
     colour : float
         By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
+    loudness : float
+        Power of the signals before the matched filter, at all times and frequencies, relative to ``level``; both are
+        relative to white bits. 0 where it was not measured: no plan keeps a budget below any sound.
     """
 
     shares: NDArray[np.float64]
@@ -88,6 +93,7 @@ class Texture:
     places: NDArray[np.float64]
     covariance: NDArray[np.complex128] | None = None
     colour: float = 1.0
+    loudness: float = 0.0
 
     @classmethod
     def unknown(cls, settings: Settings) -> "Texture":
@@ -123,16 +129,27 @@ class ErrorModel:
         self.texture = texture or Texture.unknown(settings)
         self.frequency_hz, _ = matched_spectrum(settings, n_waves=WAVES)
 
-    def delays(self, fit: DelayFit) -> float:
+    def delays(self, fit: DelayFit, *, n_mics: int, fractions: NDArray[np.float64] | None = None) -> float:
         """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
 
         What samples are wrong by on average is a filter of the image itself, however coherent echoes are; the
         simple ways of interpolation weaken it, which changes magnitudes by all of it. Of the rest no two
-        microphones err alike, so that it has no phase in common with the beam.
+        microphones err alike, so that it has no phase in common with the beam. Few microphones average less: the error
+        of a single one is a filter of its own signal.
+
+        Parameters
+        ----------
+        fit : DelayFit
+        n_mics : int
+        fractions : (delay,) float64, optional
+            Fractions of a step that delays have, where they are too few to be spread evenly.
         """
         texture = self.texture
+        if fractions is not None:
+            return texture.colour * float(fit.errors_at(fractions) @ texture.shares) * max(1.0, 0.5 / texture.gain)
         varying, shared = (float(errors @ texture.shares) for errors in (fit.errors, fit.biases))
-        return texture.colour * (0.5 * varying / texture.gain + (0.5 if fit.is_fitted else 1.0) * shared)
+        independent = 0.5 * (1 + 1 / n_mics) * varying / texture.gain
+        return texture.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
 
     def beams(self, nodes: BeamNodes) -> float:
         """Return the part of interpolated beams, from an estimate of `BeamNodes`.
@@ -158,7 +175,8 @@ class ErrorModel:
         """Return the part of delays that hold for a zone of ranges.
 
         Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
-        microphones are late by turns the phase of the beam only.
+        microphones are late by turns the phase of the beam, and shifts its envelope: only the phase at the mean
+        frequency has no effect.
 
         Parameters
         ----------
@@ -171,7 +189,11 @@ class ErrorModel:
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
         spread_m4 = float(np.mean(np.var(across_m2, axis=1)))
         turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
-        return self._of(float(turn_2 @ self.texture.shares) * bend_2)
+        shares = self.texture.shares
+        centre_hz = float(self.frequency_hz @ shares)
+        shared_m4 = float(np.mean(np.mean(across_m2, axis=1) ** 2))
+        shift_2 = (2 * math.pi * (self.frequency_hz - centre_hz) / (2 * sound_speed_m_s)) ** 2 * shared_m4
+        return self._of(float(turn_2 @ shares) * bend_2) + float(shift_2 @ shares) * bend_2
 
     def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
         """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
@@ -236,8 +258,13 @@ class ErrorModel:
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
-        """Return the part of single precision."""
-        return _ARITHMETIC / self.texture.gain
+        """Return the part of single precision.
+
+        Microphones of PCM may hear the same loud sound and round it alike, so that their errors add up in a beam. Bits
+        differ between microphones.
+        """
+        alike = 1 if self._settings.recording.is_pdm else int(microphones(self._settings.array).enabled.sum())
+        return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain
 
     def _of(self, power: float) -> float:
         gain = self.texture.gain

@@ -29,9 +29,11 @@ from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import zone_edges
 from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
 
-__all__ = ["FastChain", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
+__all__ = ["FastChain", "ahead_of", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
 
 _TINY = 1e-30
+_PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
+_MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
 _SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
 
 
@@ -63,9 +65,15 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
     return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)
 
 
-def ringing_db(stop_band_db: float) -> float:
-    """Return how far down the matched filter's ringing may be cut off, to be heard less than the stop band."""
-    return max(60.0, 1.2 * stop_band_db - 12.0)
+def ringing_db(settings: Settings) -> float:
+    """Return the level below its peak at which the ringing of the matched filter may be cut off.
+
+    Bits have noise that hides what lies below the stop band. PCM has none: sound outside the window may exceed the
+    image by the whole dynamic range, and what is cut off, or wraps around in the transform, must stay below the budget.
+    """
+    if not settings.recording.is_pdm:
+        return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
+    return max(60.0, 1.2 * (settings.accuracy.stop_band_db or 60.0) - 12.0)
 
 
 class _Buffers(NamedTuple):
@@ -131,7 +139,7 @@ class FastChain:
             )
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
-        ahead_s = _dither(len(own_s)) * step_s if plan.interpolation == "fitted" else np.zeros(1)
+        ahead_s = ahead_of(fit, len(own_s), step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
@@ -142,7 +150,7 @@ class FastChain:
             settings,
             largest_delay_s=largest_s + (fit.n_taps // 2 + 2) * step_s,
             n_taps=len(taps),
-            ringing_db=ringing_db(plan.stop_band_db or 60.0),
+            ringing_db=ringing_db(settings),
         )
         if plan.beam_taps:
             require_nodes(aperture, len(window.range_m))
@@ -252,6 +260,42 @@ class FastChain:
             self._finish(buffers)
         return heard, self._lead
 
+    def sensitivity(
+        self, words: NDArray[np.unsignedinteger[Any]], error_power: float, *, most_beams: int, seed: int = 1
+    ) -> float:
+        """Return the error power of the image where the weights of an adaptive beamformer err by ``error_power``.
+
+        Each direction and microphone errs by an independent complex number, whose power is relative to the weight.
+        At most ``most_beams`` directions are compared, bright ones more often than dark ones.
+
+        Raises
+        ------
+        ArgumentError
+            The beamformer is delay-and-sum, which is linear.
+        """
+        if self._adaptive is None:
+            raise ArgumentError("processing.beamformer is 'delay_and_sum'; give an adaptive one to measure it")
+        image = np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
+        heard, _ = self.analytic(words, image)
+        chosen = _brightest(image, most_beams)
+        random = np.random.default_rng(seed)
+        shape = (len(chosen), heard.shape[0], 2)
+        errors = random.normal(scale=math.sqrt(error_power / 2), size=shape).view(np.complex128)[..., 0]
+        with self._taken(self._threads) as buffers:
+            images = []
+            analytic = buffers.lane.send(heard)
+            for factors in (np.ones_like(errors), 1 + errors):
+                combine = self._adaptive.with_weights(self._kernels, self._memory, chosen, factors)
+                out = np.empty((len(chosen), len(self.range_m)), dtype=np.float32)
+                target = buffers.lane.target(out)
+                combine(analytic, target)
+                buffers.lane.fetch(target, out)
+                buffers.lane.wait()
+                images.append(out.astype(np.float64))
+        self._finish(buffers)
+        power = float(np.sum(images[0] ** 2))
+        return float(np.sum((images[1] - images[0]) ** 2)) / power if power else 0.0
+
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
         with self._taken(self._threads) as buffers:
@@ -359,13 +403,22 @@ class FastChain:
         return _Buffers(lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers())
 
 
-def _dither(n_mics: int) -> NDArray[np.float64]:
-    """Return by what part of a step each microphone's samples are taken earlier: (mic,) float64 in 0 to 1.
+def _brightest(image: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    """Return directions, half of them spread evenly and half of them the brightest: (direction,) intp."""
+    if len(image) <= count:
+        return np.arange(len(image))
+    power = np.sum(np.square(image, dtype=np.float64), axis=1)
+    even = np.linspace(0, len(image) - 1, count - count // 2).astype(np.intp)
+    return np.union1d(even, np.argsort(power)[-(count // 2) :])
+
+
+def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
+    """Return by how many seconds each microphone's samples are taken earlier: (mic,) float64, or (1,) zeros.
 
     Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
     golden ratio's multiples any few of them are spread evenly.
     """
-    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0
+    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0 * step_s if fit.is_fitted else np.zeros(1)
 
 
 def zones_of(settings: Settings) -> list[tuple[int, int, float]]:

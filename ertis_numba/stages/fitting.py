@@ -175,6 +175,13 @@ class DelayFit:
         wrong = made - self._wanted(self.fractions)
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
+    def errors_at(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean power of the error, of what is shared too, at given fractions: (wave,) float64."""
+        frequency_hz = self._spectrum.frequency_hz
+        found = np.unique(np.round(fractions, 4))
+        made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)
+        return np.asarray(np.mean(np.abs(made - self._wanted(found)) ** 2, axis=1))
+
     @property
     def is_fitted(self) -> bool:
         """Whether the weights are those that err least."""

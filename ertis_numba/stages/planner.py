@@ -19,8 +19,9 @@ from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import require_int16, whole_limits
 from ertis_numba.stages.costs import Costs, Work, cache_file, costs_of
-from ertis_numba.stages.fast import chain_taps, spectrum_of, zones_of
+from ertis_numba.stages.fast import ahead_of, chain_taps, spectrum_of, zones_of
 from ertis_numba.stages.fitting import DelayFit, Spectrum, one_thread
+from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
@@ -35,6 +36,7 @@ _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
 _TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
+_MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
 _NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
@@ -126,6 +128,8 @@ class Planner:
         Of what is heard; what errs on the safe side by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
+    sensitivity : Sensitivity, optional
+        Of the beamformer; a safe estimate for any sound by default.
 
     Raises
     ------
@@ -141,6 +145,7 @@ class Planner:
         threads: int,
         texture: Texture | None = None,
         max_bytes: int | None = None,
+        sensitivity: Sensitivity | None = None,
     ) -> None:
         self._settings, self._kernels = settings, kernels
         self._most_bytes = _MOST_BYTES if max_bytes is None else max_bytes
@@ -151,6 +156,8 @@ class Planner:
         self._spectrum = spectrum_of(settings)
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self._n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
+        self._sensitivity = sensitivity or Sensitivity.of(settings.processing, self._n_mics)
+        self._own_s = layout.delay_s[layout.enabled]
         self._aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
         amplitudes = 1 / layout.gain[layout.enabled]
         self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
@@ -173,7 +180,10 @@ class Planner:
             None does; the message has the best there is.
         """
         wanted_db = self._settings.accuracy.max_error_db
-        budget = 10 ** (wanted_db / 10) * _ROUNDED
+        allowed = 10 ** (wanted_db / 10) * _ROUNDED
+        # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
+        # that of the beams; see `prediction` for the warning.
+        budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = self._open_plans(budget)
             rated = [(plan, self._parts(plan)) for plan in plans if self._fits(plan)]
@@ -188,7 +198,9 @@ class Planner:
             costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
             cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
             return self.chosen(self._accuracy(cheapest))
-        plan, _ = min(rated, key=lambda entry: sum(entry[1].values()))
+        plan, parts = min(rated, key=lambda entry: sum(entry[1].values()))
+        if budget < sum(parts.values()) <= allowed:
+            return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
         memory = ", others do not fit into memory" if len(rated) < len(plans) else ""
         wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
@@ -200,6 +212,9 @@ class Planner:
     def chosen(self, accuracy: Accuracy) -> Chosen:
         """Return what is expected of a complete plan."""
         parts, plan = self.parts(accuracy), _plan_of(accuracy)
+        beams = sum(parts.values())
+        amplified = self._sensitivity.output(beams) / beams if 0 < beams < math.inf else 1.0
+        parts = {name: amplified * power for name, power in parts.items()}
         costs = costs_of(self._kernels, self._threads)
         return Chosen(self._settings.replace(accuracy=accuracy), parts, costs.stages_ms(self._work(plan)))
 
@@ -367,10 +382,21 @@ class Planner:
         fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
         return _Delays(
             n_taps=fit.n_taps,
-            error=self.model.delays(fit),
+            error=self.model.delays(fit, n_mics=self._n_mics, fractions=self._few_fractions(fit, step_s)),
             sum_of_weights=float(np.max(weights.sum(axis=1))),
             squares=float(np.mean(np.sum(weights**2, axis=1))),
         )
+
+    def _few_fractions(self, fit: DelayFit, step_s: float) -> NDArray[np.float64] | None:
+        """Return the fractions of all delays where they are too few to be spread evenly over a step."""
+        if self._n_mics * (1 + 2 * self._reach_s() / step_s) > _MANY_FRACTIONS:
+            return None
+        delays_s = (
+            self._own_s
+            - ahead_of(fit, self._n_mics, step_s)
+            + self._aperture.delays_s(self._aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
+        )
+        return fit.split(delays_s)[1].ravel()
 
     def _count_nodes(self, n_taps: int, density: float) -> int:
         high_hz = self._settings.call.high_frequency_hz

@@ -62,12 +62,16 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     starts = range(0, len(chain.range_m), _TILE)
     largest = [np.max(np.abs(heard[:, :, start : start + _TILE + 2 * lead])) ** 2 for start in starts]
     covariance = _covariance(series, settings, n_phases * settings.output_rate_hz)
+    noise = _noise(words, settings, kernels)
+    level = max(undivided / _white_power(settings), 1e-30)
+    decimated = noise[: max(1, math.ceil(len(noise) / settings.decimation))]
     return Texture(
         shares=_shares(series, settings, n_phases * settings.output_rate_hz),
         gain=max(image_power / (power / n_mics), 1e-3),
         crest=float(np.mean(largest)) / undivided,
-        noise=_noise(words, settings, kernels),
-        level=max(undivided / _white_power(settings), 1e-12),
+        noise=noise,
+        level=level,
+        loudness=float(np.mean(decimated)) / level,
         covariance=covariance,
         places=np.quantile(np.square(image, dtype=np.float64), _QUANTILES) / (image_power or 1.0),
     )

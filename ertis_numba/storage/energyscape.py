@@ -1,5 +1,6 @@
 """Energyscape files: what processing a recording gave, with its axes."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -72,6 +73,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         super().__init__(path, overwrite=overwrite, attributes=_origin(readers), truth=truth)
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
+        self._predicted: dict[str, dict[str, float | str]] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
         self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._mounting = {
@@ -89,6 +91,17 @@ class EnergyscapeWriter(Writer[Energyscape]):
         """
         self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
 
+    def note_error(self, sensor: str, *, predicted_error_db: float, max_error_db: float, error_warning: str) -> None:
+        """Store the predicted error of a sensor's images, the budget, and the warning where it may be exceeded.
+
+        Call it before the first energyscape of the sensor.
+        """
+        self._predicted[sensor] = {
+            "predicted_error_db": predicted_error_db,
+            "max_error_db": max_error_db,
+            "error_warning": error_warning,
+        }
+
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         self._first[first.stamp.sensor] = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
@@ -100,6 +113,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             texts={"settings": self_contained(first.settings).to_toml()},
         )
         describe(group, self._mounting.get(first.stamp.sensor, {}))
+        describe(group, self._predicted.get(first.stamp.sensor, {}))
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
         describe(group["energy"], {"coordinates": "azimuth elevation"})
@@ -165,6 +179,11 @@ class EnergyscapeReader(Reader[Energyscape]):
         Where the sensor is; None where the file does not say it, as older ones do not.
     rotation_xyzw : (4,) float64, or None
         The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
+    predicted_error_db, max_error_db : float, or None
+        Error of the first image that the error model predicted from its measurement, and the budget; None where the
+        file has neither, as older ones and images of the paper's method.
+    error_warning : str
+        Warning that images may exceed the budget; empty where they do not, or where nothing was predicted.
     """
 
     _kind: ClassVar[str] = "energyscape"
@@ -176,11 +195,20 @@ class EnergyscapeReader(Reader[Energyscape]):
     range_m: NDArray[np.float64]
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
+    predicted_error_db: float | None
+    max_error_db: float | None
+    error_warning: str
 
     def _load(self) -> None:
         for name, field in _AXES.items():
             setattr(self, field, np.asarray(self._group[name][:]))
         said = self._group.attrs
+        self.predicted_error_db, self.max_error_db = (
+            _number(self.path, name, said[name]) if name in said else None
+            for name in ("predicted_error_db", "max_error_db")
+        )
+        warning = said.get("error_warning", "")
+        self.error_warning = warning.decode("utf-8", "replace") if isinstance(warning, bytes) else str(warning)
         if "translation_m" not in said and "rotation_xyzw" not in said:
             self.translation_m = self.rotation_xyzw = None
             return
@@ -203,6 +231,18 @@ class EnergyscapeReader(Reader[Energyscape]):
             settings=self.settings,
             stamp=self._rows.stamp(index, self.sensor),
         )
+
+
+def _number(path: Path, name: str, value: Any) -> float:
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        found = math.nan
+    if not math.isfinite(found):
+        raise DamagedError(
+            f"{path}: attribute {name} is {value!r}, wanted a finite number; process the recording again"
+        )
+    return found
 
 
 def open_energyscapes(path: str | Path, *, sensor: str | None = None) -> EnergyscapeReader:

@@ -1,0 +1,218 @@
+"""Error budgets over random settings and scenes: kept, or exceeded with a warning on stderr and in the file."""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from click.testing import CliRunner
+from numpy.typing import NDArray
+
+from ertis_bench import machine
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+from ertis_bench.random_settings import Limits, recorded
+from ertis_numba import verification
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
+from ertis_numba.storage import open_energyscapes, write_recording
+from ertis_numba.waveform import call_at
+
+__all__ = ["form", "measurement_of", "run", "tried"]
+
+_FLOOR_DB: Final = -100.0  # below, single precision is most of the error
+_DIRECTIONS: Final = 24  # that are compared
+_BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "capon"], ...]] = (
+    "delay_and_sum",
+    "delay_and_sum",
+    "delay_and_sum",
+    "coherence_factor",
+    "dmas",
+    "capon",
+)
+_SCENES: Final = ("quiet", "loud", "direct sound", "hum", "one echo", "echoes")
+
+_GROUPS: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "all": lambda _: True,
+    "PDM": lambda row: bool(row["pdm"]),
+    "PCM": lambda row: not row["pdm"],
+    "one microphone": lambda row: bool(row["microphones"] == 1),
+    **{f"`{name}`": lambda row, name=name: row["beamformer"] == name for name in sorted(set(_BEAMFORMERS))},  # type: ignore[misc]
+    **{f"scene: {name}": lambda row, name=name: row["scene"] == name for name in _SCENES},  # type: ignore[misc]
+}
+
+
+def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Process ``count`` random recordings by the command line, and return the report.
+
+    Parameters
+    ----------
+    count : int
+        Settings that have a plan and an image that is not silent.
+    seed : int
+        Seed of the first setting; the others have the seeds after it.
+    say : callable
+        Called with lines about what happens.
+    """
+    rows: list[dict[str, Any]] = []
+    refused = 0
+    each = seed
+    while len(rows) < count:
+        row = tried(each)
+        if row is None:
+            refused += 1
+        else:
+            rows.append(row)
+            say(
+                "{seed}: {beamformer}, {microphones} microphones, {scene}: {outcome}, error {error_db:.1f} dB, "
+                "predicted {predicted_db:.1f} dB, budget {budget_db:.1f} dB".format_map(row)
+            )
+        each += 1
+    return {"machine": machine.describe(), "count": count, "seed": seed, "refused": refused, "rows": rows}
+
+
+def tried(seed: int) -> dict[str, Any] | None:
+    """Return what became of one random recording; None where its settings have no plan, or its image is silent."""
+    from ertis_cli.main import cli  # noqa: PLC0415  the command line imports the benchmarks
+
+    measurement, scene = measurement_of(seed)
+    settings = measurement.settings
+    with tempfile.TemporaryDirectory() as folder:
+        recording, target = Path(folder) / "rec.h5", Path(folder) / "image.h5"
+        write_recording(recording, [measurement])
+        done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--device", "cpu", "--quiet"])
+        if done.exit_code:
+            if "max_error_db" in done.stderr and "the best" in done.stderr:
+                return None
+            raise ArgumentError(f"seed {seed}: ertis process ended with {done.exit_code}: {done.stderr}")
+        with open_energyscapes(target) as images:
+            image = images[0]
+            predicted_db, stored = images.predicted_error_db, images.error_warning
+    if not np.any(image.energy):
+        return None
+    chosen, weights = verification.sampled_directions(image.energy, _DIRECTIONS)
+    verifier = verification.ExactImage(image, measurement)
+    exact = np.stack([verifier.amplitudes(direction) for direction in chosen.tolist()])
+    scale = np.sqrt(weights)[:, None]
+    error_db = verification.error_db(scale * image.energy[chosen], scale * exact)
+    warned = bool(stored) and stored in done.stderr
+    kept = error_db <= settings.accuracy.max_error_db
+    return {
+        "seed": seed,
+        "scene": scene,
+        "pdm": settings.recording.is_pdm,
+        "microphones": int(microphones(settings.array).enabled.sum()),
+        "beamformer": settings.processing.beamformer,
+        "budget_db": settings.accuracy.max_error_db,
+        "error_db": error_db,
+        "predicted_db": predicted_db,
+        "audible": error_db > _FLOOR_DB,
+        "outcome": ("kept, warned" if warned else "kept") if kept else "warned" if warned else "missed",
+    }
+
+
+def measurement_of(seed: int) -> tuple[Measurement, str]:
+    """Return a random measurement, and the name of its scene."""
+    random = np.random.default_rng([seed, 16])
+    scene = str(random.choice(_SCENES))
+    settings = _settings(random)
+    return Measurement(_words(random, settings, scene), settings), scene
+
+
+def _settings(random: np.random.Generator) -> Settings:
+    pdm = bool(random.integers(2))
+    array = _array(random)
+    low_hz = float(random.uniform(15e3, 40e3))
+    call = Call(
+        start_frequency_hz=float(random.uniform(1.3 * low_hz, 80e3)),
+        stop_frequency_hz=low_hz,
+        duration_s=float(random.uniform(0.5e-3, 3e-3)),
+    )
+    if pdm:
+        recording, step = Recording(sample_rate_hz=4.5e6, n_samples=54_000), int(random.choice([40, 60, 100]))
+    else:
+        encoding: Literal["int16", "float32"] = "int16" if random.integers(2) else "float32"
+        recording = Recording(sample_rate_hz=450e3, n_samples=5_400, encoding=encoding)
+        step = int(random.choice([4, 6, 10]))
+    first_m = float(random.uniform(0.3, 0.8))
+    beamformer = _BEAMFORMERS[random.integers(len(_BEAMFORMERS))]
+    n_mics = len(microphones(array).enabled_positions_m)
+    if n_mics < Limits().max_mics and beamformer == "dmas" and n_mics < 2:
+        beamformer = "delay_and_sum"
+    spherical = beamformer == "delay_and_sum" and random.integers(3) == 0
+    return Settings(
+        array=array,
+        call=call,
+        recording=recording,
+        processing=Processing(
+            directions=f"{random.choice(['2d', '3d'])}:{random.integers(2, 120)}",
+            range_m=(first_m, float(random.uniform(first_m + 0.1, 1.4))),
+            range_decimation=step,
+            wavefront="spherical" if spherical else "plane",
+            beamformer=beamformer,
+            dmas_order=int(random.integers(2, min(8, max(2, n_mics)) + 1)),
+            snapshots=int(random.integers(1, 9)),
+            loading=float(10 ** random.uniform(-3, 1)),
+        ),
+        accuracy=Accuracy(max_error_db=float(random.choice([-20.0, -35.0, -35.0, -60.0, random.uniform(-100, -20)]))),
+    )
+
+
+def _array(random: np.random.Generator) -> Array:
+    """Return a shipped layout, or 1 to 64 microphones at random places."""
+    if random.integers(3) == 0:
+        return Array(layout=str(random.choice(["eRTIS_v3D1", "eRTIS_v2", "uRTIS_v1"])))
+    n_mics = int(random.choice([1, 1, 2, 3, int(random.integers(4, 65))]))
+    places_m = random.uniform(-0.03, 0.03, (n_mics, 3)) * [0, 1, 1]
+    if n_mics == 1 and random.integers(2):
+        places_m[:] = 0.0
+    return Array(layout="random", positions_m=tuple(map(tuple, places_m.tolist())), word_bits=64)
+
+
+def _words(random: np.random.Generator, settings: Settings, scene: str) -> NDArray[Any]:
+    """Return the words of a scene: echoes in the window, and in some scenes louder sound outside of window or band."""
+    layout, recording, call = microphones(settings.array), settings.recording, settings.call
+    speed_m_s = sound_speed_m_s(settings.air)
+    time_s = np.arange(recording.n_samples) / recording.sample_rate_hz
+    positions_m = np.zeros((len(layout.enabled), 3))
+    positions_m[layout.enabled] = layout.enabled_positions_m
+    noise = {"quiet": -3.5, "loud": -0.7}.get(scene, -5.0)
+    signals = 10**noise * random.standard_normal((len(positions_m), recording.n_samples))
+    first_m, last_m = settings.processing.range_m
+    n_echoes = {"one echo": 1, "echoes": int(random.integers(2, 10)), "loud": 3}.get(scene, int(random.integers(0, 3)))
+    level = 0.7 / max(1, n_echoes) if scene in {"one echo", "echoes", "loud"} else 10 ** random.uniform(-4.5, -2)
+    for _ in range(n_echoes):
+        toward = random.standard_normal(3) + np.array([1.5, 0.0, 0.0])
+        range_m = random.uniform(first_m, last_m)
+        place_m = range_m * toward / np.linalg.norm(toward)
+        arrival_s = (range_m + np.linalg.norm(place_m - positions_m, axis=1)) / speed_m_s
+        signals += level * np.stack([call_at(call, time_s - late_s) for late_s in arrival_s])
+    if scene == "direct sound":
+        signals += 0.8 * call_at(call, time_s - 0.2e-3)
+    if scene == "hum":
+        signals += 0.8 * np.sin(2 * math.pi * random.uniform(50, 5000) * time_s)
+    return recorded(random, np.clip(signals, -1, 1), settings)
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return the report as Markdown."""
+    header = ["settings", "tried", "budget kept", "exceeded, warned", "exceeded in silence", "warned in vain"]
+    return (
+        f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
+        f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
+        f"relative to the independent float64 image, in up to {_DIRECTIONS} directions, bright ones more often. "
+        f"{sentence(report['machine'])}"
+    )
+
+
+def _lines(rows: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
+    for name, belongs in _GROUPS.items():
+        outcomes = [row["outcome"] for row in rows if row["audible"] and belongs(row)]
+        kept = outcomes.count("kept") + outcomes.count("kept, warned")
+        counts = (kept, outcomes.count("warned"), outcomes.count("missed"), outcomes.count("kept, warned"))
+        yield [name, str(len(outcomes)), *map(str, counts)]

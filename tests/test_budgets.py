@@ -1,0 +1,133 @@
+"""Error budgets: kept, or exceeded with a warning on stderr and in the file, for every beamformer and dynamic range."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_bench import budgets
+from ertis_cli.main import cli
+
+from ertis_numba import kernels, verification
+from ertis_numba.frames import Measurement
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.prediction import planner_of, predict
+from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.storage import open_energyscapes, write_recording
+from ertis_numba.waveform import call_at
+
+CPU = kernels.load("cpu")
+PCM = Settings(
+    call=Call(start_frequency_hz=60e3, stop_frequency_hz=25e3, duration_s=2e-3),
+    recording=Recording(sample_rate_hz=450e3, n_samples=5400, encoding="float32"),
+    processing=Processing(directions="2d:9", range_m=(0.5, 1.4), range_decimation=10),
+)
+
+
+def pcm(settings, *, direct=0.0, hum=0.0, echo=1e-5, n_mics=32):
+    """A measurement of one echo, direct sound before the window, and a hum below the band."""
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
+    signal = direct * call_at(settings.call, time_s - 1e-4) + hum * np.sin(2 * np.pi * 1000 * time_s)
+    signal += echo * call_at(settings.call, time_s - 6.2e-3)
+    return Measurement(np.tile(signal[:, None], (1, n_mics)).astype(np.float32), settings)
+
+
+def errors(measurement, **pipeline):
+    """True and predicted error of the image, and the budget."""
+    with Pipeline(measurement.settings, "cpu", 1, **pipeline) as made:
+        image, settings = made.process(measurement), made.settings
+    exact = verification.exact_image(image, measurement).energy
+    planner = planner_of(measurement, settings, CPU, threads=1)
+    return verification.error_db(image.energy, exact), predict(planner, settings)
+
+
+@pytest.mark.parametrize("sound", ["direct", "hum"])
+@pytest.mark.parametrize("budget_db", [-35.0, -70.0])
+def test_sound_outside_the_window_does_not_wrap_into_pcm_images(sound, budget_db):
+    settings = PCM.replace(accuracy=Accuracy(max_error_db=budget_db))
+    true_db, predicted = errors(pcm(settings, **{sound: 0.5}))
+    assert true_db <= budget_db or predicted.warning
+    if budget_db == -35.0:
+        assert true_db <= budget_db
+
+
+def test_prediction_knows_sound_beyond_single_precision():
+    settings = PCM.replace(accuracy=Accuracy(max_error_db=-100.0))
+    true_db, predicted = errors(pcm(settings, direct=0.5, echo=1e-6))
+    assert predicted.warning
+    assert true_db - predicted.predicted_error_db < 3.0
+
+
+@pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), (0.0, 1e-3, 0.0)])
+@pytest.mark.parametrize("budget_db", [-20.0, -35.0, -50.0])
+def test_predictions_for_one_microphone_are_not_optimistic(place_m, budget_db):
+    array = Array(layout="one", positions_m=(place_m,))
+    settings = PCM.replace(array=array, accuracy=Accuracy(max_error_db=budget_db))
+    true_db, predicted = errors(pcm(settings, echo=0.1, n_mics=1))
+    assert true_db <= budget_db
+    assert true_db - predicted.predicted_error_db < 1.0
+
+
+@pytest.mark.parametrize(
+    "processing", [{"beamformer": "dmas", "dmas_order": 8}, {"beamformer": "capon", "loading": 1e-3}]
+)
+def test_budgets_of_adaptive_beamformers_are_kept_or_warned_of(processing):
+    settings = PCM.replace(processing=PCM.processing.replace(**processing), accuracy=Accuracy(max_error_db=-35.0))
+    true_db, predicted = errors(pcm(settings, echo=0.3))
+    assert true_db <= -35.0 or predicted.warning
+
+
+def test_sensitivity_inverts_and_plans_more_exact_beams():
+    for beamformer in ("delay_and_sum", "coherence_factor", "dmas", "capon"):
+        processing = Processing(beamformer=beamformer, dmas_order=4, loading=1e-2)
+        sensitivity = Sensitivity.of(processing, 32)
+        for power in (1e-10, 1e-5, 1e-2):
+            assert sensitivity.output(sensitivity.beams(power)) == pytest.approx(power)
+    plain = Planner(PCM, CPU, threads=1).choose()
+    dmas = PCM.replace(processing=PCM.processing.replace(beamformer="dmas", dmas_order=4))
+    chosen = Planner(dmas, CPU, threads=1).choose()
+    assert chosen.error_db <= -35.0
+    assert plain.error_db <= -35.0
+    linear = Planner(chosen.settings, CPU, threads=1, sensitivity=Sensitivity()).chosen(chosen.settings.accuracy)
+    assert linear.error_db == pytest.approx(chosen.error_db - 10 * np.log10(4))
+
+
+def test_process_warns_on_stderr_and_in_the_file(tmp_path):
+    settings = PCM.replace(accuracy=Accuracy(max_error_db=-100.0))
+    quiet = pcm(settings, direct=0.5, echo=1e-6)
+    write_recording(tmp_path / "quiet.h5", [quiet])
+    target = tmp_path / "quiet.energy.h5"
+    done = CliRunner().invoke(cli, ["process", str(tmp_path / "quiet.h5"), "--json"])
+    assert done.exit_code == 0, done.stderr
+    with open_energyscapes(target) as images:
+        assert images.error_warning in done.stderr
+        assert images.predicted_error_db > -100.0 == images.max_error_db
+        assert images.error_warning == json.loads(done.stdout)["sensors"][0]["error_warning"]
+    told = CliRunner().invoke(cli, ["info", str(target)]).stdout
+    assert "images may exceed the error budget" in told
+
+
+def test_process_is_silent_where_the_budget_is_kept(tmp_path):
+    write_recording(tmp_path / "loud.h5", [pcm(PCM, echo=0.3)])
+    done = CliRunner().invoke(cli, ["process", str(tmp_path / "loud.h5")])
+    assert done.exit_code == 0, done.stderr
+    assert "exceed the error budget" not in done.stderr
+    with open_energyscapes(tmp_path / "loud.energy.h5") as images:
+        assert images.error_warning == ""
+        assert images.predicted_error_db < images.max_error_db == -35.0
+
+
+@pytest.mark.parametrize("seed", [39, 42, 415, 453])
+def test_settings_that_once_exceeded_their_budget_in_silence(seed):
+    """Zones of two microphones, direct sound 110 dB above the image, and rounding of direct sound."""
+    row = budgets.tried(seed)
+    assert row is not None
+    assert row["outcome"] != "missed"
+
+
+def test_random_settings_keep_their_budget_or_are_warned_of():
+    rows = [row for seed in range(12) if (row := budgets.tried(seed))]
+    assert len(rows) >= 8
+    assert not [row for row in rows if row["outcome"] == "missed"]
