@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
-from ertis_bench import machine
+from ertis_bench import captures, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.random_settings import Limits, recorded
@@ -78,26 +77,24 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 def tried(seed: int) -> dict[str, Any] | None:
     """Return what became of one random recording; None where its settings have no plan, or its image is silent."""
-    from ertis_cli.main import cli  # noqa: PLC0415  the command line imports the benchmarks
-
     measurement, scene = measurement_of(seed)
     settings = measurement.settings
     with tempfile.TemporaryDirectory() as folder:
         recording, target = Path(folder) / "rec.h5", Path(folder) / "image.h5"
         write_recording(recording, [measurement])
-        done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--device", "cpu", "--quiet"])
-        if done.exit_code:
+        done = captures.ertis("process", str(recording), "-o", str(target), "--device", "cpu", "--quiet")
+        if done.returncode:
             if "max_error_db" in done.stderr and "the best" in done.stderr:
                 return None
-            raise ArgumentError(f"seed {seed}: ertis process ended with {done.exit_code}: {done.stderr}")
+            raise ArgumentError(f"seed {seed}: ertis process ended with {done.returncode}: {done.stderr}")
         with open_energyscapes(target) as images:
             image = images[0]
             predicted_db, stored = images.predicted_error_db, images.error_warning
     if not np.any(image.energy):
         return None
-    chosen, weights = verification.sampled_directions(image.energy, _DIRECTIONS)
-    verifier = verification.ExactImage(image, measurement)
-    exact = np.stack([verifier.amplitudes(direction) for direction in chosen.tolist()])
+    chosen, weights = verification.sampled(np.square(image.energy, dtype=np.float64).sum(axis=1), _DIRECTIONS)
+    verifier, ranges = verification.ExactImage(image, measurement), np.arange(image.energy.shape[1])
+    exact = np.stack([verifier.amplitudes(direction, ranges) for direction in chosen.tolist()])
     scale = np.sqrt(weights)[:, None]
     error_db = verification.error_db(scale * image.energy[chosen], scale * exact)
     warned = bool(stored) and stored in done.stderr

@@ -1,7 +1,7 @@
 """Errors of images relative to exact ones, which are computed independently in float64."""
 
 from ertis_numba.verification._exact import ExactImage
-from ertis_numba.verification._measured import Measured, error_db, exact_image, measure, sampled_directions
+from ertis_numba.verification._measured import Measured, error_db, exact_image, measure, sampled
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
 
 __all__ = [
@@ -13,5 +13,5 @@ __all__ = [
     "exact_image",
     "measure",
     "peak_errors",
-    "sampled_directions",
+    "sampled",
 ]
