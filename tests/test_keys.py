@@ -165,7 +165,7 @@ def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatc
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "missing"),
+        ("", "is empty"),
         ('name = "robot"\npublic = "x"\nsecret = "y"\n', "key 'x' is none"),
         (f'name = "robot"\npublic = "{PAIR.public}"\nsecret = "{KeyPair.new("other").secret}"\n', "does not belong"),
         (f'name = "../robot"\npublic = "{PAIR.public}"\nsecret = "{PAIR.secret}"\n', "cannot be that of a key"),

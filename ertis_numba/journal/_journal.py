@@ -407,6 +407,17 @@ class Journal(Contents):
             self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
         )
 
+    def free_log(self) -> None:
+        """Move the content of the log to the main file and cut the log, which gives its room back to the disk.
+
+        Raises
+        ------
+        DataError
+            The disk fails. What was appended is still there.
+        """
+        with self._turn:
+            self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
     def remove(self) -> None:
         """Close the journal and remove it: what is in it is in a recording, or is nothing."""
         with self._turn:

@@ -122,6 +122,7 @@ class Shelf:
             self._give_up_failed()
             self._store(items)
         except NoRoomError:  # nothing was written, so the journals are sound
+            self._free_logs()
             raise
         except Exception:
             self._fail()
@@ -286,6 +287,15 @@ class Shelf:
             self._save(open_=self._open)
         found, self.to_hand_on = self.to_hand_on, []
         return found
+
+    def _free_logs(self) -> None:
+        """Give the room of logs back: on a small disk it is what the next measurements need."""
+        try:
+            for volume in (self.volume, self._twins):
+                if volume is not None:
+                    volume.journal.free_log()
+        except (DataError, OSError):
+            self._fail()
 
     def _fail(self) -> None:
         """Close the journals that are written: after a failed sync, what they show may never reach the disk."""
