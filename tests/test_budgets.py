@@ -53,6 +53,20 @@ def test_sound_outside_the_window_does_not_wrap_into_pcm_images(sound, budget_db
         assert true_db <= budget_db
 
 
+@pytest.mark.parametrize("beamformer", ["delay_and_sum", "dmas"])
+@pytest.mark.parametrize("exponent", [-100, 100])
+def test_prediction_does_not_depend_on_the_magnitude_of_samples(beamformer, exponent):
+    settings = PCM.replace(processing=PCM.processing.replace(beamformer=beamformer))
+    given = pcm(settings, direct=0.5, echo=0.01)
+    scaled = Measurement(np.ldexp(given.words, exponent), settings)
+    with Pipeline(settings, "cpu", 1) as made:
+        plan = made.settings
+    wanted, found = (
+        predict(planner_of(each, plan, CPU, threads=1), plan).predicted_error_db for each in (given, scaled)
+    )
+    assert found == pytest.approx(wanted, abs=0.05)
+
+
 def test_prediction_knows_sound_beyond_single_precision():
     settings = PCM.replace(accuracy=Accuracy(max_error_db=-100.0))
     true_db, predicted = errors(pcm(settings, direct=0.5, echo=1e-6))

@@ -189,6 +189,19 @@ def test_tally_of_another_journal_is_not_believed(tmp_path):
     assert stored(tmp_path / "rec.h5.journal") == ([10, 11], ())
 
 
+def test_tally_of_another_journal_is_gone_once_a_journal_grows(tmp_path):
+    (tmp_path / "other").mkdir()
+    other = crashed(tmp_path / "other", entries(COUNT), target="other")
+    create(tmp_path, entries(2)).close()
+    shutil.copy(tally_of(other), tmp_path)
+    (tmp_path / "killed").mkdir()
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        journal.append(entries(3)[2:])
+        for item in tmp_path.glob("rec*"):
+            shutil.copy(item, tmp_path / "killed")
+    assert stored(tmp_path / "killed" / "rec.h5.journal") == ([10, 11, 12], ())
+
+
 def test_damaged_tally_changes_nothing(tmp_path):
     path = crashed(tmp_path, entries(COUNT))
     whole = tally_of(path).read_bytes()

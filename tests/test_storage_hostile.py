@@ -2,6 +2,7 @@
 
 import re
 
+import h5py
 import pytest
 from ertis_bench.network.hostile_files import hostile_files, write_good
 
@@ -57,3 +58,21 @@ def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monke
     monkeypatch.setattr(structure, "stored_bytes", lambda _: 1_000_000)
     with pytest.raises(DataError, match="store more bytes than the file has"):
         open_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda extra: extra.create_dataset("bomb", (1_000_000,), "S100000", chunks=(1,)), "and the file holds"),
+        (lambda extra: extra.create_dataset("far", (8,), "u1", external=[("other.raw", 0, 8)]), "lies in other files"),
+        (lambda extra: extra.attrs.update({f"a{number}": 0 for number in range(300)}), "has 300 attributes"),
+    ],
+    ids=["unallocated", "external", "attributes"],
+)
+def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, told):
+    (tmp_path / "other.raw").write_bytes(bytes(8))
+    path = write_good(tmp_path / "good.h5")
+    with h5py.File(path, "r+", libver=("v110", "v110")) as file:
+        spoil(file.create_group("extra"))
+    with pytest.raises(DataError, match=told):
+        verify(path)

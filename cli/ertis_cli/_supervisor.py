@@ -160,7 +160,7 @@ class _Supervisor:
             _fail(f"{self._reason} ended the central node's process before it had stopped")
         if not self._addresses:
             _fail(f"{self._reason} ended the central node's process before it listened")
-        if self._failed_starts > MAX_FAILED_STARTS:
+        if self._failed_starts >= MAX_FAILED_STARTS:
             _fail(f"the central node's process was started {self._failed_starts} times in vain ({self._reason})")
         stable = listened and time.monotonic() - self._started_s > STABLE_S
         self._in_a_row = 1 if stable else self._in_a_row + 1

@@ -1,8 +1,8 @@
 """Journals: measurements as they arrive, durable one commit at a time."""
 
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
@@ -125,7 +125,8 @@ class Journal(Contents):
             opened.tally.read(opened._identity, any_journal=is_new)
             acked = limit_of(path)
             if acked is not None:
-                opened.tally.limit(acked)  # what is above is no loss
+                with _disk_errors(path):
+                    opened.tally.limit(acked)  # what is above is no loss
             damage = rescue(opened, opened._database, log)
             if damage:
                 opened.tally.note_damage(damage)
@@ -176,7 +177,8 @@ class Journal(Contents):
         self._last.clear()
         self._n_entries = self._held_bytes = 0
         self._load()
-        _beside(self.path, LIMIT).unlink(missing_ok=True)
+        with _disk_errors(self.path):
+            _beside(self.path, LIMIT).unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -346,10 +348,8 @@ class Journal(Contents):
             # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
-            try:
+            with _disk_errors(self.tally.path):
                 self.tally.discard(sensor, epoch, up_to)
-            except OSError as error:
-                raise DataError(f"{self.tally.path}: {error.strerror}; check the disk") from error
             with self._database.transaction():
                 if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
                     self._database.execute(f"PRAGMA user_version = {VERSION}")
@@ -474,6 +474,15 @@ class Journal(Contents):
             self.close()
         else:
             self._database.leave_log()
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the system as a `DataError` about a file."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; check the disk") from error
 
 
 def _unlink(path: Path) -> None:

@@ -63,6 +63,7 @@ class Tally:
         self.path = journal.with_name(f"{journal.name}{TALLY}")
         self._descriptor = -1
         self._identity = 0
+        self._was_read = False
         self._places: dict[tuple[str, int], int] = {}
         self.marks: dict[tuple[str, int], Mark] = {}
         self.damage = ""
@@ -70,6 +71,9 @@ class Tally:
     def begin(self, identity: int) -> None:
         """Write for a new journal of this identity."""
         self._identity = identity
+        if self._descriptor >= 0:
+            with suppress(OSError):
+                self._begin()
 
     def read(self, identity: int, *, any_journal: bool = False) -> None:
         """Read what an earlier process has left for the journal of this identity, or for any; write for it later."""
@@ -81,6 +85,7 @@ class Tally:
         blocks = dict(_blocks(content))
         if blocks.get(0, {}).get("journal") != identity and not any_journal:
             return
+        self._was_read = True
         self.damage = blocks.pop(0, {}).get("damage", "")
         for place, block in blocks.items():
             mark = Mark(**block)
@@ -142,7 +147,7 @@ class Tally:
     def _begin(self) -> None:
         """Open the file and write what it belongs to; what is in it stays only if it was read."""
         if self._descriptor < 0:
-            flags = os.O_CREAT | os.O_RDWR | (0 if self.marks else os.O_TRUNC) | getattr(os, "O_BINARY", 0)
+            flags = os.O_CREAT | os.O_RDWR | (0 if self._was_read else os.O_TRUNC) | getattr(os, "O_BINARY", 0)
             self._descriptor = os.open(self.path, flags, 0o666)
         self._write(0, {"journal": self._identity} | ({"damage": self.damage} if self.damage else {}))
 

@@ -89,7 +89,8 @@ def planner_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     beams = sum(linear.chosen(settings.accuracy).parts.values())
     # A perturbation of weights by this power makes the beams of delay-and-sum err by as much as predicted.
     share = 0.5 if texture.gain <= 1 else 1 - 0.5 / texture.gain
-    words = word_format(settings).checked(measurement.words)
+    form = word_format(settings)
+    words, _ = form.normalised(form.checked(measurement.words))
     chain = FastChain(settings, kernels, threads=threads)
     try:
         image = chain.sensitivity(words, min(1.0, beams * texture.gain / share), most_beams=_MOST_BEAMS)

@@ -47,7 +47,8 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
         processing=settings.processing.replace(beamformer="delay_and_sum"),
     )
     chain = FastChain(rough, kernels, threads=threads)
-    words = word_format(settings).checked(measurement.words)
+    form = word_format(settings)
+    words, _ = form.normalised(form.checked(measurement.words))  # all that is measured here is relative
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
     heard, lead = chain.analytic(words, image)
     analytic = heard[:, :, lead:]

@@ -95,7 +95,15 @@ class EnergyscapeWriter(Writer[Energyscape]):
         """Store the predicted error of a sensor's images, the budget, and the warning where it may be exceeded.
 
         Call it before the first energyscape of the sensor.
+
+        Raises
+        ------
+        ArgumentError
+            An error is not a finite number.
         """
+        for name, value in (("predicted_error_db", predicted_error_db), ("max_error_db", max_error_db)):
+            if not math.isfinite(value):
+                raise ArgumentError(f"{name} is {value}; give a finite number of decibels")
         self._predicted[sensor] = {
             "predicted_error_db": predicted_error_db,
             "max_error_db": max_error_db,

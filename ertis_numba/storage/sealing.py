@@ -82,7 +82,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         rows = {name: JournalRows(journal, name) for name in journal.sensors}
         refused = _refused(journal, rows)
         if refused and not any(map(len, rows.values())):
-            return Sealed(path, None, set_aside=journal.set_aside(REFUSED), refused=refused)
+            damage = _damage(journal, rows)  # which goes with the tally
+            return Sealed(path, None, set_aside=journal.set_aside(REFUSED), damage=damage, refused=refused)
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.journal import Journal
+from ertis_numba.storage._axes_check import fault_of
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage._structure import fault_of
 from ertis_numba.storage.recording import JOURNAL_DAMAGE, Gap, RecordingReader, open_recording
 
 __all__ = ["Damage", "SensorReport", "verify"]

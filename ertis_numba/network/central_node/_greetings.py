@@ -66,6 +66,7 @@ class Greetings:
         self._change = threading.Condition()
         self._waiting: dict[bytes, deque[Greeting]] = {}  # by peer, the next one's turn first
         self._done: deque[Greeting] = deque()
+        self._current: Greeting | None = None  # that the thread reads
         self._bytes = 0
         self._ends = False
         self._thread: threading.Thread | None = None
@@ -114,6 +115,8 @@ class Greetings:
         """Drop the greetings of a peer that has left."""
         with self._change:
             self._bytes -= sum(greeting.n_bytes for greeting in self._waiting.pop(peer_id, ()))
+            if self._current is not None and self._current.peer_id == peer_id:
+                self._current = None
             for greeting in [each for each in self._done if each.peer_id == peer_id]:
                 self._done.remove(greeting)
 
@@ -134,7 +137,7 @@ class Greetings:
                     return
                 peer_id = next(iter(self._waiting))
                 waiting = self._waiting.pop(peer_id)
-                greeting = waiting.popleft()
+                greeting = self._current = waiting.popleft()
                 self._bytes -= greeting.n_bytes
                 if waiting:
                     self._waiting[peer_id] = waiting  # behind all others
@@ -143,5 +146,8 @@ class Greetings:
             except Exception as error:  # noqa: BLE001  the loop answers whatever it is
                 greeting.result = error
             with self._change:
+                if self._current is not greeting:  # the peer has left meanwhile
+                    continue
+                self._current = None
                 self._done.append(greeting)
             waker.wake()

@@ -94,7 +94,8 @@ class Shelf:
             with Journal.open(path) as journal:
                 self._settle(runs_of(journal))
                 self._untold.learn(journal)
-                self._checksums.learn(journal)
+                if "_conflicts" not in path.name:  # whose measurements come second under their numbers
+                    self._checksums.learn(journal)
                 if journal.damage:
                     self._tell(Remark(f"the log of {path.name} was damaged; lost: {journal.damage}"))
         elif recording.exists():

@@ -5,11 +5,13 @@ from typing import Any, Final
 
 import h5py
 
+from ertis_numba.errors import DamagedError, ForeignDataError
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM
+from ertis_numba.storage.structure import require_attributes, stored_bytes
 
 __all__ = ["fault_of"]
 
-_MOST_VALUES: Final = 1_000_000  # of a dataset that no table names, such as an axis that only counts
+_MAX_BYTES: Final = 16 * 2**20  # of a dataset that no table names
 _DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM)}
 _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on damage
 
@@ -17,6 +19,13 @@ _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeEr
 def fault_of(path: Path) -> str:
     """Return the first object of a file that is damaged, and how, in a line; empty if there is none.
 
+    Raises
+    ------
+    ForeignDataError
+        A dataset lies in another file.
+
+    Notes
+    -----
     HDF5 has checksums of everything but the lists by which variables refer to their axes, so these are compared with
     the names that the axes have to have.
     """
@@ -28,6 +37,10 @@ def fault_of(path: Path) -> str:
             for place in ("/", *names):
                 if wrong := _fault(file, file[place]):
                     return f"{place}: {wrong}"
+    except ForeignDataError:
+        raise
+    except DamagedError as error:
+        return str(error)
     except _UNREADABLE as error:
         reason = str(error.args[0]).partition("\n")[0] if error.args else type(error).__name__
         return f"{place} cannot be read ({reason})"
@@ -35,6 +48,7 @@ def fault_of(path: Path) -> str:
 
 
 def _fault(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
+    require_attributes(item)
     for name in item.attrs:
         value = item.attrs[name]
         if name == "REFERENCE_LIST":
@@ -44,11 +58,19 @@ def _fault(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
     if not isinstance(item, h5py.Dataset):
         return ""
     name = item.name.rpartition("/")[2]
-    if name not in _DIMS and item.size <= _MOST_VALUES:
-        item[()]
+    if name not in _DIMS and item.shape is not None and not _only_counts(item):
+        stored_bytes(item, may_be_filtered=True)
+        if item.nbytes <= _MAX_BYTES:
+            item[()]
     if "/truth/" in item.name or item.is_scale:
         return ""
     return _wrong_axes(item, _DIMS.get(name, ()))
+
+
+def _only_counts(item: h5py.Dataset) -> bool:
+    """Return whether a dataset is an axis without values, which stores nothing."""
+    is_here = not (item.is_virtual or item.external)
+    return bool(item.is_scale and is_here and not item.id.get_storage_size())
 
 
 def _wrong_axes(item: h5py.Dataset, wanted: tuple[str, ...]) -> str:
