@@ -84,7 +84,7 @@ def test_a_node_that_is_ended_before_it_listens_is_not_started_again(tmp_path):
     command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "a")]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, env=environment)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; what it")
+    assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; all ack")
 
 
 def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):
