@@ -68,7 +68,7 @@ def test_flipped_bit_in_the_words_is_told_by_recover_and_verify(tmp_path, counte
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == 3, done.stderr
-    assert "11 measurements, 1 missing, 1 of them stored and lost, as the log of the journal was damaged" in done.stderr
+    assert "11 measurements, 1 missing, 1 of them stored, then lost in the journal's damaged log" in done.stderr
     checked = CliRunner().invoke(cli, ["verify", str(tmp_path / "rec.h5")])
     assert checked.exit_code == 3
     assert f"left: 11 measurements, 1 missing (14: {LOST})" in checked.stdout
