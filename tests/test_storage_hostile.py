@@ -47,7 +47,7 @@ def test_a_recording_is_refused(tmp_path, spoiled, name):
         open_recording(path, sensor=None if "'..'" in name else "front").close()
 
 
-def test_the_file_that_others_are_made_of_is_sound(tmp_path):
+def test_template_of_hostile_files_is_sound(tmp_path):
     assert [report.whole for report in verify(write_good(tmp_path / "good.h5"))] == [True]
 
 

@@ -103,7 +103,7 @@ def status_of(pid):
     return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
 
 
-def test_a_life_counts_what_is_left_of_a_duration():
+def test_restarted_process_runs_for_the_rest_of_the_duration():
     assert Life().remaining_s(None) is None
     assert Life(elapsed_s=4.0).remaining_s(10.0) == 6.0
     assert Life(elapsed_s=40.0).remaining_s(10.0) > 0.0
