@@ -132,7 +132,7 @@ def _tells_no_name(error: OSError) -> bool:
 
 
 def make_folder(path: Path, *, parents: bool = False) -> None:
-    """Make a folder whose name is durable when this returns, even if it was there before.
+    """Make a folder and its name durable, even if the folder exists already.
 
     Parameters
     ----------

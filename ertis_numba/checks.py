@@ -107,7 +107,7 @@ def sensor_name(name: str) -> str:
     if not _SENSOR_NAME.fullmatch(name):
         raise ArgumentError(
             f"sensor name {name[:80]!r} cannot stand in a file; give letters, digits and _, after the first also "
-            ". @ + -; 255 at most"
+            ". @ + -; 255 characters at most"
         )
     return name
 

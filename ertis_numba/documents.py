@@ -106,7 +106,7 @@ class Document(Table, frozen=True, kw_only=True):
         source : str, optional
             Name of the document in errors, such as its path.
         find_line : bool
-            Name the line of an error. That parses the text several times, so leave it out for text that nobody edits.
+            Name the line of an error. This parses the text several times; switch it off for text that nobody edits.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Document(Table, frozen=True, kw_only=True):
 
     @classmethod
     def _require_size(cls, text: str, source: str | None) -> None:
-        """Refuse text that would take the parser long."""
+        """Refuse text that the parser could not read in bounded time."""
         n_bytes = len(text) if text.isascii() else len(text.encode("utf-8", "surrogatepass"))
         if n_bytes > cls.max_bytes:
             raise SettingsError(f"{source or cls.label()}: {n_bytes} bytes; the limit is {cls.max_bytes}")

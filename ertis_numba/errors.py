@@ -7,7 +7,7 @@
     │   └── SettingsError                a settings file or structure cannot be used
     ├── DataError (ValueError)           a file or measurement does not hold what it should
     │   ├── DamagedError                 it is not what was written, and never will be
-    │   ├── ForeignDataError             a file points into other files, or to one place by several names
+    │   ├── ForeignDataError             a file has links, filters, or data under several names or in other files
     │   ├── FormatVersionError           a file was written by a newer version
     │   ├── InUseError                   a journal belongs to another process
     │   └── NoRoomError                  a disk is too full, and nothing was written
@@ -59,7 +59,7 @@ class DamagedError(DataError):
 
 
 class ForeignDataError(DataError):
-    """A file points into other files, or to one place by several names, which no file of this package does."""
+    """A file has links, filters, or data under several names or in other files; this package writes no such file."""
 
 
 class FormatVersionError(DataError):
@@ -71,7 +71,7 @@ class InUseError(DataError):
 
 
 class NoRoomError(DataError):
-    """A disk is too full for what is to be written; nothing was written."""
+    """The disk has no room for the data; nothing was written."""
 
 
 class DeviceError(ErtisError, RuntimeError):

@@ -39,7 +39,8 @@ class Pipeline:
     graphs : bool
         Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
     max_bytes : int, optional
-        Limit on the memory, predicted before any of it is taken; that of a plan's tables alone is 2 GiB by default.
+        Limit on the predicted memory, checked before any is allocated. By default, only a plan's tables are limited, to
+        2 GiB.
 
     Attributes
     ----------
@@ -55,8 +56,8 @@ class Pipeline:
     Raises
     ------
     ArgumentError
-        The settings name a layout, grid or range that cannot be used, no plan keeps the error or the limit on memory,
-        or the device is unknown or has no graphs.
+        The settings name a layout, grid or range that cannot be used, no plan keeps the limits on error and memory, or
+        the device is unknown or has no graphs.
     DeviceError
         The device cannot be used here, or has too little memory.
 
@@ -196,7 +197,7 @@ class Pipeline:
         )
 
     def _words_of(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
-        """Return the words, and the exponent of two that they were divided by."""
+        """Return the words, scaled into the range of single precision, and the exponent of the divisor 2^n."""
         self._require_open()
         self._require_same_sensor(measurement.settings)
         return self._format.normalised(self._format.checked(measurement.words))

@@ -71,10 +71,10 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 def call_spectrum(
     call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
 ) -> NDArray[np.complex128]:
-    """Return the one-sided spectrum of a call as decimated signals have it: (bin,) complex128.
+    """Return the one-sided spectrum of a call in decimated signals: (bin,) complex128.
 
-    The call is sampled at the rate of the record. At the decimated rate a call that is short, or has no ramp, would
-    alias: it has power beyond half of that rate, which the decimation filter takes from the signals.
+    The call is sampled at the rate of the record. At the decimated rate, a call that is short or has no ramp would
+    alias, because it has power above the Nyquist frequency. The decimation filter removes that power from the signals.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class MatchedFilter:
 
 
 def matched_band_hz(settings: Settings) -> tuple[float, float]:
-    """Return the band outside which the matched filter is 0: `processing.band_edges_hz`, or 5 kHz around the call's."""
+    """Return the band of the matched filter: `processing.band_edges_hz`, or the call's band widened by 5 kHz."""
     call, given = settings.call, settings.processing.band_edges_hz
     if given is not None:
         return given

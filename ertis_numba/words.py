@@ -74,10 +74,10 @@ class WordFormat(NamedTuple):
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
 
     def normalised(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
-        """Return words that single precision has room for, and the exponent of two that they were divided by.
+        """Return words scaled into the range of single precision, and the exponent of the divisor 2^n.
 
-        Images are linear in the words, so that theirs are to be multiplied by the same power. Only numbers of
-        floating point whose largest magnitude is far from 1 are changed.
+        Images are linear in the words, so the caller multiplies the image by the same power of two. Only floating-point
+        words are scaled, and only if their largest magnitude is far from 1.
 
         Parameters
         ----------

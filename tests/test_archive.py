@@ -263,7 +263,7 @@ def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypat
     assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
 
 
-def test_a_journal_that_has_failed_is_not_believed_and_stored_again_elsewhere(tmp_path, monkeypatch):
+def test_failed_journal_is_limited_and_its_rows_are_stored_in_a_new_one(tmp_path, monkeypatch):
     """After a failed sync a journal shows what never reaches the disk."""
     given = from_zero(3)
     with Opened(tmp_path) as opened:
@@ -498,7 +498,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         Archive(tmp_path / "no" / "folder").open()
 
 
-def test_another_measurement_of_a_number_is_kept_after_its_recording_is_full(tmp_path):
+def test_different_measurement_with_a_stored_number_is_kept_after_rotation(tmp_path):
     given, (other,) = from_zero(3), from_zero(1, 1, seed=2)
     again = [item_of(entry) for entry in (given[1], other)]
     for item in again:
@@ -514,7 +514,7 @@ def test_another_measurement_of_a_number_is_kept_after_its_recording_is_full(tmp
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_measurement_that_comes_again_after_a_restart_is_compared(tmp_path, killed):
+def test_repeated_measurement_is_compared_after_a_restart(tmp_path, killed):
     given, (other,) = from_zero(30), from_zero(1, 28, seed=2)
     again = [item_of(entry) for entry in (given[29], other)]
     for item in again:
@@ -531,7 +531,7 @@ def test_measurement_that_comes_again_after_a_restart_is_compared(tmp_path, kill
     assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
 
 
-def test_measurement_that_cannot_be_compared_any_more_is_kept(tmp_path):
+def test_repeated_measurement_without_a_known_checksum_is_kept(tmp_path):
     given, (other,) = from_zero(30), from_zero(1, 1, seed=2)
     item = item_of(other)
     item.again = True
@@ -545,7 +545,7 @@ def test_measurement_that_cannot_be_compared_any_more_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("place", [3, 30, -10])
-def test_damaged_ledger_is_reported_once_and_made_anew(tmp_path, place):
+def test_damaged_ledger_is_reported_once_and_rebuilt(tmp_path, place):
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, from_zero(6)))
         opened.until_stored(5)
@@ -561,7 +561,7 @@ def test_damaged_ledger_is_reported_once_and_made_anew(tmp_path, place):
     assert not any(isinstance(event, Remark) for event in opened.events)
 
 
-def test_flipped_digit_of_a_ledger_throws_nothing_away(tmp_path):
+def test_flipped_digit_of_a_ledger_discards_no_measurement(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, from_zero(6)))
         opened.until_stored(5)

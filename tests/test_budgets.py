@@ -67,7 +67,7 @@ def test_prediction_does_not_depend_on_the_magnitude_of_samples(beamformer, expo
     assert found == pytest.approx(wanted, abs=0.05)
 
 
-def test_prediction_knows_sound_beyond_single_precision():
+def test_prediction_includes_rounding_of_loud_sound():
     settings = PCM.replace(accuracy=Accuracy(max_error_db=-100.0))
     true_db, predicted = errors(pcm(settings, direct=0.5, echo=1e-6))
     assert predicted.warning
@@ -93,7 +93,7 @@ def test_budgets_of_adaptive_beamformers_are_kept_or_warned_of(processing):
     assert true_db <= -35.0 or predicted.warning
 
 
-def test_sensitivity_inverts_and_plans_more_exact_beams():
+def test_sensitivity_has_an_inverse_and_makes_plans_more_exact():
     for beamformer in ("delay_and_sum", "coherence_factor", "dmas", "capon"):
         processing = Processing(beamformer=beamformer, dmas_order=4, loading=1e-2)
         sensitivity = Sensitivity.of(processing, 32)
@@ -134,7 +134,7 @@ def test_process_is_silent_where_the_budget_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [39, 42, 415, 453])
-def test_settings_that_once_exceeded_their_budget_in_silence(seed):
+def test_seeds_that_once_missed_their_budget_silently_no_longer_do(seed):
     """Zones of two microphones, direct sound 110 dB above the image, and rounding of direct sound."""
     row = budgets.tried(seed)
     assert row is not None

@@ -196,7 +196,7 @@ class Deaf:
         return pulse not in self._pulses and self._emulator.trigger(pulse, at_ns=at_ns)
 
 
-def test_gap_reasons_tell_dropped_measurements_from_missed_pulses(captures):
+def test_gap_reasons_distinguish_dropped_measurements_from_missed_pulses(captures):
     capture = captures(trigger="sync", names=("one", "two"), n=10, dropped={"two": (4,)})
     one, two = capture.emulators
     with SyncChain([one, Deaf(two, {6})], rate_hz=10.0):

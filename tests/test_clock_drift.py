@@ -54,7 +54,7 @@ def test_calls_of_others_are_heard_stretched():
     assert error_db(signals, written_out(EAR.call, found.delay_s, 1.0, 40_000, stretch=1.0005 / 0.9995)) < -60
 
 
-def test_calls_that_are_over_before_the_record_are_not_heard():
+def test_calls_that_end_before_the_record_are_left_out():
     scene = of_two(-500.0, 500.0, count=1000, sync_every=1000)
     assert heard(scene, "cross_emission", "clock_drift", index=0).any()
     assert not heard(scene, "cross_emission", "clock_drift", index=900).any()

@@ -66,7 +66,7 @@ def test_emitter_offset_moves_images_in_walls():
     assert_allclose(delay_s, np.linalg.norm(image_m) / SPEED_M_S, atol=1e-12)
 
 
-def test_truth_knows_the_place_of_the_emitter():
+def test_truth_accounts_for_the_emitter_position():
     """Image, truth and comparison agree on half of the bistatic way."""
     sensor = SENSOR.replace(
         array=SENSOR.array.replace(layout="eRTIS_v3D1", positions_m=None, word_bits=32),

@@ -59,7 +59,7 @@ def test_one_flipped_bit_in_the_log_costs_one_measurement_at_most(tmp_path, plac
 
 
 @pytest.mark.parametrize("counted", [True, False])
-def test_flipped_bit_in_the_words_is_told_by_recover_and_verify(tmp_path, counted):
+def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, counted):
     given = entries(COUNT, settings=LARGE)
     path = crashed(tmp_path, given, settings=LARGE)
     if not counted:
@@ -68,7 +68,7 @@ def test_flipped_bit_in_the_words_is_told_by_recover_and_verify(tmp_path, counte
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == 3, done.stderr
-    assert "11 measurements, 1 missing, 1 of them stored and lost, as the log of the journal was damaged" in done.stderr
+    assert "11 measurements, 1 missing, 1 of them stored, then lost in the journal's damaged log" in done.stderr
     checked = CliRunner().invoke(cli, ["verify", str(tmp_path / "rec.h5")])
     assert checked.exit_code == 3
     assert f"left: 11 measurements, 1 missing (14: {LOST})" in checked.stdout
@@ -153,7 +153,7 @@ def test_leftovers_of_two_torn_ends_are_no_damage(tmp_path):
     assert log.n_lost_commits == 0
 
 
-def test_log_without_damage_is_read_by_its_checksums(tmp_path):
+def test_repair_changes_nothing_in_an_undamaged_log(tmp_path):
     path = crashed(tmp_path, entries(COUNT))
     log = read_log(path)
     assert (log.n_read, log.n_lost_commits) == (log.n_frames, 0)
@@ -161,7 +161,7 @@ def test_log_without_damage_is_read_by_its_checksums(tmp_path):
     assert len(log.content) - len(log.repaired) < FRAME_BYTES
 
 
-def test_tally_goes_with_the_log(tmp_path):
+def test_tally_is_removed_with_the_log(tmp_path):
     with create(tmp_path) as journal:
         assert tally_of(journal.path).exists()
         journal.note_gap("left", 13, 20, "x", epoch=EPOCH)
@@ -181,7 +181,7 @@ def test_discarded_measurements_are_not_missed(tmp_path, killed):
     assert stored(tmp_path / "rec.h5.journal") == ([], ())
 
 
-def test_tally_of_another_journal_is_not_believed(tmp_path):
+def test_tally_of_another_journal_is_ignored(tmp_path):
     (tmp_path / "other").mkdir()
     other = crashed(tmp_path / "other", entries(COUNT), target="other")
     create(tmp_path, entries(2)).close()

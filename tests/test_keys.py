@@ -258,11 +258,11 @@ def test_list_that_was_cut_short_is_refused(tmp_path):
             AllowList.load(path)
 
 
-def test_list_that_was_edited_by_hand_says_what_to_do(tmp_path):
+def test_list_edited_by_hand_is_refused_with_a_remedy(tmp_path):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
     path.write_text(path.read_text().replace('"left"', '"rear"'))
-    with pytest.raises(SettingsError, match="edited by hand; look at what it says, then remove the line that begins"):
+    with pytest.raises(SettingsError, match="edited by hand; review its content, then remove the line that begins"):
         AllowList.load(path)
     path.write_text(path.read_text().partition("\n")[2])
     assert AllowList.load(path).keys[0].serials == ("front", "rear")

@@ -68,7 +68,7 @@ def saved(folder):
     return (folder / ".ertis-ledger"), gaps
 
 
-def test_no_flipped_bit_of_a_ledger_raises_a_mark_or_passes_unnoticed(tmp_path):
+def test_flipped_bit_of_a_ledger_is_noticed_and_raises_no_number(tmp_path):
     path, gaps = saved(tmp_path)
     whole = path.read_bytes()
     for bit in range(8 * len(whole)):

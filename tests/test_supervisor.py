@@ -84,7 +84,7 @@ def test_a_node_that_is_ended_before_it_listens_is_not_started_again(tmp_path):
     command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "a")]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, env=environment)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; what it")
+    assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; all ack")
 
 
 def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):
@@ -103,7 +103,7 @@ def status_of(pid):
     return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
 
 
-def test_a_life_counts_what_is_left_of_a_duration():
+def test_restarted_process_runs_for_the_rest_of_the_duration():
     assert Life().remaining_s(None) is None
     assert Life(elapsed_s=4.0).remaining_s(10.0) == 6.0
     assert Life(elapsed_s=40.0).remaining_s(10.0) > 0.0

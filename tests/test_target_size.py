@@ -42,7 +42,7 @@ def series_of_a_sphere(radius_m, first_m, second_m, cos_between, wave):
 
 
 @pytest.mark.parametrize("radius_m", [0.001, 0.0015, 0.002, 0.004, 0.01, 0.03])
-def test_sphere_echoes_as_its_partial_waves_say(radius_m):
+def test_sphere_echo_matches_the_partial_wave_series(radius_m):
     scene = scene_of(sensor=EAR, spheres=(Sphere(position_m=vector(CENTRE_M), radius_m=radius_m),))
     found = of_the_call(heard(scene, "spreading", "target_size")[0])
     wanted = np.array([series_of_a_sphere(radius_m, 0.4, 0.4, 1.0, wave) for wave in WAVE])
@@ -50,7 +50,7 @@ def test_sphere_echoes_as_its_partial_waves_say(radius_m):
 
 
 @pytest.mark.parametrize("radius_m", [0.001, 0.003, 0.008])
-def test_sphere_scatters_aside_as_its_partial_waves_say(radius_m):
+def test_sphere_bistatic_echo_matches_the_partial_wave_series(radius_m):
     ear_m, mouth_m = np.array([0.0, 0.0, 0.0]), np.array([0.1, 0.4, 0.0])
     scene = pair(ear_m, mouth_m, spheres=(Sphere(position_m=vector(CENTRE_M), radius_m=radius_m),))
     silent = pair(ear_m, mouth_m)
@@ -62,7 +62,7 @@ def test_sphere_scatters_aside_as_its_partial_waves_say(radius_m):
     assert_allclose(of_the_call(echo) / wanted, 1.0, atol=0.06)
 
 
-def test_small_sphere_falls_after_rayleigh():
+def test_small_sphere_follows_rayleigh_scattering():
     """``5/6 a (ka)²`` straight back."""
     scene = scene_of(sensor=EAR, spheres=(Sphere(position_m=(1.0, 0.0, 0.0), radius_m=0.001),))
     for frequency_hz in (2_000.0, 5_000.0, 10_000.0):
@@ -90,7 +90,7 @@ def kirchhoff(radius_m, mouth_m, ear_m, normal, wave, count=200):
 @pytest.mark.parametrize(
     ("diameter_m", "turned_deg"), [(0.02, 0), (0.02, 10), (0.06, 0), (0.06, 5), (0.1, 0), (0.1, 4), (0.2, 2)]
 )
-def test_disc_echoes_as_kirchhoffs_integral_says(diameter_m, turned_deg):
+def test_disc_echo_matches_kirchhoffs_integral(diameter_m, turned_deg):
     disc = Point(position_m=vector(CENTRE_M), diameter_m=diameter_m, facing_deg=(180 - turned_deg, 0), strength_db=0.0)
     found = 0.4**2 * of_the_call(heard(scene_of(disc, sensor=EAR), "spreading", "target_size")[0])
     angle = np.radians(180 - turned_deg)
@@ -100,7 +100,7 @@ def test_disc_echoes_as_kirchhoffs_integral_says(diameter_m, turned_deg):
     assert_allclose(found * np.exp(0.8j * WAVE), wanted, atol=0.012)
 
 
-def test_disc_nearby_echoes_otherwise_to_each_microphone():
+def test_near_disc_echo_differs_between_microphones():
     """A disc of 10 cm at 40 cm: a microphone 5 cm aside is almost in its shadow."""
     ear = EAR.replace(array=line_array(3, 0.05))
     disc = Point(position_m=vector(CENTRE_M), diameter_m=0.1, facing_deg=(180, 0), strength_db=0.0)

@@ -73,7 +73,7 @@ class Trials:
 
 
 @pytest.mark.parametrize(("directions", "max_error_db"), [("2d:91", -35.0), ("3d:600", -20.0), ("3d:600", -60.0)])
-def test_two_thirds_of_points_lie_within_their_uncertainty(directions, max_error_db):
+def test_two_thirds_of_points_lie_within_one_standard_deviation(directions, max_error_db):
     trials = Trials(directions, max_error_db)
     for ratio in (10.0, 1000.0):
         within = np.mean(np.abs(trials.errors(ratio, N_TRIALS, seed=1)) < 1, axis=0)

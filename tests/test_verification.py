@@ -177,7 +177,7 @@ def test_sample_weights_add_up_to_all():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_verified_errors_are_true_for_random_settings(seed):
+def test_verified_errors_match_the_referee_for_random_settings(seed):
     """The short form of `ertis bench verification`."""
     found = campaign.compared(seed)
     assert not found["wrong"], found

@@ -174,7 +174,7 @@ def test_matched_filter_of_decimated_signals_has_the_bins_of_the_record(call):
     ],
     ids=["default", "default, wide band", "0.2 ms", "0.2 ms, wide band"],
 )
-def test_band_edges_change_an_echo_by_what_the_documentation_says(call, band_edges_hz, difference_db):
+def test_band_edges_change_an_echo_as_documented(call, band_edges_hz, difference_db):
     """Relative to the textbook matched filter, which has no band."""
     n_fft = 2**17
     spectrum = np.fft.rfft(call_samples(call, rate_hz=4.5e6), n_fft)

@@ -6,7 +6,7 @@ from ertis_cli._signals import obey_signals
 
 
 def main() -> None:
-    """Obey signals, then load the command line and run it: Python itself would answer Ctrl-C with a traceback."""
+    """Install the signal handlers, then load and run the command line; by default, Ctrl-C would print a traceback."""
     obey_signals()
     try:
         from ertis_cli.main import main as run

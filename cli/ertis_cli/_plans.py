@@ -24,7 +24,7 @@ _PART = "  {name:52}  {safe:>8}  {texture:>14}"
 
 
 def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error_db: float | None) -> None:
-    """Refuse options that are about plans where the method has none."""
+    """Refuse options that need a plan if the method has none."""
     asked = {"--explain": explain, "--verify": verify, "--max-error": max_error_db is not None}
     context = click.get_current_context()
     for name, given in asked.items():
@@ -90,7 +90,7 @@ def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
     )
     peaks = verified["peaks"]
     if peaks is None:
-        yield "  reflectors were not compared, as the whole exact image would take too long"
+        yield "  reflectors were not compared, because the whole exact image would take too long to compute"
         return
     line = f"  {peaks['wanted'] - peaks['lost']} of the strongest {options.counted(peaks['wanted'], 'reflector')} found"
     if peaks["level_db"] is not None:

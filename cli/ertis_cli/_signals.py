@@ -27,11 +27,11 @@ _ENDED = 128  # and the number of the signal
 
 
 class Interruption:
-    """Signal handler that ends the command as Ctrl-C does, and does so again where a library swallows that.
+    """Signal handler that ends the command like Ctrl-C, and repeats the signal if a library swallows the exception.
 
-    Python raises in whatever runs when a signal comes. A callback of a library, a finaliser, or an ``except`` clause
-    without a class may catch it and go on. So a thread looks whether the main thread still unwinds, and sends the
-    signal again if not.
+    Python raises the exception in whatever code runs when a signal arrives. A library's callback, a finaliser, or a
+    bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
+    and sends the signal again otherwise.
     """
 
     def __init__(self) -> None:
@@ -53,11 +53,11 @@ class Interruption:
         return int(str(error.code)) if isinstance(error, SystemExit) else _ENDED + signal.SIGINT
 
     def end(self) -> None:
-        """Send no signal again: the command has ended."""
+        """Stop repeating signals, because the command has ended."""
         self._over.set()
 
     def caused(self, error: BaseException | None) -> bool:
-        """Return whether an exception is due to a signal: it is the handler's own, or was raised while that unwound."""
+        """Return True if a signal caused an exception: the handler raised it, or its unwinding led to it."""
         pending, seen = [error], set[int]()
         while pending:
             each = pending.pop()
@@ -70,12 +70,12 @@ class Interruption:
         return False
 
     def hide_swallowed(self, swallowed: "sys.UnraisableHookArgs") -> None:
-        """Print exceptions that Python cannot raise, but for those of this handler."""
+        """Print exceptions that Python cannot raise, except those of this handler."""
         if not self.caused(swallowed.exc_value):
             sys.__unraisablehook__(swallowed)
 
     def _insist(self, error: BaseException, number: int) -> None:
-        """Send a signal again as soon as the main thread neither handles its exception nor has got a later one."""
+        """Repeat a signal once the main thread no longer handles its exception, unless a later signal has arrived."""
         main = threading.main_thread().ident or 0
         while not self._over.wait(_RETRY_INTERVAL_S) and error is self._errors[-1]:
             handled: Any = sys._current_exceptions().get(main)  # noqa: SLF001  nothing else says what unwinds
@@ -97,7 +97,7 @@ interruption: Final = Interruption()
 def obey_signals() -> None:
     """Let signals end the command like Ctrl-C, so that no half-written file is left behind.
 
-    A signal that the process was started with ignoring, as by ``nohup``, stays ignored.
+    A signal stays ignored if the process was started with that signal ignored, as ``nohup`` does.
     """
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -106,10 +106,10 @@ def obey_signals() -> None:
 
 
 class Signals:
-    """What asked this program to end, and what is to be done about it.
+    """Signals that have arrived, and the function that stops the program.
 
-    A signal never breaks into what runs: libraries that are being loaded would swallow it, or break over it. What was
-    asked for is done by `obey`, or by what is to be called from then on.
+    A signal never interrupts running code, because a library that is loading would swallow the exception or fail.
+    `obey` acts on earlier signals; later signals call the function that `obey` was given.
     """
 
     def __init__(self) -> None:
@@ -128,19 +128,19 @@ class Signals:
         self._stop()
 
     def obey(self, stop: Callable[[], None]) -> None:
-        """End if that was asked for meanwhile; call ``stop`` where it is from now on.
+        """End the program if a signal has arrived; call ``stop`` at each later signal.
 
         Raises
         ------
         KeyboardInterrupt, SystemExit
-            It was.
+            A signal has arrived.
         """
         self._stop = stop
         if self.came:
             self.end()
 
     def end(self) -> NoReturn:
-        """End as the first signal asked."""
+        """End the program with the exception of the first signal."""
         if self.came[0] == signal.SIGINT:
             raise KeyboardInterrupt
         sys.exit(_ENDED + self.came[0])
@@ -148,7 +148,7 @@ class Signals:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[Signals]:
-    """Yield what remembers the signals that ask this program to end."""
+    """Yield an object that records the signals that ask this program to end."""
     asked = Signals()
     with _handled_by(asked):
         yield asked
@@ -156,9 +156,9 @@ def stopped_by_signals() -> Iterator[Signals]:
 
 @contextmanager
 def broken_off_by_signals() -> Iterator[None]:
-    """Have signals that ask this program to end break into the block, so that it clears up.
+    """Let signals that ask this program to end interrupt the block, so that it cleans up.
 
-    Also those that it was begun with ignoring, as a shell's script begins its background jobs.
+    This includes signals that the program was started to ignore, as a shell script starts its background jobs.
     """
     with _handled_by(interruption):
         yield
@@ -175,13 +175,13 @@ def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
 
 
 def is_detached(number: int) -> bool:
-    """Return whether the process outlives its terminal, as ``nohup`` asks by ignoring SIGHUP."""
+    """Return True if the process outlives its terminal, because ``nohup`` has set SIGHUP to be ignored."""
     return number == getattr(signal, "SIGHUP", None) and signal.getsignal(number) is signal.SIG_IGN
 
 
 @contextmanager
 def interrupt_later() -> Iterator[None]:
-    """Keep Ctrl-C until the block ends: the compiler's callbacks would swallow it, or break over it."""
+    """Delay Ctrl-C until the block ends: the compiler's callbacks would swallow the exception or fail."""
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:

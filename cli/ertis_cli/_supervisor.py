@@ -1,7 +1,7 @@
-"""Supervisor of the process that runs a central node, which it starts again when a signal has ended it.
+"""Supervisor that restarts the process of a central node after a signal has ended it.
 
-A library that aborts takes its process with it. What a central node has acknowledged is in journals then, and sensor
-nodes keep the rest: the next process recovers the journals and listens at the same address.
+A library that aborts ends its process. Acknowledged measurements are then in journals, and sensor nodes keep all
+others. The next process recovers the journals and listens at the same address.
 """
 
 import os
@@ -21,9 +21,9 @@ __all__ = ["Life", "allow", "supervised"]
 RETRY_INTERVALS_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Pause before each restart; the last is repeated."""
 MAX_FAILED_STARTS: Final = 10
-"""Restarts in a row that do not come to listen, after which the command fails."""
+"""Limit on successive restarts that end before they listen; the command then fails."""
 STABLE_S: Final = 60.0
-"""Age of a process whose end does not count as one more of a series."""
+"""Age of a process from which its end starts a new series of restarts."""
 
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _PR_SET_PDEATHSIG: Final = 1  # of prctl(2)
@@ -56,7 +56,7 @@ class Life(NamedTuple):
     report_fd: int = -1
 
     def note(self, event: dict[str, Any]) -> None:
-        """Tell the supervisor that the central node listens."""
+        """Report to the supervisor that the central node listens."""
         import json
 
         if event["event"] == "listening" and self.report_fd >= 0:
@@ -64,20 +64,20 @@ class Life(NamedTuple):
             os.write(self.report_fd, json.dumps(addresses).encode())
 
     def remaining_s(self, duration_s: float | None) -> float | None:
-        """Return the part of a duration that is left."""
+        """Return the remaining part of a duration."""
         return None if duration_s is None else max(1e-3, duration_s - self.elapsed_s)
 
 
 def allow() -> None:
-    """Let commands of this process fork: it runs nothing but the command line, and has no threads."""
+    """Allow commands of this process to fork: it runs only the command line and has no threads."""
     global _allowed  # noqa: PLW0603  a process is the command line or is not
     _allowed = sys.platform == "linux"
 
 
 def supervised() -> Life:
-    """Return in a new process, as often as needed; this one waits, and exits as the last of them did.
+    """Return in a child process, once per start; the parent waits, and exits with the code of the last child.
 
-    Elsewhere than on Linux, and in other programs, it returns in this very process.
+    On other systems than Linux, and in other programs, this returns in the calling process.
     """
     if not _allowed:
         return Life()
@@ -90,7 +90,7 @@ def supervised() -> Life:
 
 
 class _Supervisor:
-    """Parent of the central node's process: it forwards signals, and judges how its child has ended."""
+    """Parent of the central node's process; forwards signals, and restarts the child or exits."""
 
     def __init__(self) -> None:
         self._waited_for = {each for each in (*_STOPPING, signal.SIGCHLD) if not is_detached(each)}
@@ -126,7 +126,7 @@ class _Supervisor:
         return Life(self._restarts, self._reason, self._addresses, time.monotonic() - self._begun_s, report_fd)
 
     def wait(self) -> None:
-        """Wait until the child has ended; return if it is to be started again, and exit as it did otherwise."""
+        """Wait until the child has ended; return if it needs a restart, and otherwise exit with its code."""
         while True:
             came = signal.sigwaitinfo(self._waited_for)
             if came.si_signo in _STOPPING:
@@ -142,7 +142,7 @@ class _Supervisor:
                 return
 
     def _judge(self, code: int) -> None:
-        """Return if another child is to be started after one that has ended so; exit otherwise."""
+        """Return if a child that ended with this code needs a restart; exit otherwise."""
         import json
 
         report = os.read(self._reports, 4096)
@@ -161,14 +161,14 @@ class _Supervisor:
         if not self._addresses:
             _fail(f"{self._reason} ended the central node's process before it listened")
         if self._failed_starts >= MAX_FAILED_STARTS:
-            _fail(f"the central node's process was started {self._failed_starts} times in vain ({self._reason})")
+            _fail(f"the central node's process failed to start {self._failed_starts} times in a row ({self._reason})")
         stable = listened and time.monotonic() - self._started_s > STABLE_S
         self._in_a_row = 1 if stable else self._in_a_row + 1
         self._restarts += 1
 
 
 def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent has ended, however that was."""
+    """Have the kernel kill this process when its parent ends for any reason."""
     import ctypes
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -177,6 +177,6 @@ def _die_with(parent: int) -> None:
 
 
 def _fail(text: str) -> NoReturn:
-    remedy = "what it acknowledged is stored; make recordings of it by 'ertis recover'"
+    remedy = "all acknowledged measurements are stored; run 'ertis recover' to make recordings of them"
     click.echo(f"ertis: error: {text}; {remedy}", err=True)
     sys.exit(1)

@@ -89,7 +89,7 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 @options.quiet
 @options.as_json
 def verification(**given: Any) -> None:
-    """Compare what --verify measures with a slow float64 referee, over random settings; nothing is timed."""
+    """Compare --verify with a slow float64 reference computation over random settings; nothing is timed."""
     from ertis_bench import verification as benchmark
 
     _run("verification", benchmark, **given)
@@ -106,7 +106,7 @@ def verification(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def budgets(**given: Any) -> None:
-    """Count random settings that keep their error budget, or exceed it with a warning; nothing is timed."""
+    """Count random settings that keep or exceed their error budget, with and without a warning; nothing is timed."""
     from ertis_bench import budgets as benchmark
 
     _run("budgets", benchmark, **given)
@@ -130,7 +130,7 @@ def scaling(**given: Any) -> None:
     "--verdicts",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Instead of timing, add each effect that was left out of N random scenes; fail if one changes an image.",
+    help="Instead of timing, add each effect that was left out of N random scenes; fail if it changes an image.",
 )
 @_update
 @options.quiet
@@ -147,7 +147,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
     from ertis_numba.errors import DataError
 
     if given["targets"]:
-        raise click.UsageError("--verdicts makes no table; leave out --update")
+        raise click.UsageError("--verdicts writes no table; leave out --update")
     report = run(count=verdicts, say=lambda text: options.say(text, quiet=given["quiet"]))
     if given["as_json"]:
         options.print_json(report)
@@ -157,7 +157,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
             f"effects left out that change an image by more than the tolerance: {len(report['wrong'])}"
         )
     if report["wrong"]:
-        raise DataError(f"verdicts are wrong: {report['wrong']}; report these scenes")
+        raise DataError(f"effects left out in error: {report['wrong']}; report these scenes")
 
 
 @bench.command()

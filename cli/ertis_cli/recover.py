@@ -22,13 +22,13 @@ _FAILED, _INCOMPLETE = 1, 3
 @options.as_json
 @click.pass_context
 def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet: bool, as_json: bool) -> None:
-    """Make recordings of what a crash has left.
+    """Recover recordings from journals left by a crash.
 
-    A capture that was interrupted leaves a journal, in which is every measurement that it told to be stored. Its
-    recording gets the name it was to have, and the journal goes; one that a running capture uses is left alone. In a
-    folder, all files named *.journal are taken. Where no recording can hold a sensor, the others are sealed and the
-    journal is kept, with a name that ends in .refused. The exit code is 1 if something could not be sealed, and 3 if
-    measurements that were stored are damaged or lost.
+    An interrupted capture leaves a journal with every measurement that it reported as stored. The command seals the
+    journal into a recording with its intended name and removes the journal. It skips a journal that a running capture
+    uses. In a folder, it recovers all files named *.journal. If a recording cannot hold a sensor, the command seals the
+    others and keeps the journal under a name that ends in .refused. The exit code is 1 if something could not be
+    sealed, and 3 if stored measurements are damaged or lost.
     """
     journals = [journal for place in places for journal in _found(place)]
     if not journals:
@@ -88,7 +88,7 @@ def _failed(report: dict[str, Any]) -> bool:
 
 
 def _refusal(report: dict[str, Any]) -> str:
-    """Return why sensors of a journal are not in its recording, in a line."""
+    """Return the reasons why sensors of a journal are missing in its recording, as one line."""
     reasons = "; ".join(f"no recording can hold sensor {name} ({why})" for name, why in report["refused"].items())
     return f"{report['journal']}: {reasons}; the journal is kept as {report['set_aside']}"
 
@@ -105,7 +105,7 @@ def _told(report: dict[str, Any]) -> str:
     if report["damaged"]:
         told.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
     if report["lost"] or report["damage"]:
-        told.append(f"{report['lost']} of them stored and lost, as the log of the journal was damaged")
+        told.append(f"{report['lost']} of them stored, then lost in the journal's damaged log")
     if report["damage"]:
         told.append(f"also lost: {report['damage']}")
     return f"{report['recording']}: {', '.join(told)}"

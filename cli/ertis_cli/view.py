@@ -51,7 +51,7 @@ _ONLY = {
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Where to serve the page. Where other machines reach it, the address that is printed has a token.",
+    help="Host at which to serve the page. If other machines can reach it, the printed address has a token.",
 )
 @click.option("--port", type=click.IntRange(0, 65_535), default=8080, show_default=True, help="0 for any that is free.")
 @click.option(
@@ -258,7 +258,7 @@ def _tell(what: str, shown: "View", *, quiet: bool, as_json: bool) -> None:
         options.print_json({"event": "viewing", "source": what, "url": shown.url})
     options.say(f"{what} at {shown.url}; Ctrl-C ends", quiet=quiet)
     if not shown.is_local:
-        options.say("other machines need the token in that address; whoever has it steers this view", quiet=quiet)
+        options.say("other machines need the token in that address; anyone with it can control this view", quiet=quiet)
 
 
 def _tell_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:

@@ -43,7 +43,7 @@ def examine(
     verify : bool
         Yield the true error of the image of ``first`` beside those that were predicted.
     heard : Planner, optional
-        From `prediction.planner_of`, where there is one already.
+        Planner from `prediction.planner_of`, if there is one already.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class SensorRun:
     times_ms : list of float
     told : dict
     prediction : Prediction or None
-        Predicted error of the first measurement's image; None before it is known, and for the paper's method.
+        Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
     """
 
     def __init__(self, pipeline: Pipeline, *, batch: int, most_bytes: float | None = None) -> None:

@@ -27,11 +27,11 @@ class Arrived:
     tick : int or None
         Of the command, which all sensors share; None where SYNC pulses trigger.
     skipped : int
-        Numbers that the sensor counted since the block before, and whose blocks did not come.
+        Numbers that the sensor counted since the previous block, but whose blocks did not arrive.
     damaged : bool
         Whether blocks were rejected since the one before.
     waited_s : float
-        Time since the block before in which nothing was read from the sensor, as the disk was busy.
+        Time since the previous block in which the reader waited for the disk.
     """
 
     sensor: str

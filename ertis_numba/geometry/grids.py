@@ -43,7 +43,7 @@ class Grid:
 
 
 def grid_count(name: str) -> int | None:
-    """Return the number of directions of a named grid; None where the name is the path of a file.
+    """Return the number of directions of a named grid; None if the name is the path of a file.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Settings from another machine, or from a file of measurements that may come from one."""
+"""Settings from an untrusted source: another machine, or a file of measurements."""
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry.grids import grid_count
@@ -9,7 +9,7 @@ __all__ = ["received_settings"]
 
 
 def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
-    """Return settings that somebody else wrote; they name no file of this machine.
+    """Parse settings from an untrusted source, and refuse names of files on this machine.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
     Raises
     ------
     SettingsError
-        The text is too long, is not TOML, a value cannot be used, or a name is that of a file.
+        The text is too long or is not TOML, a value cannot be used, or a name is the path of a file.
     """
     if isinstance(text, bytes):
         if len(text) > Settings.max_bytes:  # before a copy of it is made
@@ -35,11 +35,11 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
         try:
             text = text.decode()
         except UnicodeDecodeError as error:
-            raise SettingsError(f"{source} are no text ({error}); give TOML in UTF-8") from error
+            raise SettingsError(f"{source} are not text ({error}); give TOML in UTF-8") from error
     settings = Settings.from_toml(text, source, find_line=False)
     layout, directions = settings.array.layout, settings.processing.directions
     if not layout.isprintable() or not directions.isprintable():
-        raise SettingsError(f"{source} hold names that cannot be printed; give printable characters")
+        raise SettingsError(f"{source} have names with characters that cannot be printed; give printable characters")
     if settings.array.positions_m is None and layout not in layout_names():
         raise SettingsError(
             f"{source}: array.layout is {layout[:80]!r}, a file; send its positions instead, or name one of "

@@ -22,10 +22,10 @@ _SELECTION: Final = selection("measurements", "WHERE id = ?")
 
 
 def _own_name(journal: str, target: str) -> str:
-    """Return the name of the recording to be made of a journal, in the folder of the journal.
+    """Return the name of the recording to be made from a journal, in the folder of the journal.
 
-    A journal may come from a stranger: what it says itself counts only where its own name says nothing, and never as
-    another folder.
+    A journal may come from an untrusted source. The path that it stores is used only if the journal's own name lacks
+    the suffix, and then only the last part of that path.
     """
     if journal.endswith(SUFFIX) and journal != SUFFIX:
         return journal.removesuffix(SUFFIX)
@@ -136,7 +136,7 @@ class Contents:
         return sorted(Key(place, names[number], *rest) for place, number, *rest in rows if number not in self._unusable)
 
     def newest(self, n_most: int) -> list[tuple[str, int, int, int]]:
-        """Return sensor, epoch, number and CRC-32 of the measurements that came last; their words are not read."""
+        """Return sensor, epoch, number and CRC-32 of the newest measurements, without reading their words."""
         with self._turn:
             rows = self._database.execute(
                 "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_most,)

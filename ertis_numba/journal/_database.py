@@ -112,10 +112,10 @@ class Database:
         return is_new
 
     def _bring_logs_to_disk(self) -> None:
-        """Write the logs that an earlier process has left again, in place, and sync them.
+        """Rewrite the logs of an earlier process in place, and sync them.
 
-        That process may have ended before its sync, or its sync may have failed. Then the system shows content that it
-        never writes: it marks pages whose writing has failed as written. Content that is written again is dirty again.
+        That process may have ended before its sync, or its sync may have failed. The system then marks the failed pages
+        as written and never writes them, although readers see their content. Rewriting makes the pages dirty again.
         """
         for log in (_beside(self._path, "-wal"), _beside(self._path, "-journal")):
             if log.exists() and log.stat().st_size:
@@ -128,7 +128,7 @@ class Database:
         self._sync_folder()
 
     def _sync_folder(self) -> None:
-        """Make the names of the logs durable: SQLite syncs the folder too, but ignores an error of that."""
+        """Make the names of the logs durable; SQLite also syncs the folder, but ignores an error of that sync."""
         if self._is_folder_synced:
             return
         try:
@@ -176,7 +176,7 @@ class Database:
 
     @property
     def has_name(self) -> bool:
-        """Whether the file is still the one of its name."""
+        """Return True if the path still leads to the open file."""
         try:
             self._require_there(self._file)
         except (InUseError, OSError):
@@ -257,9 +257,9 @@ class Database:
             self.execute(statement)
 
     def copy_to(self, path: Path) -> None:
-        """Copy the pages of the file as they are now.
+        """Copy the present pages of the file.
 
-        To open the file a second time would end the lock on it, as closing any descriptor does by POSIX.
+        The file is not opened a second time: POSIX releases a lock when the process closes any descriptor of the file.
 
         Raises
         ------

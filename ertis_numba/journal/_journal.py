@@ -42,7 +42,7 @@ class Journal(Contents):
     tally : Tally
         Highest numbers that were stored.
     remark : str
-        Files that `create` has moved away; empty in general.
+        Files that `create` has renamed; empty if there were none.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -53,7 +53,7 @@ class Journal(Contents):
 
     @property
     def damage(self) -> str:
-        """Losses from a damaged log that are not among the gaps; empty in general."""
+        """Losses from a damaged log that no gap covers; empty if there are none."""
         return self.tally.damage
 
     @classmethod
@@ -139,11 +139,11 @@ class Journal(Contents):
 
     @staticmethod
     def give_up(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
-        """Note durably that only acknowledged measurements of a closed journal are to be believed.
+        """Limit a closed journal durably to its acknowledged measurements.
 
-        After a failed sync a journal may show rows that never reach the disk. Close it, give it up, store the rows that
-        were not acknowledged in another journal. Whoever opens this one deletes them first, so that none is stored
-        twice. A journal of which nothing was acknowledged is removed.
+        After a failed sync, a journal may show rows that never reach the disk. Close the journal, give it up, and store
+        the rows that were not acknowledged in another journal. The next process that opens this journal deletes those
+        rows first, so that none is stored twice. A journal without acknowledged measurements is removed.
 
         Parameters
         ----------
@@ -164,7 +164,7 @@ class Journal(Contents):
         sync(path.parent)
 
     def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
-        """Delete rows that were given up."""
+        """Delete rows above the limit."""
         runs = {(key.sensor, key.epoch) for key in self.index()} | {(gap.sensor, gap.epoch) for gap in self.gaps}
         with self._database.transaction():
             self._database.execute(f"PRAGMA user_version = {VERSION}")  # numbers of rows may have holes now
@@ -366,7 +366,7 @@ class Journal(Contents):
         return int(n_deleted)
 
     def adopt(self, header: Sequence[Any]) -> None:
-        """Say of what the journal is, as it said before its log was damaged.
+        """Restore the header of the journal from before its log was damaged.
 
         Parameters
         ----------
@@ -486,7 +486,7 @@ def _disk_errors(path: Path) -> Iterator[None]:
 
 
 def _unlink(path: Path) -> None:
-    """Remove a journal that is closed, and what lies beside it."""
+    """Remove a closed journal and the files beside it."""
     for end in ("", *_LOGS, *_NOTES):
         _beside(path, end).unlink(missing_ok=True)
 
@@ -496,7 +496,7 @@ def _beside(path: Path, end: str) -> Path:
 
 
 def _clear(path: Path) -> str:
-    """Move logs away that are left of an earlier journal of this name, and return which."""
+    """Rename logs of an earlier journal with this name, and return their names as one line."""
     for end in _NOTES:
         _beside(path, end).unlink(missing_ok=True)
     moved = []

@@ -1,7 +1,7 @@
 """Limit of a journal that has failed: the numbers up to which its measurements were acknowledged.
 
-After a failed sync, the system may show rows that never reach the disk. Whoever wrote them stores them again in
-another journal. The limit, a small file beside the journal, keeps them from being stored twice.
+After a failed sync, the system may show rows that never reach the disk. The central node stores them again in another
+journal. The limit, a small file beside the journal, prevents that they are stored twice.
 """
 
 import json
@@ -20,7 +20,7 @@ LIMIT: Final = "-limit"
 
 
 def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
-    """Write the limit of a journal; when this returns, it is durable.
+    """Write the limit of a journal durably.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
 
 
 def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
-    """Return the limit of a journal, or None where there is none.
+    """Return the limit of a journal; None if it has none.
 
     Raises
     ------
@@ -64,8 +64,8 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
         is_sound = False
     if not is_sound:
         raise DamagedError(
-            f"{place} is damaged; remove it to seal all that {path.name} shows, of which another recording may hold "
-            "some, too"
+            f"{place} is damaged; remove it to seal all rows that {path.name} shows, although another recording may "
+            "hold some of them"
         )
     return limit
 

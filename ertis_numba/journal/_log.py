@@ -1,7 +1,7 @@
-"""Checksums of SQLite's write-ahead log, and which of its commits SQLite will not read.
+"""Checksums of SQLite's write-ahead log, and commits that SQLite will not read.
 
-SQLite ends a log at the first frame whose checksum is wrong. After a power cut, that frame belongs to the last
-transaction, which nobody was told of. If a later transaction follows, the frame was synced before: it is damaged.
+SQLite stops reading a log at the first frame with a wrong checksum. After a power cut, that frame belongs to the last
+transaction, which was never reported. If a later transaction follows, the frame was synced, so it is damaged.
 See https://sqlite.org/fileformat.html, sections 4.1 and 4.2.
 """
 
@@ -28,7 +28,7 @@ _PAGE_BYTES: Final = range(512, 65_537)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Log:
-    """A write-ahead log as it lies on the disk.
+    """A write-ahead log as stored on the disk.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Log:
 
     @property
     def repaired(self) -> bytes:
-        """The same log with the checksums that its content has now, so that SQLite reads all of it."""
+        """Copy of the log with checksums of its present content, so that SQLite reads all of it."""
         big_endian, page_bytes = _format(self.content)
         frame_bytes = _FRAME.size + page_bytes
         salts = self.content[16:24]
@@ -63,7 +63,7 @@ class Log:
 
 
 def read_log(path: Path) -> Log | None:
-    """Return the write-ahead log beside a journal; None if there is none that SQLite could have written."""
+    """Return the write-ahead log beside a journal; None if there is none, or none that SQLite could have written."""
     try:
         content = path.with_name(f"{path.name}-wal").read_bytes()
     except OSError:
@@ -97,10 +97,10 @@ def read_log(path: Path) -> Log | None:
 
 
 def _count_lost(commits: NDArray[np.intp], sound: NDArray[np.bool_]) -> int:
-    """Count commits that were synced, as a later transaction follows.
+    """Count commits that a later transaction proves to be synced.
 
-    A later one counts if its checksums carry on from the commit before. What earlier crashes have left behind the end
-    is of one transaction each, whose checksums carry on from nothing that is there.
+    A later transaction counts if its checksums continue those of the previous commit. Remnants of earlier crashes after
+    the end consist of one transaction each, and their checksums continue no commit in the log.
     """
     for place in range(len(commits) - 1, 0, -1):
         if sound[commits[place - 1] + 1 : commits[place] + 1].all():
@@ -116,7 +116,7 @@ def _has_sound_header(content: bytes) -> bool:
 
 
 def _guess_header(content: bytes) -> bytes:
-    """Return a header for the frames that follow one that is damaged: it has the salts that most of them have."""
+    """Return a header for the frames after a damaged header, with the salts that most of them have."""
     frame_bytes = _FRAME.size + PAGE_BYTES
     salts = Counter(content[place : place + 8] for place in range(_HEADER_BYTES + 8, len(content), frame_bytes))
     most = max(salts, key=salts.__getitem__, default=b"").ljust(8, b"\0")
@@ -130,7 +130,7 @@ def _header_check(header: bytes, *, big_endian: bool) -> bytes:
 
 
 def _format(content: bytes) -> tuple[bool, int]:
-    """Return whether checksums read big-endian words, and the size of a page; 0 if this is no log."""
+    """Return True if checksums read big-endian words, and the size of a page; the size is 0 if this is no log."""
     if len(content) < _HEADER_BYTES:
         return False, 0
     magic, _, page_bytes = struct.unpack_from(">3I", content)
@@ -138,14 +138,14 @@ def _format(content: bytes) -> tuple[bool, int]:
 
 
 def _words(frames: bytes, *, big_endian: bool, page_bytes: int) -> NDArray[np.uint32]:
-    """Return what the checksums of frames are over: the first two words of each, and its page."""
+    """Return the checksummed part of frames: the first two words of each header, and the page."""
     words = np.frombuffer(frames, ">u4" if big_endian else "<u4").astype(np.uint32, copy=False)
     words = words.reshape(-1, (_FRAME.size + page_bytes) // 4)
     return np.concatenate([words[:, :2], words[:, 6:]], axis=1)
 
 
 def _sums(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return the checksums of rows of words, each from zero on.
+    """Return the checksum of each row of words, starting from zero.
 
     For each pair of words x, y, SQLite takes s ← s + x + t and t ← t + y + s, modulo 2³²: a linear step, so that each
     pair adds a multiple of itself to the end.
@@ -159,7 +159,7 @@ def _sums(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def _advance(check: NDArray[np.uint32], n_pairs: int) -> NDArray[np.uint32]:
-    """Return checksums after so many pairs of words that are zero."""
+    """Return checksums after ``n_pairs`` further pairs of zero words."""
     low, middle, high = (int(step[-1]) for step in _steps(n_pairs + 1))
     step = np.array([[low, middle], [middle, high]], np.uint32)
     return check @ step  # symmetric

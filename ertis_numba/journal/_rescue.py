@@ -1,4 +1,4 @@
-"""Rescue of a journal whose log is damaged: later commits are read from a repaired copy, the rest becomes gaps."""
+"""Rescue of a journal with a damaged log: later commits are read from a repaired copy; lost numbers become gaps."""
 
 import shutil
 import tempfile
@@ -27,8 +27,7 @@ LOST: Final = "lost in a damaged journal"
 class _Found:
     """Rows of a repaired copy that the journal does not have.
 
-    ``lost`` are measurements whose record is sound and whose words are not, ``n_unreadable`` the others that are
-    damaged.
+    ``lost`` has the measurements with a sound record and damaged words. ``n_unreadable`` counts all other damaged ones.
     """
 
     header: list[Any] = field(default_factory=list)
@@ -40,7 +39,7 @@ class _Found:
 
 
 def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
-    """Bring back what a damaged log has kept from SQLite, and note the rest as gaps.
+    """Recover rows of a damaged log that SQLite does not read, and note lost numbers as gaps.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
     Returns
     -------
     str
-        Losses that no gap of the journal tells; empty in general.
+        Losses that no gap of the journal covers; empty if there are none.
     """
     n_commits = log.n_lost_commits if log is not None else 0
     try:
@@ -84,7 +83,7 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
 
 
 def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
-    """Yield what a journal holds or says to be missing: run, first and last number."""
+    """Yield the numbers that a journal holds or lists as gaps: run, first and last number."""
     for key in journal.index():
         yield (key.sensor, key.epoch), key.sequence, key.sequence
     for gap in journal.gaps:
@@ -92,7 +91,7 @@ def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
 
 
 def _missing(journal: "Journal") -> Iterator[Gap]:
-    """Yield what the tally says to be stored beyond what the journal holds."""
+    """Yield the numbers that the tally lists and the journal lacks."""
     if not journal.tally.marks:
         return
     highest: dict[tuple[str, int], int] = {}
@@ -105,7 +104,7 @@ def _missing(journal: "Journal") -> Iterator[Gap]:
 
 
 def _holes(journal: "Journal", gap: Gap) -> Iterator[Gap]:
-    """Yield the parts of a gap of which the journal holds nothing."""
+    """Yield the parts of a gap without any number that the journal holds."""
     begin = gap.first
     held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.epoch))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
@@ -115,9 +114,9 @@ def _holes(journal: "Journal", gap: Gap) -> Iterator[Gap]:
 
 
 def _read_copy(journal: "Journal", database: Database, log: Log) -> _Found:
-    """Read the rows that the journal does not have from a copy of it with the repaired log.
+    """Read the rows that the journal lacks from a copy of it with the repaired log.
 
-    Each row has a checksum of its own: what a repaired log gets wrong is not taken for a row.
+    Each row has a checksum of its own, so a wrong repair does not yield wrong rows.
 
     Raises
     ------
@@ -126,7 +125,7 @@ def _read_copy(journal: "Journal", database: Database, log: Log) -> _Found:
     """
     n_bytes = journal.path.stat().st_size + 2 * len(log.content)
     if shutil.disk_usage(journal.path.parent).free < 2 * n_bytes:
-        raise DataError(f"{journal.path.parent} has no room for a copy of {journal.path.name}")
+        raise DataError(f"{journal.path.parent} has no room for a copy of {journal.path.name}; free some space")
     with tempfile.TemporaryDirectory(prefix=f".{journal.path.name}.", dir=journal.path.parent) as folder:
         copy = Path(folder) / journal.path.name
         database.copy_to(copy)
@@ -166,7 +165,7 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
 
 
 def _add(journal: "Journal", found: _Found) -> list[str]:
-    """Store what was found, and return what cannot be told as a gap."""
+    """Store the recovered rows, and return the losses that no gap can cover."""
     if found.header:
         journal.adopt(found.header)
     for sensor in found.sensors:

@@ -1,7 +1,7 @@
 """Highest numbers that a journal holds, in a file beside it.
 
-A damaged log can take measurements away in a way that SQLite does not notice. The tally is written after each commit
-and not synced: it never says more than the journal has, and after a kill it says all of it.
+A damaged log can lose measurements without an error from SQLite. The tally is written after each commit and not synced.
+It never lists a number that the journal has not stored, and after a kill it is complete.
 """
 
 import json
@@ -30,9 +30,9 @@ class Mark:
     sensor : str
     epoch : int
     first, last : int
-        Of the measurements and gaps that were stored.
+        First and last number of the stored measurements and gaps.
     discarded : int
-        Up to which measurements may have been deleted.
+        Number up to which measurements may have been deleted.
     """
 
     sensor: str
@@ -46,7 +46,7 @@ _FIELDS: Final = tuple(field.name for field in fields(Mark))
 
 
 class Tally:
-    """A file of one block for each run, which is written again whenever the run grows.
+    """A file with one block for each run, updated whenever the run grows.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Tally:
     ----------
     marks : dict of (sensor, epoch) to Mark
     damage : str
-        Losses that are known and are no gaps of the journal; empty in general.
+        Known losses that no gap of the journal covers; empty if there are none.
     """
 
     def __init__(self, journal: Path) -> None:
@@ -69,14 +69,14 @@ class Tally:
         self.damage = ""
 
     def begin(self, identity: int) -> None:
-        """Write for a new journal of this identity."""
+        """Start a tally for a new journal of this identity."""
         self._identity = identity
         if self._descriptor >= 0:
             with suppress(OSError):
                 self._begin()
 
     def read(self, identity: int, *, any_journal: bool = False) -> None:
-        """Read what an earlier process has left for the journal of this identity, or for any; write for it later."""
+        """Read an earlier process's tally for the journal of this identity, or for any journal, and continue it."""
         self._identity = identity
         try:
             content = self.path.read_bytes()
@@ -93,14 +93,14 @@ class Tally:
             self.marks[mark.sensor, mark.epoch] = mark
 
     def grow(self, sensor: str, epoch: int, first: int, last: int) -> None:
-        """Note that numbers are stored; where the disk is too full for that, a loss of them would not be noticed."""
+        """Note that numbers are stored; if the disk is full, this is skipped, and their loss would go unnoticed."""
         mark = self.marks.setdefault((sensor, epoch), Mark(sensor, epoch, first, last))
         mark.last = max(mark.last, last)
         with suppress(OSError):
             self._put(mark)
 
     def note_damage(self, text: str) -> None:
-        """Keep in the file what a damaged log has lost, where the journal itself cannot say it."""
+        """Keep a description of losses that the journal itself cannot record."""
         self.damage = text
         with suppress(OSError):
             self._begin()
@@ -120,7 +120,7 @@ class Tally:
             os.fsync(self._descriptor)
 
     def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
-        """Forget numbers beyond those that were acknowledged: a failed journal was given up beyond them.
+        """Remove numbers above the acknowledged ones, because a failed journal was given up above them.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class Tally:
         self._write(place, {name: getattr(mark, name) for name in _FIELDS})
 
     def _begin(self) -> None:
-        """Open the file and write what it belongs to; what is in it stays only if it was read."""
+        """Open the file and write its header; keep earlier content only if it was read."""
         if self._descriptor < 0:
             flags = os.O_CREAT | os.O_RDWR | (0 if self._was_read else os.O_TRUNC) | getattr(os, "O_BINARY", 0)
             self._descriptor = os.open(self.path, flags, 0o666)
@@ -172,7 +172,7 @@ class Tally:
 
 
 def _blocks(content: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the blocks that are as they were written, and their places."""
+    """Yield the place and content of each block with a correct CRC-32."""
     for begin in range(0, len(content), _BLOCK_BYTES):
         check, _, text = content[begin : begin + _BLOCK_BYTES].rstrip().partition(b" ")
         if check == b"%08x" % zlib.crc32(text):

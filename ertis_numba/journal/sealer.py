@@ -35,11 +35,11 @@ class Sealed:
     damaged : int
         … were damaged in the journal.
     set_aside : Path or None
-        Where the journal is now, if measurements in it are damaged or refused; it is gone otherwise.
+        New path of the journal if it has damaged or refused measurements; otherwise the journal was removed.
     lost : int
-        Of those missing, measurements that were stored and that a damaged log of the journal has lost.
+        Missing measurements that were stored and then lost in a damaged log of the journal.
     damage : str
-        Losses from a damaged log that are no gaps of the recording; empty in general.
+        Losses from a damaged log that no gap of the recording covers; empty if there are none.
     refused : dict of str to str
         Sensors whose measurements no recording can hold, and the reasons.
     """

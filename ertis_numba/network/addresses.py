@@ -76,7 +76,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def is_own_host(given: str, host: str) -> bool:
-    """Whether the Host of an HTTP request is a loopback name or address, or the host that a server was given.
+    """Return True if the Host of an HTTP request is a loopback name or address, or the server's own host.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Documents with a checksum, for files in which a damaged letter would be believed."""
+"""Documents with a checksum, for files in which a damaged character could go unnoticed."""
 
 import zlib
 from typing import Any, Self
@@ -12,12 +12,12 @@ __all__ = ["Checked"]
 
 
 class Checked(Document, frozen=True, kw_only=True):
-    """A document that is written with the CRC-32 of its content; one without it is read as well.
+    """A document with an optional CRC-32 of its content.
 
     Attributes
     ----------
     check : str
-        As read from a file, and then compared; empty in a document that is in use.
+        CRC-32 as the file has it; empty in a document in memory.
     """
 
     check: str = ""
@@ -29,16 +29,16 @@ class Checked(Document, frozen=True, kw_only=True):
         Raises
         ------
         SettingsError
-            The text cannot be used, or is not what was written.
+            The text cannot be used, or its checksum is wrong.
         """
         if not text.strip():
-            raise SettingsError(f"{source or cls.label()} is empty; copy it again, or make it anew by 'ertis keys'")
+            raise SettingsError(f"{source or cls.label()} is empty; copy it again, or make a new one with 'ertis keys'")
         read = super().from_toml(text, source, find_line=find_line)
         made = read.replace(check="")
         if read.check and read.check != _crc32(made):
             raise SettingsError(
                 f"{source or cls.label()}: check is {read.check[:16]!r}, the content has {_crc32(made)!r}: the file is "
-                "damaged or was edited by hand; look at what it says, then remove the line that begins with 'check'"
+                "damaged or was edited by hand; review its content, then remove the line that begins with 'check'"
             )
         return made
 

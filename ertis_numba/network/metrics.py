@@ -186,7 +186,7 @@ class Metrics:
 
 
 def _of_own_hosts(app: "WSGIApplication", host: str) -> "WSGIApplication":
-    """Return an application that refuses requests to other host names, which a page of another site may let lead here.
+    """Return an application that refuses requests for other host names, as DNS rebinding sends them.
 
     A browser that fetches from ``evil.example`` names it as Host, even if that name has the address of this machine.
     """

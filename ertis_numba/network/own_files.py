@@ -41,11 +41,11 @@ def private_folder(folder: Path) -> Path:
     return folder
 
 
-def require_own(path: Path, about: str = "says who is let in") -> None:
-    """Refuse a file that others on this machine may change, by itself or by another in its place.
+def require_own(path: Path, about: str = "lists who is let in") -> None:
+    """Refuse a file that other users of this machine may change or replace.
 
-    Others are all users but this one and root. Each link on the way is followed, and each folder that it leads through
-    is looked at, as StrictModes of OpenSSH does with the folders above ``authorized_keys``.
+    Other users are all but this one and root. The function follows each link of the path and checks each folder of it,
+    as StrictModes of OpenSSH does with the folders above ``authorized_keys``.
 
     Parameters
     ----------
@@ -70,19 +70,19 @@ def require_own(path: Path, about: str = "says who is let in") -> None:
         if status.st_uid not in (0, os.geteuid()):
             raise SettingsError(
                 f"{path} {about} and others may change {what} (owned by user {status.st_uid}); "
-                f"run 'chown {os.geteuid()} {where}', and look at what it says"
+                f"run 'chown {os.geteuid()} {where}', and review the file"
             )
         mode = stat.S_IMODE(status.st_mode)
         is_kept = where in links or (where in folders and mode & stat.S_ISVTX)  # others cannot put another in its place
         if mode & _OTHERS_WRITE and not is_kept:
             raise SettingsError(
                 f"{path} {about} and others may change {what} (mode {mode:04o}); "
-                f"run 'chmod go-w {where}', and look at what it says"
+                f"run 'chmod go-w {where}', and review the file"
             )
 
 
 def _way_to(path: Path) -> tuple[list[Path], list[Path], Path]:
-    """Return the folders and the links that a path leads through, and where it ends."""
+    """Return the folders and links of a path, and the file at its end."""
     folders: dict[Path, None] = {}
     links: dict[Path, None] = {}
     here, left, n_followed = Path("/"), deque(path.absolute().parts[1:]), 0

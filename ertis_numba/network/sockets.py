@@ -224,10 +224,10 @@ class Monitor(_Events):
 
 
 class Strangers(_Events):
-    """Count the connections to a server that were closed before the peer had shown a key.
+    """Counter of connections to a server that closed before the peer had presented a key.
 
-    libzmq does not say which connection a finished handshake belongs to. So a connection counts as soon as the
-    connections that are still open, and younger than the longest handshake, cannot be the ones that are missing.
+    libzmq does not report which connection a finished handshake belongs to. A connection therefore counts only once the
+    open connections younger than the longest handshake can no longer account for the missing handshakes.
     """
 
     def __init__(self, server: "zmq.Socket[bytes]") -> None:
@@ -236,7 +236,7 @@ class Strangers(_Events):
         self._n_unfinished = self._n_counted = 0
 
     def read(self) -> int:
-        """Return how many more were turned away since the last call."""
+        """Return the number of connections turned away since the last call."""
         now_s = time.monotonic()
         for event, value in self._events():
             if event == zmq.EVENT_ACCEPTED:

@@ -101,7 +101,7 @@ class ArchiveStatus(msgspec.Struct, kw_only=True):
     sealing: int = 0
     sealing_failed: int = 0
     set_aside: int = 0
-    """Journals kept under another name: what is in them is damaged, or no recording can hold it."""
+    """Journals kept under another name, because they are damaged or no recording can hold some of their sensors."""
     commit: Percentiles = Percentiles()
     ack: Percentiles = Percentiles()
     """From the arrival of a measurement to its ack being sent."""

@@ -9,7 +9,7 @@ from ertis_numba.errors import ArgumentError
 __all__ = ["MAX_CALL_SAMPLES", "Call"]
 
 MAX_CALL_SAMPLES = 2**20
-"""Limit on the samples of a call: a second at 1 MHz. Files hold them, and filters take several copies of them."""
+"""Limit on the samples of a call, about one second at 1 MHz: files store them, and filters make several copies."""
 
 
 class Call(Table, frozen=True, kw_only=True):

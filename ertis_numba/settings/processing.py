@@ -27,8 +27,8 @@ class Processing(Table, frozen=True, kw_only=True):
     range_decimation : int
         Samples of the record per range of the energyscape.
     band_edges_hz : (low, high), optional
-        Frequencies below and above the call's band at which the matched filter reaches 0. The default lies 5 kHz
-        outside the band, or half of its lowest frequency where that is less; see ``docs/accuracy.md``.
+        Frequencies below and above the call's band at which the matched filter reaches 0. By default, each lies 5 kHz
+        outside the band, or half of the band's lowest frequency if that is less; see ``docs/accuracy.md``.
     decimation : int, optional
         Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest that
         suits the method and the call's band; see `Settings.decimation`.

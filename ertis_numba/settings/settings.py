@@ -63,7 +63,7 @@ class Settings(Document, frozen=True, kw_only=True):
             )
 
     def _check_band(self) -> None:
-        """Refuse edges of the matched filter's band that cut into the call's band, or that the signals cannot hold."""
+        """Refuse edges of the matched filter inside the call's band or above the Nyquist frequency of the signals."""
         given = self.processing.band_edges_hz
         if given is None:
             return
@@ -72,13 +72,13 @@ class Settings(Document, frozen=True, kw_only=True):
         if given[0] > highest_hz or given[1] < lowest_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz is {given[0]:g} to {given[1]:g} Hz, but the call sweeps over "
-                f"{self.call.low_frequency_hz:g} to {self.call.high_frequency_hz:g} Hz; give at most {highest_hz:g} "
-                f"and at least {lowest_hz:g}"
+                f"{self.call.low_frequency_hz:g} to {self.call.high_frequency_hz:g} Hz; give a lower edge of at most "
+                f"{highest_hz:g} and an upper edge of at least {lowest_hz:g}"
             )
         if given[1] > nyquist_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz ends at {given[1]:g} Hz, but signals at {self.signal_rate_hz:g} Hz hold "
-                f"{nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
+                f"at most {nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
             )
 
     def _check_adaptive(self) -> None:

@@ -143,9 +143,9 @@ def responses(
     frequency_hz: Floats,
     clock: Stopwatch,
 ) -> Floats | Complexes:
-    """Return what distance, air, walls, targets and directions leave of a call: (path, mic, node).
+    """Return the gain of a call by distance, air, walls, targets and directivity: (path, mic, node).
 
-    float64, or complex128 where a target turns the phase. The transducer's own response is left to `emitted`.
+    The type is float64, or complex128 if a target turns the phase. `emitted` has the transducer's own response.
     """
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
@@ -171,7 +171,7 @@ def responses(
 
 
 def emitted(active: AbstractSet[str], emitter: Emitter, frequency_hz: Floats) -> Floats | Complexes:
-    """Return what the transducer makes of each frequency of a call: (node,) float64 or complex128."""
+    """Return the transducer's response at each frequency of a call: (node,) float64 or complex128."""
     if "emitter_response" in active and emitter.resonance_hz is not None:
         return cast("Complexes", effect("emitter_response")(emitter, frequency_hz))
     return np.ones(len(frequency_hz))
@@ -236,9 +236,9 @@ def _arrivals(
     late_s: Floats,
     stretch: Floats | None = None,
 ) -> Arrivals:
-    """Return copies of a sensor's call, by the clock of the sensor that listens.
+    """Return copies of a sensor's call, timed by the clock of the receiving sensor.
 
-    What is over before the record begins, as it may be with clocks that differ, is left out.
+    Copies that end before the record begins are left out; clocks that differ may cause such copies.
     """
     sensor = shot.scene.sensors[number]
     if "clock_drift" in active:

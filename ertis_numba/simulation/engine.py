@@ -101,7 +101,7 @@ class Engine:
         return snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
 
     def converted(self, signals: NDArray[np.float64], draw: int) -> NDArray[Any]:
-        """Return the words that modulators or converters make of signals, which hold all noise but their own.
+        """Return the output words of modulators or converters for signals with all noise but their own.
 
         Parameters
         ----------

@@ -12,7 +12,7 @@ __all__ = ["near_discs"]
 def near_discs(shot: Snapshot) -> list[str]:
     """Return a note for each disc too near for Fresnel's approximation.
 
-    Its next term, a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a, must not exceed an eighth of a turn.
+    The next term, a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a, must not exceed an eighth of a turn.
     """
     targets = shot.targets
     wave = 2 * math.pi * shot.sensor.call.high_frequency_hz / shot.speed_m_s
@@ -20,6 +20,6 @@ def near_discs(shot: Snapshot) -> list[str]:
     least_m = np.cbrt(wave * (targets.diameter_m / 2) ** 4 / math.pi)
     return [
         f"{targets.names[k]} is a disc of {targets.diameter_m[k]:g} m at {apart_m[k]:.2g} m from {shot.sensor.name}; "
-        f"its echo is right from {least_m[k]:.2g} m on. Make it smaller, move it away, or give a wall with size_m"
+        f"its echo is accurate from {least_m[k]:.2g} m on. Make it smaller, move it away, or use a wall with size_m"
         for k in np.flatnonzero((targets.diameter_m > 0) & (apart_m < least_m))
     ]

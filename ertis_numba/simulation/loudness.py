@@ -1,4 +1,4 @@
-"""Bounds on the amplitude that modulators and converters meet, without a rendering."""
+"""Bounds on the input amplitude of modulators and converters, computed without rendering."""
 
 import math
 
@@ -26,14 +26,14 @@ _CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to t
 
 
 def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
-    """Return whether the signals may come within 6 dB of full scale with any choice of the effects not given."""
+    """Return True if the signals may come within 6 dB of full scale for some choice of the other effects."""
     if "spreading" not in active:
         return True
     return _RIPPLE * peak_bound(shot, frozenset(EFFECTS) - _WEAKENING) >= LOUD
 
 
 def peak_bound(shot: Snapshot, active: frozenset[str]) -> float:
-    """Return an amplitude that the signals of no microphone exceed, full scale 1.
+    """Return an upper bound on the amplitude at all microphones, relative to full scale.
 
     Calls that overlap in time add up with their full amplitudes, and noise counts with its crest.
     """
@@ -52,7 +52,7 @@ def _calls(shot: Snapshot, active: frozenset[str]) -> float:
 
 
 def _changes(entry: Arrivals) -> Floats:
-    """Return when each copy of a call begins and ends at any microphone, and by how much the sum changes then."""
+    """Return the times at which copies of a call begin or end at any microphone, and the change of the sum there."""
     loudest = np.max(np.abs(entry.amplitude), axis=(1, 2))
     lasts_s = entry.call.duration_s * (1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0)))
     if entry.emitter is not None:

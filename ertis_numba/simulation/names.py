@@ -7,7 +7,7 @@ __all__ = ["EFFECTS", "INDISPENSABLE"]
 EFFECTS: Final = {
     "propagation": "sound takes its time, to any part of a sample",
     "spreading": "amplitude falls with distance",
-    "emitter_offset": "the emitter sits beside the centre of the array",
+    "emitter_offset": "the emitter is away from the centre of the array",
     "cross_emission": "sensors hear each other's calls",
     "sync_delay": "each sensor of the SYNC chain starts later",
     "clock_drift": "sample clocks run fast or slow",

@@ -48,17 +48,17 @@ def _spreading(sight: Sight) -> Estimate | None:
 
 
 def _emitter_offset(sight: Sight) -> Estimate | None:
-    """Compare paths from emitters at their places with those from the centres of their arrays."""
+    """Compare paths from emitters at their positions with those from the centres of their arrays."""
     sensors = sight.shot.scene.sensors
     if not any(any(sensors[number].emitter.position_m) for number in sight.emitters(sight.active)):
         return None
     return replace(
-        _filtered(sight, "emitter_offset", "the emitter's place changes {name} by {change:.2f} dB"), sure=200.0
+        _filtered(sight, "emitter_offset", "the emitter's position changes {name} by {change:.2f} dB"), sure=200.0
     )
 
 
 def _clock_drift(sight: Sight) -> Estimate | None:
-    """Compute the shift of echoes by the clocks of sensors."""
+    """Compute the shift of echoes by drift of the sensors' clocks."""
     shot = sight.shot
     sensors = shot.scene.sensors
     heard = [shot.number, *sight.emitters(sight.active)]
@@ -76,13 +76,13 @@ def _clock_drift(sight: Sight) -> Estimate | None:
         change = change_db(sight.envelope_change(seen, moved) * reach, sight.beside(seen.delay_s))
         if change >= worst.change_db:
             most = shift_s[np.argmax(np.abs(shift_s))]
-            reason = f"clocks shift what {sensors[number].name} sends by up to {1e9 * most:+.3g} ns"
+            reason = f"clock drift shifts the call of {sensors[number].name} by up to {1e9 * most:+.3g} ns"
             worst = Estimate(change_db=change, reason=reason, sure=200.0)
     return worst
 
 
 def _emitter_response(sight: Sight) -> Estimate | None:
-    """Compare echoes with those of a transducer that sends all frequencies alike."""
+    """Compare echoes with those of a transducer with a flat frequency response."""
     shot = sight.shot
     emitters = [shot.scene.sensors[number].emitter for number in sight.emitters(sight.active)]
     resonances_hz = [emitter.resonance_hz for emitter in emitters if emitter.resonance_hz is not None]

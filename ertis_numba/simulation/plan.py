@@ -57,7 +57,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is simulated of a scene, and why.
+    """The effects that are simulated for a scene, with reasons.
 
     Attributes
     ----------
@@ -81,8 +81,8 @@ def make_plan(scene: Scene) -> Plan:
     All sensors are asked, at the beginning, at the end, in between and at way points; the greatest change
     counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
     what filters echoes, then what adds to them; and again in the light of all others, until nothing changes. Where
-    an estimate is not sure enough, the measurements where it is greatest are rendered and processed with the effect
-    and without. So is the loudest measurement, where converters may answer to what an estimate does not see.
+    an estimate is not certain enough, the measurements with the greatest estimates are rendered and processed with the
+    effect and without. So is the loudest measurement, because estimates do not model converters.
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
@@ -109,9 +109,9 @@ def _kept_on(verdict: Verdict) -> Verdict:
 
 
 def _indices(scene: Scene) -> list[int]:
-    """Return the measurements that are asked.
+    """Return the measurements for which effects are estimated.
 
-    The first; of a scene in motion several more, those at its way points among them; of clocks that drift, the last
+    These are the first; in a scene in motion, several more and those at its way points; with clock drift, the last
     before a SYNC.
     """
     last = scene.count - 1
@@ -160,7 +160,7 @@ def _decided(
 
 
 def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
-    """Return the estimates of all shots, the greatest change first, and the measurements they are about."""
+    """Return the estimates of all shots and the numbers of their measurements, the greatest change first."""
     found = [(ESTIMATES[name](Sight.of(shot, active)), index) for index, shot in shots]
     return sorted(
         ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
@@ -168,7 +168,7 @@ def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapsho
 
 
 def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:
-    """Return the measurement whose converters may be driven hardest, if they come within 6 dB of full scale."""
+    """Return the measurement with the highest bound on its amplitude, if that is within 6 dB of full scale."""
     peaks = [
         (max(peak_bound(shot, active), peak_bound(shot, active | {name})), index)
         for index, shot in shots

@@ -28,9 +28,9 @@ def match(settings: Settings) -> tuple[MatchedFilter, float, int]:
 
 
 def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
-    """Return a call, 1 at the microphones, after the filter of the own call: (lag,) complex128, from lag 0 on.
+    """Return a call of amplitude 1, filtered by the sensor's matched filter: (lag,) complex128, from lag 0 on.
 
-    The response of the emitter's transducer is included where one is given.
+    If an emitter is given, the call includes the response of its transducer.
     """
     rate_hz = settings.signal_rate_hz
     rings_s = 0.0 if emitter is None else effect("emitter_response", "ringing_s")(emitter)
@@ -55,9 +55,9 @@ def baseband(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats
 
 @functools.lru_cache(maxsize=16)
 def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, Floats]:
-    """Return the envelope of the matched call, by lags from 0 on: both (lag,) float64.
+    """Return lags from 0 on and the envelope of the matched call: both (lag,) float64.
 
-    Where its emitter rings, relative to its peak.
+    If an emitter is given, whose transducer rings, the envelope is relative to its peak.
     """
     lag_s, pulse = baseband(settings, emitter)
     middle = len(lag_s) // 2

@@ -28,8 +28,8 @@ _KEPT = 24  # images: most verdicts are about the same effects with one more or 
 class Rehearsal:
     """Renders and processes measurements of a scene with some effects and with others.
 
-    Modulators and converters take part where a signal comes within 6 dB of full scale. Elsewhere they are left out:
-    they answer to any change with other noise, which is no change of the image.
+    Modulators and converters are included if a signal comes within 6 dB of full scale. Otherwise they are left out: any
+    change of the input changes their noise, which is no change of the image.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ class Rehearsal:
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
         """Return by how much an effect changes the images of all sensors at the most, in decibels.
 
-        Sensors whose settings give no image, as with a range window beyond the end of their records, are left out;
-        None where no sensor gives one.
+        Sensors whose settings yield no image, such as a range window beyond the end of their records, are left out.
+        The result is None if no sensor yields an image.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Rehearsal:
         return max(changes_db, default=None)
 
     def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
-        """Return what modulators or converters receive, noise included: (mic, sample) float64."""
+        """Return the input of modulators or converters, with noise: (mic, sample) float64."""
         sensor = self._scene.sensor(name)
         signals = Engine(self._scene, sensor, active).signals(index)
         dbfs = sensor.electronics.noise_dbfs
@@ -96,7 +96,7 @@ class Rehearsal:
         return image, float(np.abs(signals).max())
 
     def _converted(self, name: str, index: int, active: frozenset[str]) -> list[Image]:
-        """Return two images of what modulators or converters make of the signals, with different dither."""
+        """Return two images from the output of modulators or converters, with different dither."""
         sensor = self._scene.sensor(name)
         engine, signals = Engine(self._scene, sensor, active), self._signals(name, index, active)
         chain = self._chain(sensor.settings())
@@ -136,7 +136,7 @@ def image_change_db(
 
 
 def _local(image: Image, spacing_m: float) -> Image:
-    """Return the strongest over all directions and 5 cm of range: (range,) float32."""
+    """Return the strongest amplitude over all directions and 5 cm of range: (range,) float32."""
     strongest = image.max(axis=0)
     near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(strongest))) + 1
     return np.asarray(scipy.ndimage.maximum_filter1d(strongest, near))

@@ -37,7 +37,7 @@ class Scene(Document, frozen=True, kw_only=True):
     count : int
         Number of measurements.
     sync_every : int
-        Measurements from one SYNC to the next; between them the sample clocks run free.
+        Measurements from one SYNC to the next; between SYNCs, sample clocks are not synchronised.
     tolerance_db : float
         Effects that change no image by more are left out.
     max_reflections : int

@@ -38,11 +38,11 @@ class Emitter(Table, frozen=True, kw_only=True):
     silent : bool
         The sensor only listens.
     position_m : (x, y, z)
-        In the sensor frame, whose origin is the centroid of the enabled microphones.
+        Position in the sensor frame, whose origin is the centroid of the enabled microphones.
     resonance_hz : float, optional
-        Of the transducer, which then filters the call and rings; it sends all frequencies alike by default.
+        Resonance of the transducer, which then filters the call and rings; the response is flat by default.
     quality_factor : float
-        Of that resonance: its bandwidth is ``resonance_hz / quality_factor``.
+        Quality factor of the resonance: its bandwidth is ``resonance_hz / quality_factor``.
     """
 
     level_db: float = 0.0

@@ -121,7 +121,7 @@ def _add(
     kernel_set, nodes_per_bin = kernels.load("cpu"), rate_hz / n_fft / NODE_HZ
 
     def add(call: NDArray[np.complex128], paths: NDArray[np.intp]) -> None:
-        """Add some paths; the kernel takes real amplitudes, so that imaginary ones go with a call turned by 90°."""
+        """Add some paths; the kernel accepts real amplitudes, so imaginary parts use a call turned by 90°."""
         turned = paths[amplitude[paths].imag.any(axis=(1, 2))]
         with kernel_set.threads(threads):
             kernel_set.add_paths(call, turns[paths], amplitude[paths].real.copy(), 0, nodes_per_bin, out)

@@ -81,8 +81,8 @@ class Texture:
     colour : float
         By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
     loudness : float
-        Power of the signals before the matched filter, at all times and frequencies, relative to ``level``; both are
-        relative to white bits. 0 where it was not measured: no plan keeps a budget below any sound.
+        Power of the signals before the matched filter, over all times and frequencies, relative to ``level``. Both are
+        relative to white bits. It is 0 if it was not measured.
     """
 
     shares: NDArray[np.float64]
@@ -108,7 +108,7 @@ class Texture:
 
     @classmethod
     def echo(cls, settings: Settings, n_mics: int) -> "Texture":
-        """Return the texture of a single echo, whose image is as bright as microphones in phase make it."""
+        """Return the texture of a single echo, to which all microphones contribute in phase."""
         _, shares = matched_spectrum(settings, n_waves=WAVES)
         power = shares**2  # that of the echo, beside that of the filter
         return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
@@ -142,7 +142,7 @@ class ErrorModel:
         fit : DelayFit
         n_mics : int
         fractions : (delay,) float64, optional
-            Fractions of a step that delays have, where they are too few to be spread evenly.
+            Fractions of a step in the delays, if the delays are too few to spread evenly.
         """
         texture = self.texture
         if fractions is not None:
@@ -258,10 +258,10 @@ class ErrorModel:
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
-        """Return the part of single precision.
+        """Return the error power of single precision.
 
-        Microphones of PCM may hear the same loud sound and round it alike, so that their errors add up in a beam. Bits
-        differ between microphones.
+        PCM microphones may receive the same loud sound and round it alike, so that their errors add up in a beam. PDM
+        bits differ between microphones.
         """
         alike = 1 if self._settings.recording.is_pdm else int(microphones(self._settings.array).enabled.sum())
         return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain

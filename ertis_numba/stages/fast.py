@@ -47,7 +47,7 @@ def spectrum_of(settings: Settings) -> Spectrum:
 
 @functools.lru_cache(maxsize=8)
 def _spectrum_of(settings: Settings) -> Spectrum:
-    """Return the same spectrum for the same call and rates, so that what is fitted to it can be kept as well."""
+    """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
     return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
 
 
@@ -68,8 +68,8 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
 def ringing_db(settings: Settings) -> float:
     """Return the level below its peak at which the ringing of the matched filter may be cut off.
 
-    Bits have noise that hides what lies below the stop band. PCM has none: sound outside the window may exceed the
-    image by the whole dynamic range, and what is cut off, or wraps around in the transform, must stay below the budget.
+    The noise of PDM bits hides ringing below the stop band. PCM has no such noise. Sound outside the window may exceed
+    the image by the whole dynamic range, and ringing that is cut off or wraps around must stay below the error budget.
     """
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
@@ -263,10 +263,10 @@ class FastChain:
     def sensitivity(
         self, words: NDArray[np.unsignedinteger[Any]], error_power: float, *, most_beams: int, seed: int = 1
     ) -> float:
-        """Return the error power of the image where the weights of an adaptive beamformer err by ``error_power``.
+        """Return the relative error power of the image for weights of an adaptive beamformer with ``error_power``.
 
-        Each direction and microphone errs by an independent complex number, whose power is relative to the weight.
-        At most ``most_beams`` directions are compared, bright ones more often than dark ones.
+        The error of each direction and microphone is an independent complex number with this power relative to the
+        weight. At most ``most_beams`` directions are compared; bright ones are preferred.
 
         Raises
         ------
@@ -274,7 +274,9 @@ class FastChain:
             The beamformer is delay-and-sum, which is linear.
         """
         if self._adaptive is None:
-            raise ArgumentError("processing.beamformer is 'delay_and_sum'; give an adaptive one to measure it")
+            raise ArgumentError(
+                "processing.beamformer is 'delay_and_sum'; give an adaptive one to measure its sensitivity"
+            )
         image = np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
         heard, _ = self.analytic(words, image)
         chosen = _brightest(image, most_beams)
@@ -413,7 +415,7 @@ def _brightest(image: NDArray[np.float32], count: int) -> NDArray[np.intp]:
 
 
 def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
-    """Return by how many seconds each microphone's samples are taken earlier: (mic,) float64, or (1,) zeros.
+    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
 
     Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
     golden ratio's multiples any few of them are spread evenly.

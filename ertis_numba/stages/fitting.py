@@ -176,7 +176,7 @@ class DelayFit:
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
     def errors_at(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean power of the error, of what is shared too, at given fractions: (wave,) float64."""
+        """Return the mean error power, including the shared error, at given fractions: (wave,) float64."""
         frequency_hz = self._spectrum.frequency_hz
         found = np.unique(np.round(fractions, 4))
         made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)

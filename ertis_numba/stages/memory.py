@@ -1,4 +1,4 @@
-"""Memory that a pipeline needs, predicted before anything is made for it."""
+"""Memory that a pipeline needs, predicted before any is allocated."""
 
 from typing import Final
 
@@ -17,7 +17,7 @@ _OF_POINT: Final = 4  # of an image
 
 
 def predicted_bytes(settings: Settings) -> int:
-    """Return the memory that planning and processing take, besides libraries and the tables of an unusually exact plan.
+    """Return the memory for planning and processing, except libraries and the tables of an unusually exact plan.
 
     Raises
     ------
@@ -33,12 +33,12 @@ def predicted_bytes(settings: Settings) -> int:
 
 
 def require_memory(settings: Settings, max_bytes: int) -> int:
-    """Return the memory that is left for the tables of a plan; refuse settings whose pipeline would need more.
+    """Return the memory that remains for the tables of a plan; refuse settings whose pipeline would need too much.
 
     Raises
     ------
     ArgumentError
-        It would.
+        The pipeline would need more than ``max_bytes``.
     """
     n_bytes = predicted_bytes(settings)
     if n_bytes > max_bytes:

@@ -129,7 +129,7 @@ class Planner:
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
     sensitivity : Sensitivity, optional
-        Of the beamformer; a safe estimate for any sound by default.
+        Sensitivity of the beamformer; by default, a safe estimate for any sound.
 
     Raises
     ------
@@ -219,7 +219,7 @@ class Planner:
         return Chosen(self._settings.replace(accuracy=accuracy), parts, costs.stages_ms(self._work(plan)))
 
     def parts(self, accuracy: Accuracy) -> dict[str, float]:
-        """Return the power of each part of the error of a complete plan, relative to that of the exact image."""
+        """Return the error power of each step of a complete plan, relative to the exact image."""
         with one_thread():
             return self._parts(_plan_of(accuracy))
 
@@ -388,7 +388,7 @@ class Planner:
         )
 
     def _few_fractions(self, fit: DelayFit, step_s: float) -> NDArray[np.float64] | None:
-        """Return the fractions of all delays where they are too few to be spread evenly over a step."""
+        """Return the fractions of all delays, if the delays are too few to spread evenly over a step."""
         if self._n_mics * (1 + 2 * self._reach_s() / step_s) > _MANY_FRACTIONS:
             return None
         delays_s = (

@@ -1,4 +1,4 @@
-"""Image of a single reflector, as the array and the call make it."""
+"""Point-spread function: the image of a single reflector, from array and call."""
 
 import math
 
@@ -13,7 +13,7 @@ from ertis_numba.waveform import matched_filter
 __all__ = ["PULSE_M", "PointSpread"]
 
 PULSE_M = 0.04
-"""How far off a compressed pulse of 25 kHz bandwidth is 26 dB down, and 40 dB at 2.5 times as far."""
+"""Range offset at which a compressed pulse of 25 kHz bandwidth is 26 dB down; it is 40 dB down at 2.5 times that."""
 
 _STEPS_PER_WAVE = 512  # of the table, per wavelength at the edge of the band: linear interpolation errs by 5e-6
 
@@ -30,8 +30,8 @@ class PointSpread:
     Attributes
     ----------
     reach_m : float
-        Range beyond which nothing of the reflector shows: a side lobe moves by half of the difference of two paths,
-        so by the aperture's radius at most, and is as long as the pulse.
+        Range offset beyond which the image of the reflector ends. A side lobe shifts by half of the difference of two
+        paths, so by the aperture's radius at most, and is as long as the pulse.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -57,7 +57,7 @@ class PointSpread:
     def __call__(
         self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64], air: Air | None = None
     ) -> NDArray[np.float64]:
-        """Return the amplitude, 1 at no offset: (place,) float64.
+        """Return the amplitude, which is 1 at zero offset: (place,) float64.
 
         Parameters
         ----------

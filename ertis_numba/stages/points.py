@@ -28,8 +28,8 @@ class PointExtractor:
     of the energy, as `ertis_numba.find_peaks` does. That is slower and predicts side lobes from the array: it shows
     weak reflectors beside strong ones of the same range, which are left out here.
 
-    Parabolas are no main lobes, so what they are wrong by is predicted from array and call, and taken off. Each point
-    has standard deviations of its position: see `ertis_numba.stages.uncertainty.PositionUncertainty`.
+    Main lobes are not parabolas, so the error of the parabolas is predicted from array and call, and subtracted. Each
+    point has standard deviations of its position: see `ertis_numba.stages.uncertainty.PositionUncertainty`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Error predicted for a plan from one measurement, and the warning where it exceeds the budget."""
+"""Error predicted for a plan from one measurement, and the warning if it may exceed the budget."""
 
 from dataclasses import dataclass
 from typing import Final, TypedDict
@@ -15,7 +15,7 @@ from ertis_numba.words import word_format
 __all__ = ["Prediction", "planner_of", "predict"]
 
 UNCERTAINTY_DB: Final = 1.0
-"""By which a prediction may be too low: see tests/test_accuracy.py."""
+"""Largest amount by which a prediction may be too low: see tests/test_accuracy.py."""
 ADAPTIVE_UNCERTAINTY_DB: Final = 15.0
 """The same for beamformers that are not linear: too low by up to 13.3 dB over random settings of `ertis bench budgets`.
 
@@ -44,7 +44,7 @@ class Prediction:
     max_error_db : float
         The budget.
     uncertainty_db : float
-        By which the prediction may be too low.
+        Largest amount by which the prediction may be too low.
     """
 
     predicted_error_db: float
@@ -52,7 +52,7 @@ class Prediction:
     uncertainty_db: float = UNCERTAINTY_DB
 
     def as_dict(self) -> Noted:
-        """Return what files and reports hold."""
+        """Return the prediction in the form for files and reports."""
         return {
             "predicted_error_db": self.predicted_error_db,
             "max_error_db": self.max_error_db,
@@ -72,7 +72,7 @@ class Prediction:
 
 
 def planner_of(measurement: Measurement, settings: Settings, kernels: KernelSet, *, threads: int) -> Planner:
-    """Return a planner that knows the sound of a measurement, and for adaptive beamformers its sensitivity there.
+    """Return a planner with the signal model of a measurement, and with its sensitivity for adaptive beamformers.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def planner_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
 
 
 def predict(planner: Planner, settings: Settings) -> Prediction:
-    """Return what a planner predicts for a complete plan, beside the budget."""
+    """Return a planner's prediction for a complete plan, with the budget."""
     adaptive = settings.processing.beamformer != "delay_and_sum"
     return Prediction(
         predicted_error_db=round(planner.chosen(settings.accuracy).error_db, 2),

@@ -20,7 +20,7 @@ class Sensitivity:
     ----------
     linear : float
     quadratic : float
-        Capon's cancellation of an echo whose delays err, relative to diagonal loading.
+        Coefficient of Capon's cancellation of an echo with delay errors; it grows as diagonal loading falls.
     """
 
     linear: float = 1.0
@@ -45,11 +45,11 @@ class Sensitivity:
                 return cls()
 
     def output(self, power: float) -> float:
-        """Return the error power of the image for that of the beams."""
+        """Return the error power of the image for an error power of the beams."""
         return self.linear * power + (self.quadratic * power) ** 2
 
     def beams(self, power: float) -> float:
-        """Return the error power that beams may have for that of the image, the inverse of `output`."""
+        """Return the error power that beams may have for an error power of the image, the inverse of `output`."""
         if not self.quadratic:
             return power / self.linear
         square = self.quadratic**2

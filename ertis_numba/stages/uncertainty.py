@@ -32,42 +32,45 @@ _OF_BEAMS_OF_MANY_TAPS = 0.3
 
 
 class _PlanError(NamedTuple):
-    """Errors of a plan as noise relative to an echo, root mean square."""
+    """Errors of a plan as root-mean-square noise, relative to an echo."""
 
     along: float
     across: float
 
 
 class PositionUncertainty:
-    """Estimates how far off the positions of points are: by noise, by the plan, and by a coarse grid.
+    """Estimator of position errors of points, from noise, from the plan, and from a coarse grid.
 
     Noise contributes the Cramér-Rao bounds of a single echo in white noise
 
     ``σ_range = c / (4π β √(2ρ))`` and ``σ_across = r / (k √(λ 2ρ))``,
 
-    ρ being the power of the point relative to the mean power of the noise; β the root-mean-square width of the call's
-    spectrum about its centre (P. M. Woodward, Probability and Information Theory, 1953, for the range ``cτ / 2``); k
-    the root mean square of its wave numbers; and λ the variance of the microphones' positions along the direction,
-    across the line of sight, in which it is least (H. L. Van Trees, Optimum Array Processing, 2002, section 8.4). An
-    image of one elevation has the azimuth to go across only. The noise is estimated from the median of the
-    image, which of a Rayleigh variable is √ln 2 of the root mean square; where echoes fill an image, they count as
-    noise.
+    with these quantities:
 
-    The plan of the image, if its settings carry a complete one, contributes its predicted errors for a single echo, as
-    noise of the same power times a measured share. A direction that could not be interpolated, as at the edge of a
-    grid, contributes the spacing of the grid.
+    - ρ is the power of the point relative to the mean power of the noise.
+    - β is the root-mean-square width of the call's spectrum about its centre (P. M. Woodward, Probability and
+      Information Theory, 1953, for the range ``cτ / 2``), and k is the root mean square of its wave numbers.
+    - λ is the least variance of the microphones' positions along any direction across the line of sight (H. L. Van
+      Trees, Optimum Array Processing, 2002, section 8.4). For an image of one elevation, that direction is the azimuth.
 
-    Infinite is what the array cannot tell. NaN is where the noise is not known: in images of other beamformers than
-    delay-and-sum, whose noise is no Rayleigh variable, and where half of the image or more is 0, as `clean` leaves
-    it. Errors of layout, temperature and near-field curvature come on top, and so does what echoes at the same place
-    do to each other.
+    The noise is estimated from the median of the image; the median of a Rayleigh variable is √ln 2 of its root mean
+    square. If echoes fill an image, they count as noise.
+
+    A complete plan in the image's settings contributes its predicted errors for a single echo, as noise of the same
+    power times a measured share. A direction that could not be interpolated, for example at the edge of a grid,
+    contributes the spacing of the grid.
+
+    A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown. This is the case
+    for beamformers other than delay-and-sum, whose noise is not Rayleigh-distributed, and if at least half of the image
+    is 0, as after `clean`. Errors of layout, temperature and near-field curvature are not included, nor is interference
+    between echoes at the same place.
 
     Parameters
     ----------
     settings : Settings
-        The air may be another with each image.
+        Settings of the images; the air may differ between images.
     is_planar : bool
-        Whether all directions have one elevation.
+        True if all directions have the same elevation.
     """
 
     def __init__(self, settings: Settings, *, is_planar: bool) -> None:
@@ -144,7 +147,7 @@ class PositionUncertainty:
 
 
 def _noise(image: Energyscape) -> float:
-    """Return the root mean square of the noise of an image; 0 if it is not known."""
+    """Return the root mean square of the noise of an image; 0 if it is unknown."""
     if image.settings.processing.beamformer != "delay_and_sum":
         return 0.0
     some = image.energy[:, ::_THINNED]

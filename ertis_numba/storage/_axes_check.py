@@ -1,4 +1,4 @@
-"""Check of what readers of a recording do not touch: axes and attributes of all objects of the file."""
+"""Check of parts of a recording that readers do not use: axes and attributes of all objects in the file."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeEr
 
 
 def fault_of(path: Path) -> str:
-    """Return the first object of a file that is damaged, and how, in a line; empty if there is none.
+    """Return the first damaged object of a file and its damage, as one line; empty if there is none.
 
     Raises
     ------
@@ -26,8 +26,8 @@ def fault_of(path: Path) -> str:
 
     Notes
     -----
-    HDF5 has checksums of everything but the lists by which variables refer to their axes, so these are compared with
-    the names that the axes have to have.
+    HDF5 has checksums of everything except the references from variables to their axes. These are therefore compared
+    with the expected names of the axes.
     """
     place = "/"
     try:

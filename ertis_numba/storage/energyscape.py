@@ -92,9 +92,9 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
 
     def note_error(self, sensor: str, *, predicted_error_db: float, max_error_db: float, error_warning: str) -> None:
-        """Store the predicted error of a sensor's images, the budget, and the warning where it may be exceeded.
+        """Store the predicted error of a sensor's images, the budget, and a warning if images may exceed it.
 
-        Call it before the first energyscape of the sensor.
+        Call this before the sensor's first energyscape is written.
 
         Raises
         ------
@@ -188,10 +188,10 @@ class EnergyscapeReader(Reader[Energyscape]):
     rotation_xyzw : (4,) float64, or None
         The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
     predicted_error_db, max_error_db : float, or None
-        Error of the first image that the error model predicted from its measurement, and the budget; None where the
-        file has neither, as older ones and images of the paper's method.
+        Error that the error model predicted for the first image, and the budget. None in older files and for images of
+        the paper's method.
     error_warning : str
-        Warning that images may exceed the budget; empty where they do not, or where nothing was predicted.
+        Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
     """
 
     _kind: ClassVar[str] = "energyscape"

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 JOURNAL_DAMAGE = "journal_damage"
-"""Attribute of a recording: losses of the journal that it was made of, beyond its gaps."""
+"""Attribute of a recording: losses of its journal that no gap covers."""
 
 Mounting = tuple[Sequence[float], Sequence[float]]
 """Where a sensor is, x, y, z in m, and how it is turned, a unit quaternion x, y, z, w."""
@@ -189,12 +189,12 @@ class RecordingWriter(Writer[Measurement]):
 
 
 def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]) -> None:
-    """Make all variables of a sensor but its rows.
+    """Create all variables of a sensor, without rows.
 
     Parameters
     ----------
     group : h5py.Group
-        The sensor's own, named as it is.
+        Group of the sensor, with the sensor's name.
     settings : Settings
         As `storable` returns them.
     firmware : str

@@ -51,8 +51,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """Make the recording of a journal; when it is complete, verified and on the disk, remove the journal.
 
     Measurements that are damaged in the journal are gaps of the recording, and the journal is kept under another name.
-    So it is where no recording can hold a sensor; those of the other sensors are sealed. What was sealed before is not
-    written again.
+    The journal is also kept if no recording can hold one of its sensors; the other sensors are sealed. Measurements
+    that were sealed before are not written again.
 
     Parameters
     ----------
@@ -109,13 +109,13 @@ def _require_nothing_lost(journal: Journal) -> None:
     lost += [f"{gap.first} to {gap.last} of sensor {gap.sensor}" for gap in journal.gaps if gap.reason == LOST]
     if lost:
         raise DataError(
-            f"{journal.path} has lost all its measurements, as its log was damaged ({'; '.join(lost)}); copy both "
-            "again if you can, or remove it"
+            f"{journal.path} has lost all its measurements, because its log was damaged ({'; '.join(lost)}); copy "
+            "journal and log again if you can, or remove the journal"
         )
 
 
 def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
-    """Return what a damaged log has lost and no gap of the recording can tell."""
+    """Return the losses of a damaged log that no gap of the recording covers."""
     absent = (
         f"{missing.first} to {missing.last} of sensor {name}"
         for name, held in rows.items()
@@ -127,7 +127,7 @@ def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
 
 
 def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
-    """Return the reasons why a recording cannot hold some sensors, by name, and take those out of the rows."""
+    """Return the reasons why a recording cannot hold some sensors, by name, and remove these sensors from the rows."""
     refused = {name: reason for name, (reason, count) in journal.unusable.items() if count}
     for name, held in list(rows.items()):
         first = next(iter(held), None)
@@ -139,7 +139,7 @@ def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
 
 
 def _refusal(sensor: Sensor, first: Measurement) -> str:
-    """Return why a recording cannot hold a sensor, by a trial in memory; empty where it can."""
+    """Return the reason why a recording cannot hold a sensor, from a trial in memory; empty if it can."""
     try:
         with h5py.File("trial", "w", driver="core", backing_store=False, libver=("v110", "v110")) as trial:
             lay_out_sensor(
@@ -179,7 +179,7 @@ class _Sealer(RecordingWriter):
         self._attributes["history"] = history
 
     def say_damage(self, damage: str) -> None:
-        """Say what is lost and is no gap."""
+        """Store a description of losses that no gap covers."""
         self._attributes[JOURNAL_DAMAGE] = damage
 
     def _require_words(self, item: Measurement) -> None:

@@ -1,8 +1,8 @@
-"""Bounded access to HDF5 files, which may come from anybody.
+"""Bounded access to HDF5 files from untrusted sources.
 
 HDF5 files can point into other files, claim billions of rows that take up no room, and hold the same rows under many
-names. Files of this package do none of that. So everything that is read is compared with what the file itself stores,
-before any of it is read: time and memory are then bounded by the size of the file.
+names. Files of this package do none of that. A reader therefore compares the claimed sizes with the stored data before
+it reads any of them, so that the size of the file bounds time and memory.
 """
 
 import math
@@ -57,7 +57,9 @@ def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
         raise ForeignDataError(f"{_path(group, name)} is a link to {link.path[:200]!r}; copy the data to its place")
     found = group[name]
     if not isinstance(found, kind):
-        raise DamagedError(f"{_path(group, name)} is a {type(found).__name__.lower()}, not a {kind.__name__.lower()}")
+        raise DamagedError(
+            f"{_path(group, name)} is a {type(found).__name__.lower()}, wanted a {kind.__name__.lower()}"
+        )
     if h5py.h5o.get_info(found.id).rc != 1:
         raise ForeignDataError(f"{_path(group, name)} has several names in the file; copy the data to each place")
     return found
@@ -81,7 +83,7 @@ def sensors_of(file: h5py.File) -> tuple[str, ...]:
 
 
 def require_attributes(owner: h5py.File | h5py.Group) -> None:
-    """Refuse attributes that take much room.
+    """Refuse attributes that are too many or too long.
 
     Raises
     ------
@@ -108,7 +110,7 @@ def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
     group : h5py.Group
         Of a sensor.
     table : iterable of Variable
-        Those that may be read; the ones that are missing are passed over.
+        Variables that may be read; missing ones are skipped.
 
     Raises
     ------
@@ -132,7 +134,7 @@ def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
 
 
 def _members(group: h5py.Group, table: Iterable[Variable]) -> Iterator[tuple[h5py.Group, Variable]]:
-    """Yield each variable that is there, with its group."""
+    """Yield each variable of the table that exists, with its group."""
     for variable in table:
         if variable.name in group:
             yield group, variable
@@ -167,7 +169,7 @@ def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
 
 
 def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int:
-    """Return the size of a dataset in its file; refuse one that is elsewhere, compressed, or not stored whole.
+    """Return the stored size of a dataset; refuse one that is in another file, compressed, or incomplete.
 
     Raises
     ------
@@ -185,7 +187,7 @@ def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int
         stored *= MAX_COMPRESSION
     if stored < wanted:
         raise DamagedError(
-            f"{dataset.name} has {wanted} bytes (shape {dataset.shape}), and the file holds {stored}; copy it again"
+            f"{dataset.name} has {wanted} bytes (shape {dataset.shape}), but the file holds {stored}; copy it again"
         )
     return int(stored)
 

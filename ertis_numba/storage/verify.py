@@ -33,7 +33,7 @@ class SensorReport:
     fault : str
         Why nothing of this sensor can be read; empty elsewhere.
     remark : str
-        Damage to the file, or losses from its journal that are not among the gaps, of any sensor; empty in general.
+        Damage to the file, or losses from its journal that no gap covers, of any sensor; empty if there are none.
     """
 
     sensor: str
@@ -71,7 +71,8 @@ def verify(path: str | Path) -> list[SensorReport]:
         with Journal.open(path) as journal:
             if journal.damage and not journal.sensors:
                 raise DataError(
-                    f"{path} has lost measurements, as its log was damaged ({journal.damage}); copy both again"
+                    f"{path} has lost measurements, because its log was damaged ({journal.damage}); copy journal and "
+                    "log again"
                 )
             reports = [_of_journal(journal, name) for name in journal.sensors]
             reports += [
@@ -124,7 +125,7 @@ def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
 
 def _journal_damage(recording: RecordingReader) -> str:
     damage = recording.attributes.get(JOURNAL_DAMAGE, "")
-    return f"lost with a damaged journal: {damage}" if damage else ""
+    return f"lost in a damaged journal: {damage}" if damage else ""
 
 
 def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
@@ -148,5 +149,5 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
         gaps=tuple(Gap(*item) for item in rows.missing),
         damaged=tuple(rows.damaged),
         disordered=_disordered((key.epoch, key.sequence) for key in rows.keys),
-        remark=f"lost with a damaged journal: {journal.damage}" if journal.damage else "",
+        remark=f"lost in a damaged journal: {journal.damage}" if journal.damage else "",
     )

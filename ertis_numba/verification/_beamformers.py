@@ -1,4 +1,4 @@
-"""Definitions of the beamformers in float64, written as docs/beamformers.md has them."""
+"""Beamformers in float64, by their definitions in docs/beamformers.md."""
 
 import math
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def _coherence_factor(y: Delayed, processing: Processing) -> NDArray[np.float64]
 
 
 def _dmas(y: Delayed, processing: Processing) -> NDArray[np.float64]:
-    """Return the elementary symmetric polynomial of the roots, built up microphone by microphone."""
+    """Return the elementary symmetric polynomial of the roots, accumulated microphone by microphone."""
     order, level = processing.dmas_order, np.abs(y)
     z = y * np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level > 0)
     sums: Delayed = np.zeros((order + 1, y.shape[1]), dtype=np.complex128)
@@ -49,7 +49,7 @@ def _dmas(y: Delayed, processing: Processing) -> NDArray[np.float64]:
 
 
 def _capon(y: Delayed, processing: Processing) -> NDArray[np.float64]:
-    """Return ``|wᴴ y|`` with the weights from the whole covariance matrix, microphones by microphones."""
+    """Return ``|wᴴ y|`` with the weights from the full covariance matrix, (mic, mic)."""
     n_mics, n_ranges = y.shape
     n_snapshots = min(processing.snapshots, n_ranges)
     first = np.clip(np.arange(n_ranges) - n_snapshots // 2, 0, n_ranges - n_snapshots)

@@ -1,8 +1,8 @@
-"""The exact image in float64, which shares no approximation with the images that it is compared to.
+"""Exact image in float64, without any approximation of the images that are compared with it.
 
-The samples of the record go through one transform at the record's own rate, long enough that nothing wraps around.
-Each bin is multiplied by the matched filter of the call, sampled at that rate, and turned by the exact delay of each
-microphone. There is no decimation, no interpolation, no zone of ranges, no plan and no rounding but that of float64.
+The samples of the record go through one transform at the record's own rate, long enough to prevent wrap-around. Each
+bin is multiplied by the matched filter of the call, sampled at that rate, and turned by the exact delay of each
+microphone. There is no decimation, no interpolation, no focal zone and no plan, and no rounding except that of float64.
 """
 
 import math
@@ -32,7 +32,7 @@ class ExactImage:
     Parameters
     ----------
     image : Energyscape
-        Image whose axes and settings count; its energies are not used.
+        Image with the axes and settings to use; its amplitudes are ignored.
     measurement : Measurement
         Measurement that the image was made from.
 
@@ -68,7 +68,7 @@ class ExactImage:
 
     @property
     def operations_per_direction(self) -> int:
-        """See the class."""
+        """Estimated count of complex multiplications per direction."""
         n_mics, n_bins = self._spectra.shape
         if self._settings.processing.wavefront == "spherical":
             count = n_mics * n_bins * len(self._range_m)
@@ -93,7 +93,7 @@ class ExactImage:
         return combine(self._plane(direction), processing)[ranges]  # Capon needs the neighbours of a range, too.
 
     def _plane(self, direction: int) -> NDArray[np.complex128]:
-        """Return the signals delayed as plane waves are: (mic, range) complex128.
+        """Return the signals delayed for plane waves: (mic, range) complex128.
 
         Ranges lie a whole number of samples apart, so one inverse transform of the bins, folded, gives all of them.
         """
@@ -114,7 +114,7 @@ class ExactImage:
         )
 
     def _spherical(self, direction: int, range_m: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the signals delayed as the echo of a point at each range is: (mic, range) complex128."""
+        """Return the signals delayed for a point at each range: (mic, range) complex128."""
         points_m = range_m[:, None] * self._directions[direction]
         paths_m = np.linalg.norm(points_m - self._positions_m[:, None], axis=2) + range_m  # (mic, range)
         at_s = paths_m / self._speed_m_s
@@ -131,7 +131,7 @@ class ExactImage:
 
     @cached_property
     def _tabled(self) -> NDArray[np.complex128]:
-        """The spectra as square tables, filled up with zeros: (mic, b, a) complex128."""
+        """Spectra as square tables, padded with zeros: (mic, b, a) complex128."""
         n_mics, n_bins = self._spectra.shape
         n = math.ceil(math.sqrt(n_bins))
         padded: NDArray[np.complex128] = np.zeros((n_mics, n * n), dtype=np.complex128)
@@ -140,7 +140,7 @@ class ExactImage:
 
 
 def _transform_length(settings: Settings) -> int:
-    """Return a multiple of the samples per range in which record, call and ringing fit: nothing wraps around."""
+    """Return a transform length, a multiple of the samples per range, that holds record, call and ringing."""
     call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
     edge_hz = min(call.low_frequency_hz - low_hz, high_hz - call.high_frequency_hz)
     rate_hz, step = settings.recording.sample_rate_hz, settings.processing.range_decimation
@@ -149,7 +149,7 @@ def _transform_length(settings: Settings) -> int:
 
 
 def _matched_response(settings: Settings, n_fft: int) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
-    """Return the bins of the band and the matched filter in them, by which the call has an envelope of 1."""
+    """Return the bins of the band and the matched filter there, scaled to a peak envelope of 1 for the call."""
     call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
     rate_hz = settings.recording.sample_rate_hz
     frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
@@ -163,7 +163,7 @@ def _matched_response(settings: Settings, n_fft: int) -> tuple[NDArray[np.int64]
 
 
 def _signal(words: NDArray[Any], channel: int, settings: Settings) -> NDArray[np.float64]:
-    """Return the signal of one channel, full scale 1: (sample,) float64."""
+    """Return the signal of one channel, relative to full scale: (sample,) float64."""
     if not settings.recording.is_pdm:
         return np.asarray(words[:, channel].astype(np.float64) / settings.recording.full_scale)
     place, bit = divmod(channel, 8 * words.dtype.itemsize)

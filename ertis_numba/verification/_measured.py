@@ -20,15 +20,15 @@ _MAX_OPERATIONS = 3e9  # complex multiplications: some ten seconds of one core
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The error of an image.
+    """Error of an image relative to the exact image.
 
     Attributes
     ----------
     error_db : float
     n_directions : int
-        On which it was measured.
+        Number of compared directions.
     peaks : PeakErrors or None
-        None where that was not all directions.
+        None if not all directions were compared.
     """
 
     error_db: float
@@ -37,11 +37,11 @@ class Measured:
 
 
 def measure(image: Energyscape, measurement: Measurement) -> Measured:
-    """Return the error of the image that ``measurement`` was made into, by the settings of the image.
+    """Return the error of the image of ``measurement``, relative to the exact image with the same settings.
 
-    The exact image is computed in float64, by the definition of the image's beamformer. Where all of it would take
-    more than some ten seconds, a sample is compared: directions of plane wavefronts, single places of spherical ones.
-    Bright ones are drawn more often, and each counts by the inverse of its probability.
+    The exact image is computed in float64, by the definition of the image's beamformer. If the whole image would take
+    more than about ten seconds, a sample is compared: directions for plane wavefronts, single points for spherical
+    ones. Bright ones are drawn more often, and each is weighted by the inverse of its probability.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
 
 
 def _measured_in_part(image: Energyscape, exact: ExactImage, share: float) -> Measured:
-    """Return the error measured on a share of the directions, or of the places where wavefronts are spherical."""
+    """Return the error measured on a share of the directions, or of the image points if wavefronts are spherical."""
     power = np.square(image.energy, dtype=np.float64)
     by_place = image.settings.processing.wavefront == "spherical"
     power = power if by_place else power.sum(axis=1, keepdims=True)
@@ -79,9 +79,9 @@ def _measured_in_part(image: Energyscape, exact: ExactImage, share: float) -> Me
 
 
 def exact_image(image: Energyscape, measurement: Measurement) -> Energyscape:
-    """Return the exact image of a measurement on the axes of another image, whose settings count.
+    """Return the exact image of a measurement on the axes and with the settings of another image.
 
-    All directions are computed, however long it takes. Amplitudes are rounded to float32 at the end.
+    This computes all directions, without a limit on time. Amplitudes are rounded to float32 at the end.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _whole(image: Energyscape, exact: ExactImage) -> NDArray[np.float64]:
 
 
 def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
-    """Return the norm of the difference by that of the exact image.
+    """Return the norm of the difference relative to the norm of the exact image.
 
     Raises
     ------
@@ -107,16 +107,18 @@ def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float
     """
     wanted = float(np.linalg.norm(exact.astype(np.float64)))
     if not wanted:
-        raise DataError("the exact image is silent, so no error can be measured by it; give a measurement with echoes")
+        raise DataError(
+            "the exact image is silent, so no error relative to it can be measured; give a measurement with echoes"
+        )
     difference = float(np.linalg.norm(energy.astype(np.float64) - exact))
     return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf
 
 
 def sampled(power: NDArray[np.float64], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return which items stand for all, and their weights in a sum over all: (item,) intp, (item,) float64.
+    """Return a sample of the items and their weights in a sum over all: (item,) intp, (item,) float64.
 
-    Systematic sampling with probabilities half even and half by power. Neighbours are alike, so that drawing at equal
-    steps of the cumulated probability errs less than drawing at random.
+    This is systematic sampling; half of the probability is even and half is proportional to power. Neighbours are
+    alike, so drawing at equal steps of the cumulative probability has a smaller error than drawing at random.
     """
     total = float(power.sum())
     even = np.full(len(power), 1 / len(power))

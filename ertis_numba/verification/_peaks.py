@@ -13,21 +13,21 @@ from ertis_numba.stages.detect import find_peaks
 __all__ = ["PEAKS", "PeakErrors", "peak_errors"]
 
 PEAKS = 10
-"""Of the strongest reflectors, how many are compared."""
+"""Number of strongest reflectors to compare."""
 
 _NEAR_DEG, _NEAR_M = 5.0, 0.02  # half a main lobe and half a pulse: what lies further off is another reflector
 
 
 @dataclass(frozen=True, slots=True)
 class PeakErrors:
-    """How the strongest reflectors of the exact image are shown by another one.
+    """Errors of another image at the strongest reflectors of the exact image.
 
     Attributes
     ----------
     wanted, lost : int
-        Reflectors that were looked for, and those of which there is none near by.
+        Reflectors of the exact image, and those without a near reflector in the other image.
     level_db, range_mm, angle_deg : float or None
-        Largest error of what was found, levels being below the strongest; None if nothing was.
+        Largest errors of the found reflectors; levels are relative to the strongest. None if no reflector was found.
     """
 
     wanted: int
@@ -38,7 +38,7 @@ class PeakErrors:
 
 
 def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
-    """Return how an image shows the reflectors that the exact one has."""
+    """Return the errors of an image at the reflectors of the exact image."""
     # Twice as many, since those of nearly one level change places, and what was last may be left out.
     found = find_peaks(image, top=2 * PEAKS, min_level_db=-1000.0)
     errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
@@ -53,7 +53,7 @@ def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
 
 
 def _nearest(peak: Peak, found: Sequence[Peak]) -> tuple[float, float, float] | None:
-    """Return errors of level, range and angle of the peak that shows a reflector."""
+    """Return the errors of level, range and angle of the peak that matches a reflector."""
     errors = (
         (other.level_db - peak.level_db, other.range_m - peak.range_m, _angle_deg(peak, other)) for other in found
     )

@@ -33,7 +33,7 @@ def is_loopback(host: str) -> bool:
 def own_pages(host: str, token: str | None = None) -> Iterator[None]:
     """Let a server that is made in this block refuse pages of other sites, which a browser lets connect to any host.
 
-    With a token it also refuses browsers that have not opened an address with ``?token=``; a cookie keeps the token.
+    With a token, it also refuses browsers that have never opened an address with ``?token=``. A cookie keeps the token.
 
     A browser says of what site a page is (Origin, RFC 6454) and where it connects to (Host). Of a page from here, both
     are the same. On loopback it is the name of a loopback host, too: another site may let its own name lead there.
@@ -67,7 +67,7 @@ def own_pages(host: str, token: str | None = None) -> Iterator[None]:
 
 
 def _token_of(request: "Request") -> str | None:
-    """Return the token that a browser sends: in the address at first, and in a cookie from then on."""
+    """Return the token that a browser sends, first in the address and later in a cookie."""
     query = urllib.parse.parse_qs(urllib.parse.urlsplit(request.path).query)
     if "token" in query:
         return query["token"][-1].encode("ascii", "replace").decode()

@@ -108,7 +108,7 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where a browser finds the page, with the token that other machines need."""
+        """Address of the page, with the token that other machines need."""
         host = self._server.get_host()
         shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104
         token = "" if self._token is None else f"?token={self._token}"

@@ -42,7 +42,7 @@ class View:
     ----------
     source : Live or Film
     host : str
-        Loopback by default. On any other host the page asks for the token that `url` has.
+        Loopback by default. On any other host the page requires the token in `url`.
     port : int
         0 for any that is free.
     choices : Choices, optional

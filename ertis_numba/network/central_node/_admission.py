@@ -27,7 +27,11 @@ _PEERS_OF_KEY: Final = 64
 def source_in(hello: Hello, payload: list[bytes], *, most_bytes: int) -> Sensor:
     """Return the sensor of a greeting, or refuse what is none."""
     if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
-        raise Unwanted("settings", f"a hello has no settings of at most {Settings.max_bytes} bytes; send them", "size")
+        raise Unwanted(
+            "settings",
+            f"a hello lacks settings, or they exceed {Settings.max_bytes} bytes; send one settings text",
+            "size",
+        )
     if zlib.crc32(payload[0]) != hello.settings_crc32:
         raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
     try:

@@ -1,4 +1,4 @@
-"""CRC-32 of measurements that are stored: a number that comes again is compared with what came first."""
+"""CRC-32 of stored measurements, to compare a measurement that arrives again with the stored one."""
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -20,7 +20,7 @@ class Checksums:
     Parameters
     ----------
     tails : mapping of Run to dict of int to int
-        Those of earlier processes.
+        CRC-32 by run and number, from earlier processes.
     """
 
     def __init__(self, tails: Mapping[Run, Mapping[int, int]]) -> None:
@@ -40,12 +40,12 @@ class Checksums:
             self._kept.popitem(last=False)
 
     def learn(self, journal: Journal) -> None:
-        """Keep those of the newest measurements of a journal."""
+        """Keep the CRC-32 of the newest measurements of a journal."""
         for sensor, epoch, number, crc32 in journal.newest(_LEARNED):
             self.add(Run(sensor, epoch), number, crc32)
 
     def tails(self, runs: Iterable[Run]) -> dict[Run, dict[int, int]]:
-        """Return those of the newest measurements of some runs, for the next process."""
+        """Return the CRC-32 of the newest measurements of some runs, for the next process."""
         found: dict[Run, dict[int, int]] = {run: {} for run in runs}
         for (run, number), crc32 in reversed(self._kept.items()):
             if run in found and len(found[run]) < _TAIL:

@@ -1,4 +1,4 @@
-"""Hello messages whose settings are being read, in a thread of their own: TOML of 256 kB takes a tenth of a second."""
+"""Reader of the settings in Hello messages, in a thread of its own: TOML of 256 kB takes a tenth of a second."""
 
 import threading
 from collections import deque
@@ -21,18 +21,18 @@ MAX_WAITING_BYTES: Final = 64_000_000
 
 @dataclass(slots=True, eq=False)
 class Greeting:
-    """A Hello message and what came of it.
+    """A Hello message, and the sensor or error that it led to.
 
     Attributes
     ----------
     frames : list of zmq.Frame
-        The message as it came, for the gate to look up its sender again.
+        The frames of the message, by which the gate looks up its sender again.
     hello : Hello
     payload : list of bytes
     key : str
-        Public key of the peer; empty where there are none.
+        Public key of the peer; empty where keys are not used.
     result : Sensor or Exception
-        The sensor, once it is read, or why there is none.
+        The sensor once the settings are read, or the error.
     """
 
     frames: list[zmq.Frame]
@@ -53,12 +53,12 @@ class Greeting:
 
 
 class Greetings:
-    """Reads the settings in Hello messages, one after the other; peers take turns.
+    """Reader of the settings in Hello messages, one at a time; peers take turns.
 
     Parameters
     ----------
     read : callable
-        Called in the thread with the message and its payload; returns the sensor, or raises what is wrong.
+        Called in the thread with the message and its payload; returns the sensor or raises an error.
     """
 
     def __init__(self, read: Callable[[Hello, list[bytes]], Sensor]) -> None:
@@ -73,7 +73,7 @@ class Greetings:
         self._waker: Waker | None = None
 
     def open(self) -> int:
-        """Start the thread, and return what to poll: `take` when it can be read."""
+        """Start the thread, and return a descriptor to poll; call `take` when it is readable."""
         self._waker = Waker()
         self._thread = threading.Thread(target=self._run, args=(self._waker,), name="greetings", daemon=True)
         self._thread.start()
@@ -92,12 +92,12 @@ class Greetings:
             self._waker = None
 
     def offer(self, greeting: Greeting) -> None:
-        """Have a greeting read; returns at once.
+        """Queue a greeting; never blocks.
 
         Raises
         ------
         Unwanted
-            Too many wait.
+            The queue is full.
         """
         with self._change:
             waiting = self._waiting.setdefault(greeting.peer_id, deque())
@@ -105,14 +105,14 @@ class Greetings:
                 if not waiting:
                     del self._waiting[greeting.peer_id]
                 raise Unwanted(
-                    "message", "too many hellos wait to be read; say hello again in some seconds", "too many"
+                    "message", "too many hellos wait to be read; send hello again in a few seconds", "too many"
                 )
             self._bytes += greeting.n_bytes
             waiting.append(greeting)
             self._change.notify()
 
     def forget(self, peer_id: bytes) -> None:
-        """Drop the greetings of a peer that has left."""
+        """Discard the greetings of a peer that has left."""
         with self._change:
             self._bytes -= sum(greeting.n_bytes for greeting in self._waiting.pop(peer_id, ()))
             if self._current is not None and self._current.peer_id == peer_id:
@@ -121,7 +121,7 @@ class Greetings:
                 self._done.remove(greeting)
 
     def take(self) -> list[Greeting]:
-        """Return the greetings that were read since; returns at once."""
+        """Return the greetings that were read since the last call; never blocks."""
         if self._waker is not None:
             self._waker.clear()
         with self._change:

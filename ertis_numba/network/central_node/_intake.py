@@ -78,7 +78,7 @@ class Intake:
         Raises
         ------
         Unwanted
-            It cannot be taken.
+            The greeting cannot be accepted.
         """
         return source_in(hello, payload, most_bytes=self._most_bytes)
 

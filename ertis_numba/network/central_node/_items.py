@@ -110,7 +110,7 @@ class Failed:
 
 @dataclass(slots=True)
 class Remark:
-    """Damage that was found when a folder was taken up; storing goes on."""
+    """Damage that was found when a folder was opened; storing continues."""
 
     text: str
 

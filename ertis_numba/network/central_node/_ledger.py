@@ -83,8 +83,8 @@ class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 class Ledger:
     """The highest settled number of each run of a folder, durable.
 
-    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. An entry whose CRC-32
-    is wrong is left out. It has the newest runs only, 64 of each sensor.
+    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader leaves out
+    entries with a wrong CRC-32. The file keeps only the newest 64 runs of each sensor.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Ledger:
     is_new : bool
         There was none.
     damage : str
-        Entries that are left out, and what follows from that; empty in general.
+        Entries that were left out, and the consequence; empty if the file is sound.
     settled : dict of Run to int
         The run that grew last comes last.
     open, unsealed : list of str
@@ -178,7 +178,7 @@ class Ledger:
 
     def _note_damage(self, what: str) -> None:
         self.damage = (
-            f"{self._path} is damaged: {what}. What it said is read again from the recordings and journals beside it; "
+            f"{self._path} is damaged: {what}. Its content is read again from the recordings and journals beside it; "
             "measurements in recordings that were moved elsewhere may be stored a second time"
         )
 

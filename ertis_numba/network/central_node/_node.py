@@ -267,7 +267,7 @@ class CentralNode:
         self._door.send(sender, error.answer(message or Bye()))
 
     def _greet(self, greeting: Greeting) -> None:
-        """Take a greeting whose settings were read."""
+        """Accept or refuse a greeting whose settings were read."""
         if isinstance(greeting.result, Exception):
             raise greeting.result
         if greeting.result is None or self._door.who(greeting.frames) is None:  # its key was removed meanwhile

@@ -97,7 +97,7 @@ class Shelf:
                 if "_conflicts" not in path.name:  # whose measurements come second under their numbers
                     self._checksums.learn(journal)
                 if journal.damage:
-                    self._tell(Remark(f"the log of {path.name} was damaged; lost: {journal.damage}"))
+                    self._tell(Remark(f"the log of {path.name} was damaged; measurements lost: {journal.damage}"))
         elif recording.exists():
             self._settle(look([recording]))
 
@@ -206,7 +206,7 @@ class Shelf:
         self._tell(Stored(items, took_ms))
 
     def _store_twin(self, item: Item) -> None:
-        """Keep a measurement whose number is settled, unless the one that is stored is known to be the same."""
+        """Store a measurement with a settled number as a conflict, unless it equals the stored one."""
         if not isinstance(item.what, Entry):
             return
         key = (item.run, item.first, item.what.crc32 or 0)
@@ -308,7 +308,7 @@ class Shelf:
                     volume.close()
 
     def _give_up_failed(self) -> None:
-        """Let nobody believe more of journals that have failed than was acknowledged, and have them sealed.
+        """Limit failed journals durably to their acknowledged measurements, and queue them for sealing.
 
         Raises
         ------

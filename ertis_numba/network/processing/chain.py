@@ -19,7 +19,7 @@ from ertis_numba.words import word_format
 __all__ = ["Chain"]
 
 MAX_BYTES: Final = 1_000_000_000
-"""Limit on the memory of one pipeline, which a sensor's settings decide about."""
+"""Limit on the memory of one pipeline; a sensor's settings determine its size."""
 
 _TIMED: Final = 5  # measurements, whose median counts
 

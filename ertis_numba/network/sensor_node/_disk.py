@@ -87,7 +87,7 @@ class DiskSpool(Spool):
         self._sweeper.start()
 
     def _tell_losses(self, journal: Journal) -> None:
-        """Report what a damaged log has lost; its gaps go to the central node as well."""
+        """Report the losses of a damaged log; the central node receives them as gaps, too."""
         n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
         if n_lost:
             self._on_note(f"the log of {journal.path.name} was damaged; stored numbers lost: {n_lost}")

@@ -11,12 +11,12 @@ Floats = NDArray[np.float64]
 
 
 def clock_drift(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | None) -> tuple[Floats, Floats | None]:
-    """Return delays and stretches of an emitter's call as the clock of the listening sensor counts them.
+    """Return delays and stretches of an emitter's call on the clock of the receiving sensor.
 
-    Both clocks start with the SYNC, T before the measurement. A clock that is fast by d counts ``(1 + d)`` seconds per
-    second, so that what an emitter with drift e sends after its own T arrives ``T (d - e) / (1 + e) + (1 + d) τ``
-    after the listener's own T. The call lasts ``(1 + d) / (1 + e)`` times as long. Of its own echoes, a sensor thus
-    counts every delay too long by d.
+    Both clocks start with the SYNC, a time T before the measurement. A clock with drift d counts ``(1 + d)`` seconds
+    per second. An emitter with drift e emits when its own clock reads T. The call arrives
+    ``T (d - e) / (1 + e) + (1 + d) τ`` after the receiver's clock reads T, and lasts ``(1 + d) / (1 + e)`` times as
+    long. A sensor therefore measures each delay of its own echoes as ``(1 + d)`` times the true delay.
 
     Parameters
     ----------

@@ -16,16 +16,17 @@ _FAR = 0.02  # of u: the far field is right to a few thousandths
 
 
 def disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
-    """Return the echo relative to that straight back from afar: complex128, shaped as the arguments.
+    """Return the echo relative to the far-field echo along the normal: complex128, shaped as the arguments.
 
     ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``: Kirchhoff's integral over a disc in Fresnel's approximation, as for the field
     near the focus of a lens (M. Born, E. Wolf, Principles of Optics, 7th edition, section 8.8). On the axis it is
-    ``exp(-j u / 4) sin(u / 4) / (u / 4)``, and far away, where u is 0, the pattern of a piston, ``2 J₁(v) / v``.
+    ``exp(-j u / 4) sin(u / 4) / (u / 4)``. In the far field, u is 0 and the echo has the pattern of a piston,
+    ``2 J₁(v) / v``.
 
     Parameters
     ----------
     tilt : float64
-        ``v = k a |s|``, s being the sum of the unit vectors towards both ends without its part along the normal.
+        ``v = k a |s|``; s is the sum of the unit vectors towards emitter and microphone, less its normal component.
     nearness : float64
         ``u = k a² (1 / r₁ + 1 / r₂)``.
     """

@@ -11,7 +11,7 @@ __all__ = ["LARGE", "rigid_sphere"]
 Floats = NDArray[np.float64]
 
 LARGE = 60.0
-"""Circumference in wavelengths, k a, from which a sphere is a curved mirror; straight back the two differ by 2 %."""
+"""Circumference in wavelengths, k a, from which a sphere is a curved mirror; in backscatter the two differ by 2 %."""
 _FADES = 40.0  # from here on, to `LARGE`, the series gives way to the mirror
 _ORDERS = np.arange(int(LARGE) + 15)  # beyond k a the terms fall faster than exponentially
 
@@ -19,18 +19,18 @@ _ORDERS = np.arange(int(LARGE) + 15)  # beyond k a the terms fall faster than ex
 def rigid_sphere(size: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
     """Return the echo relative to that of a curved mirror: (path, mic, frequency) complex128.
 
-    The partial-wave series of a rigid sphere in a plane wave, ``f = -(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)``
-    with spherical Hankel functions of the second kind, as time goes with ``exp(jωt)`` (P. M. Morse, K. U. Ingard,
-    Theoretical Acoustics, 1968, section 8.2). The mirror gives ``(a / 2) exp(2 j k a sin(Θ / 2))`` about the
-    sphere's centre. For small k a the ratio falls as (k a)², after Rayleigh; about 1 the wave that creeps around
-    the sphere makes it rise and fall.
+    The echo is the partial-wave series of a rigid sphere in a plane wave,
+    ``f = -(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)``. The time factor is ``exp(jωt)``, so the spherical Hankel
+    functions are of the second kind (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, section 8.2). The echo of
+    the mirror is ``(a / 2) exp(2 j k a sin(Θ / 2))``, relative to the sphere's centre. For small k a the ratio falls
+    as (k a)² (Rayleigh scattering); near k a = 1 the creeping wave around the sphere makes it oscillate.
 
     Parameters
     ----------
     size : (path, frequency) float64
         ``k a``, wave number times radius.
     cos_turn : (path, mic) float64
-        Cosine of the angle Θ by which the sound is turned, -1 straight back.
+        Cosine of the scattering angle Θ; -1 is backscatter.
     """
     wanted = (size > 0) & (size < LARGE)
     safe = np.where(wanted, size, 1.0)

@@ -8,7 +8,7 @@ from ertis_numba.simulation.paths import Paths
 __all__ = ["NEAREST_M", "spreading"]
 
 NEAREST_M = 0.01
-"""Emitters, reflectors and microphones have a size: amplitudes stop growing here."""
+"""Distance below which amplitudes no longer grow, because emitters, reflectors and microphones have a size."""
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:

@@ -33,10 +33,10 @@ def over_surfaces(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chose
 
 
 def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | NDArray[np.complex128]:
-    """Return what the size of targets makes of their echoes: (path, mic, frequency), 1 for points.
+    """Return the gain of echoes by the size of their targets: (path, mic, frequency), 1 for points.
 
-    Spheres of a few wavelengths scatter as `rigid_sphere` says, larger ones are mirrors. Discs echo as `disc` says,
-    into the half space that they face; both ends must lie in it. float64, or complex128 where phases turn.
+    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; emitter and
+    microphone must lie in the half space that the disc faces. The type is float64, or complex128 if phases turn.
     """
     wave = 2 * math.pi / speed_m_s * frequency_hz
     targets = paths.targets
@@ -53,7 +53,7 @@ def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | N
 
 
 def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDArray[np.complex128]:
-    """Return what discs send to each microphone of what reaches them: (disc, mic, frequency) complex128."""
+    """Return the gain from the sound at a disc to its echo at each microphone: (disc, mic, frequency) complex128."""
     to_ear, to_mouth = paths.arriving[chosen], -paths.leaving[chosen]
     normal, radius_m = paths.targets.normals[chosen, None], paths.targets.diameter_m[chosen, None] / 2
     both = to_ear + to_mouth
