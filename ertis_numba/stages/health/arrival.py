@@ -1,6 +1,7 @@
 """The strongest arrival of a record: its signals after the matched filter, and the wavefront that fits them."""
 
-from collections.abc import Callable, Iterator, Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ __all__ = ["Compressed", "Fit", "compress", "fit_delays", "fit_emitter", "strong
 _OVERSAMPLING = 8  # of the envelope
 _PROMINENCE = 6.0  # of the arrival's amplitude, relative to the median over time
 _TRIALS = 80  # subsets of microphones; half of them may be wrong
+_SINGULAR = 1e-2  # volume of a subset of microphones, relative to the cube of the array
 _DEGENERATE_M = 1e-3  # extent below which an axis of the array has no say
 
 
@@ -179,16 +181,15 @@ def _fit(times_s: NDArray[np.float64], fitted_s: NDArray[np.float64], emission_s
 def _robust(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Return time at the centre and slopes, by the least median of residuals, then by least squares of those near."""
     matrix = np.column_stack([np.ones(len(places_m)), places_m])
-    best = None
-    for subset in _subsets(len(places_m), matrix.shape[1]):
-        try:
-            solution = np.linalg.solve(matrix[subset], times_s[subset])
-        except np.linalg.LinAlgError:
-            continue
-        spread = float(np.median(np.abs(times_s - matrix @ solution)))
-        if best is None or spread < best[0]:
-            best = spread, solution
-    solution = np.linalg.lstsq(matrix, times_s, rcond=None)[0] if best is None else best[1]
+    subsets = _subsets(*matrix.shape)
+    corners = matrix[subsets]
+    usable = np.abs(np.linalg.det(corners)) > _SINGULAR * float(np.abs(places_m).max()) ** places_m.shape[1]
+    if usable.any():
+        solutions = np.linalg.solve(corners[usable], times_s[subsets[usable]][..., None])[..., 0]
+        spreads = np.median(np.abs(times_s - np.sum(matrix * solutions[:, None], axis=2)), axis=1)
+        solution = solutions[np.argmin(spreads)]
+    else:
+        solution = np.linalg.lstsq(matrix, times_s, rcond=None)[0]
     for _ in range(2):
         near = np.abs(times_s - matrix @ solution) < MAX_DELAY_S
         if near.sum() > matrix.shape[1]:
@@ -196,7 +197,8 @@ def _robust(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> tupl
     return float(solution[0]), solution[1:]
 
 
-def _subsets(n_mics: int, size: int) -> Iterator[NDArray[np.intp]]:
+@functools.cache
+def _subsets(n_mics: int, size: int) -> NDArray[np.intp]:
+    """Return the microphones of each trial: (trial, size)."""
     rng = np.random.default_rng(n_mics)
-    for _ in range(_TRIALS):
-        yield rng.choice(n_mics, size, replace=False)
+    return np.argsort(rng.random((_TRIALS, n_mics)), axis=1)[:, :size]

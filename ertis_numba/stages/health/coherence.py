@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
@@ -45,10 +46,12 @@ def _halves(found: Compressed, lag_s: float) -> tuple[int, int]:
 
 def aligned(found: Compressed, at_s: NDArray[np.float64], lag_s: float) -> NDArray[np.complex128]:
     """Return the complex baseband of each microphone around its time: (mic, step) complex128."""
-    steps = np.arange(-sum(_halves(found, lag_s)), sum(_halves(found, lag_s)) + 1)
+    half, n_steps = sum(_halves(found, lag_s)), found.envelope.shape[1]
+    steps = np.arange(-half, half + 1)
     turned = found.bins * np.exp(2j * np.pi * found.frequency_hz * (at_s - found.origin_s)[:, None])
-    offset_hz = found.frequency_hz - found.frequency_hz.mean()
-    return np.asarray(turned @ np.exp(2j * np.pi * np.outer(offset_hz, steps * found.step_s)))
+    low_hz, centre_hz = found.frequency_hz[0], found.frequency_hz.mean()
+    signals = scipy.fft.ifft(turned, n_steps, axis=1)[:, steps % n_steps]
+    return np.asarray(signals * np.exp(2j * np.pi * (low_hz - centre_hz) * found.step_s * steps))
 
 
 def mean_of(wide: NDArray[np.complex128], found: Compressed, lag_s: float) -> NDArray[np.complex128]:

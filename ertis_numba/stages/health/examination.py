@@ -33,6 +33,7 @@ from ertis_numba.words import word_format
 __all__ = ["health"]
 
 _HUM_BLOCK_S = 1e-3
+_LOWEST_NOISE_DBFS = -95.0  # in the call's band; rounding to 16 bits has -106
 
 
 def health(measurement: Measurement) -> Health:
@@ -79,11 +80,16 @@ def health(measurement: Measurement) -> Health:
     told, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings)
     found |= {item.channel: item for item in told}
     moved = [(item.channel, columns(item.channel)) for item in moving]
-    findings += duplicates(moved, is_pdm=settings.recording.is_pdm)
+    noisy = [(channel, column) for channel, column in moved if _has_noise(found[channel])]
+    findings += duplicates(moved if settings.recording.is_pdm else noisy, is_pdm=settings.recording.is_pdm)
     findings += repeated_blocks(words, tuple(enabled.tolist())) if moving else []
     if settings.recording.is_pdm:
         findings += stuck_at_times(moved)
-    steady = [(item.channel, columns(item.channel)) for item in moving if not found[item.channel].faults]
+    steady = [
+        (item.channel, columns(item.channel))
+        for item in moving
+        if not {"saturated", "offset"} & {*found[item.channel].faults}
+    ]
     block = round(_HUM_BLOCK_S * settings.recording.sample_rate_hz)
     findings += hum(steady, block=block, full_scale=half_scale)
     if settings.recording.encoding == "int16":
@@ -123,6 +129,11 @@ def health(measurement: Measurement) -> Health:
 
 def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
     return np.asarray(words[:, channel])
+
+
+def _has_noise(item: ChannelHealth) -> bool:
+    """Return whether numbers hold noise of their own; without it a symmetrical array hears some echoes alike."""
+    return item.noise_dbfs is not None and item.noise_dbfs > _LOWEST_NOISE_DBFS
 
 
 def _only(findings: Iterable[Finding], fault: str) -> set[int]:

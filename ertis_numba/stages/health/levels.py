@@ -5,7 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.stages.health.limits import MAX_FLIPPED_DB, MAX_GAIN_DB, MAX_NOISE_DB, MAX_WHITE_DB, MIN_LEVEL_DB
+from ertis_numba.stages.health.limits import (
+    MAX_FLIPPED_DB,
+    MAX_FLIPS_DB,
+    MAX_GAIN_DB,
+    MAX_NOISE_DB,
+    MAX_WHITE_DB,
+    MIN_LEVEL_DB,
+)
 from ertis_numba.stages.health.report import ChannelHealth, Finding
 
 __all__ = ["flip_findings", "gain_findings", "noise_findings"]
@@ -31,7 +38,7 @@ def gain_findings(channels: Sequence[ChannelHealth], level_db: NDArray[np.float6
     return [
         Finding(fault="gain", channels=(item.channel,), measured=float(value), limit=limit_db)
         for item, value in zip(channels, deviation_db, strict=True)
-        if abs(value) > limit_db and value >= MIN_LEVEL_DB
+        if abs(value) > limit_db and value >= MIN_LEVEL_DB and not item.faults
     ]
 
 
@@ -81,5 +88,5 @@ def flip_findings(channels: Sequence[ChannelHealth], floor_db: NDArray[np.float6
     return [
         Finding(fault="flipped bits", channels=(item.channel,), measured=value, limit=MAX_FLIPPED_DB)
         for item, value in zip(channels, floor_db.tolist(), strict=True)
-        if MAX_FLIPPED_DB < value <= MAX_WHITE_DB and not item.faults
+        if MAX_FLIPPED_DB < value <= MAX_FLIPS_DB and not item.faults
     ]

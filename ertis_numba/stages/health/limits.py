@@ -4,6 +4,7 @@ __all__ = [
     "COMMON_SHARE",
     "MAX_DELAY_S",
     "MAX_FLIPPED_DB",
+    "MAX_FLIPS_DB",
     "MAX_GAIN_DB",
     "MAX_HUM",
     "MAX_NOISE_DB",
@@ -52,6 +53,8 @@ MAX_WHITE_DB = -3.0
 """Relative to white bits, whose mean square of 1 spreads evenly up to half of their rate."""
 MAX_FLIPPED_DB = -18.0
 """Relative to white bits; 1 % of flipped bits has -14 dB, a microphone's noise of -30 dBFS has -30."""
+MAX_FLIPS_DB = -8.0
+"""Relative to white bits, above which bits are white rather than flipped: 4 % of flipped bits."""
 MAX_STUCK_SAMPLES = 1024
 """Length of a stretch without a change; a call of 1 kHz that overloads a modulator changes twice as often."""
 MAX_HUM = 0.03
@@ -62,5 +65,5 @@ MAX_DELAY_S = 15e-6
 """Five standard deviations of microphones whose delays spread by 3 µs."""
 MAX_SHIFT_S = 100e-6
 """Between the emission that the direct sound shows and the first sample."""
-MAX_SWAP_DB = 12.0
+MAX_SWAP_DB = 6.0
 """Change from sample to sample of 16-bit numbers, relative to the same with swapped bytes."""

@@ -20,10 +20,12 @@ _WHAT = "polarity, order and delay of channels, and a shift of the record"
 _COMPACT_SHARE = 0.75  # of the microphones that a wavefront must fit
 _PERMUTED_SHARE = 0.9  # of those that it fits in another order
 _MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
+_MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
 _PILOTS = 4  # microphones among which the strongest arrival is looked for
 _SWAP_S = 8e-6
 _LAG_S = 60e-6
 _PRESENT = 0.6  # of the usual amplitude
+_DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
 _COHERENT = 0.85
 _OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
 _MAX_SUSPECTS = 0.25  # of the microphones; where more of them disagree, the arrival is to blame
@@ -58,7 +60,7 @@ def by_wavefront(
         return [], (f"{_WHAT}: no arrival stands out",)
     times_s, middle_s = arrived
     times_s = times_s - layout.delay_s[list(channels)]
-    path_m = max(middle_s, 1e-4) * speed_m_s
+    path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
     curvatures = (0.0, 1 / path_m, 2 / path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
@@ -171,7 +173,8 @@ def _of_channels(
     usual = float(np.median(here.peak[fit.inliers]))
     inverted = (here.opposite >= _COHERENT) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
     moved = ~inverted & (coherence >= _COHERENT) & (here.at_zero < _PRESENT * usual)
-    moved &= np.abs(offset_s) > MAX_DELAY_S
+    limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
+    moved &= np.abs(offset_s) > limit_s
     if np.mean(inverted | moved) > _MAX_SUSPECTS:
         return []
     findings = [
@@ -183,18 +186,22 @@ def _of_channels(
         )
         for mic in np.flatnonzero(inverted)
     ]
-    return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels)
+    return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels, limit_s)
 
 
 def _moved(
-    mics: NDArray[np.intp], offset_s: NDArray[np.float64], fitted_s: NDArray[np.float64], channels: Sequence[int]
+    mics: NDArray[np.intp],
+    offset_s: NDArray[np.float64],
+    fitted_s: NDArray[np.float64],
+    channels: Sequence[int],
+    limit_s: float,
 ) -> list[Finding]:
     """Return pairs whose delays fit each other's place as swapped, and the others as late."""
     findings, left = [], mics.tolist()
     while left:
         mic = left.pop(0)
         measured = Finding(
-            fault="late", channels=(channels[mic],), measured=1e6 * float(offset_s[mic]), limit=1e6 * MAX_DELAY_S
+            fault="late", channels=(channels[mic],), measured=1e6 * float(offset_s[mic]), limit=1e6 * limit_s
         )
         for other in left:
             apart_s = fitted_s[other] - fitted_s[mic]
