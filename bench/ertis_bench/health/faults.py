@@ -206,9 +206,6 @@ def _of_layout(base: Base, rng: np.random.Generator) -> _Injected:
     """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or the other way round."""
     names = ("eRTIS_v2", "eRTIS_v3D1")
     own = base.sensor.array.layout
-    if own not in names:
-        rows = base.measurement.words
-        return _ordered(lambda _: np.arange(32)[::-1])(replace(base, measurement=base.measurement), rng)[0], ()
     other = names[1 - names.index(own)]
     mine, theirs = load_layout(own).positions_m, load_layout(other).positions_m
     source = np.argmin(np.linalg.norm(theirs[:, None] - mine[None], axis=2), axis=1)

@@ -168,7 +168,7 @@ def healthy(seed: int) -> tuple[str, Measurement]:
 def base(scene: str, seed: int, *, is_pdm: bool) -> Base:
     """Return a healthy recording of an array of 32 microphones that spans a plane: of an echo, or the direct sound."""
     rng = np.random.default_rng((seed, 2))
-    names = ("eRTIS_v2", "eRTIS_v3D1", "xRTIS_v1")
+    names = ("eRTIS_v2", "eRTIS_v3D1")
     what: dict[str, Any] = {}
     if scene == "one echo":
         azimuth_deg, elevation_deg = rng.choice([-1, 1], 2) * rng.uniform((25, 20), (55, 40))

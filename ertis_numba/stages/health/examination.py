@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,8 @@ from ertis_numba.stages.health.limits import (
     MAX_OFFSET,
     MAX_SAMPLES,
     MAX_SATURATED,
+    MAX_STUCK_NUMBERS,
+    MAX_STUCK_SAMPLES,
     MAX_TONE_DB,
     MIN_CHANGES,
     MIN_LEVEL_DB,
@@ -33,6 +35,7 @@ from ertis_numba.words import word_format
 __all__ = ["health"]
 
 _HUM_BLOCK_S = 1e-3
+_DEAF = {"dead", "saturated", "white bits", "duplicate", "stuck at times"}  # which hide what arrives
 _LOWEST_NOISE_DBFS = -95.0  # in the call's band; rounding to 16 bits has -106
 
 
@@ -84,7 +87,9 @@ def health(measurement: Measurement) -> Health:
     findings += duplicates(moved if settings.recording.is_pdm else noisy, is_pdm=settings.recording.is_pdm)
     findings += repeated_blocks(words, tuple(enabled.tolist())) if moving else []
     if settings.recording.is_pdm:
-        findings += stuck_at_times(moved)
+        findings += stuck_at_times(moved, most=MAX_STUCK_SAMPLES)
+    else:
+        findings += stuck_at_times(noisy, most=MAX_STUCK_NUMBERS)
     steady = [
         (item.channel, columns(item.channel))
         for item in moving
@@ -94,10 +99,8 @@ def health(measurement: Measurement) -> Health:
     findings += hum(steady, block=block, full_scale=half_scale)
     if settings.recording.encoding == "int16":
         findings += swapped_bytes(words, tuple(enabled.tolist()))
-    faulty = {channel for finding in findings for channel in finding.channels}
-    sound = [item.channel for item in told if not item.faults and item.channel not in faulty]
-    heard = [item.channel for item in told if not set(item.faults) & {"dead", "saturated"}]
-    heard = [channel for channel in heard if channel in sound or channel in _only(findings, "gain")]
+    deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
+    heard = [item.channel for item in told if not set(item.faults) & _DEAF and item.channel not in deaf]
     not_observable: tuple[str, ...] = ()
     if heard and not any("resolve" in text for text in unknown):
         shown, not_observable = by_wavefront(signal_of, heard, settings, n_samples=len(words))
@@ -134,12 +137,6 @@ def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
 def _has_noise(item: ChannelHealth) -> bool:
     """Return whether numbers hold noise of their own; without it a symmetrical array hears some echoes alike."""
     return item.noise_dbfs is not None and item.noise_dbfs > _LOWEST_NOISE_DBFS
-
-
-def _only(findings: Iterable[Finding], fault: str) -> set[int]:
-    """Return the channels of which a fault is the only finding."""
-    others = {channel for finding in findings if finding.fault != fault for channel in finding.channels}
-    return {channel for finding in findings if finding.fault == fault for channel in finding.channels} - others
 
 
 def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:

@@ -30,15 +30,23 @@ def _limit(values_db: NDArray[np.float64], least_db: float) -> tuple[NDArray[np.
     return deviation_db, max(least_db, _DEVIATIONS * _NORMAL * float(np.median(np.abs(deviation_db))))
 
 
-def gain_findings(channels: Sequence[ChannelHealth], level_db: NDArray[np.float64]) -> list[Finding]:
-    """Return the channels whose sound is too loud or too quiet, but which are not dead."""
-    if len(channels) < _MIN_CHANNELS:
+def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> list[Finding]:
+    """Return the channels in which one arrival is too loud or too quiet.
+
+    Parameters
+    ----------
+    channels : sequence of int
+    level_db : (channel,) float64
+        Of the arrival; NaN where its waveform is not that of the other channels.
+    """
+    known = np.isfinite(level_db)
+    if known.sum() < _MIN_CHANNELS:
         return []
-    deviation_db, limit_db = _limit(level_db, MAX_GAIN_DB)
+    deviation_db, limit_db = _limit(level_db[known], MAX_GAIN_DB)
     return [
-        Finding(fault="gain", channels=(item.channel,), measured=float(value), limit=limit_db)
-        for item, value in zip(channels, deviation_db, strict=True)
-        if abs(value) > limit_db and value >= MIN_LEVEL_DB and not item.faults
+        Finding(fault="gain", channels=(channel,), measured=float(value), limit=limit_db)
+        for channel, value in zip(np.asarray(channels)[known].tolist(), deviation_db, strict=True)
+        if abs(value) > limit_db
     ]
 
 

@@ -12,6 +12,7 @@ __all__ = [
     "MAX_SAMPLES",
     "MAX_SATURATED",
     "MAX_SHIFT_S",
+    "MAX_STUCK_NUMBERS",
     "MAX_STUCK_SAMPLES",
     "MAX_SWAP_DB",
     "MAX_TONE_DB",
@@ -57,6 +58,8 @@ MAX_FLIPS_DB = -8.0
 """Relative to white bits, above which bits are white rather than flipped: 4 % of flipped bits."""
 MAX_STUCK_SAMPLES = 1024
 """Length of a stretch without a change; a call of 1 kHz that overloads a modulator changes twice as often."""
+MAX_STUCK_NUMBERS = 64
+"""The same of PCM, whose noise of two steps repeats a number in one sample of five."""
 MAX_HUM = 0.03
 """Root mean square below the audible band, full scale 1. A real sensor has 0.0005."""
 MIN_REPEATED_SAMPLES = 512

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.stages.health.limits import MAX_HUM, MAX_STUCK_SAMPLES, MIN_REPEATED_SAMPLES
+from ertis_numba.stages.health.limits import MAX_HUM, MIN_REPEATED_SAMPLES
 from ertis_numba.stages.health.report import Finding
 
 __all__ = ["duplicates", "hum", "repeated_blocks", "stuck_at_times"]
@@ -46,9 +46,7 @@ def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> 
     ]
 
 
-def stuck_at_times(
-    columns: Sequence[tuple[int, NDArray[Any]]],
-) -> list[Finding]:
+def stuck_at_times(columns: Sequence[tuple[int, NDArray[Any]]], *, most: int) -> list[Finding]:
     """Return the channels that do not change over a long stretch, though they do elsewhere."""
     found = []
     for channel, column in columns:
@@ -56,11 +54,9 @@ def stuck_at_times(
         if not len(changes):
             continue
         longest = max(int(np.diff(changes).max(initial=0)), int(changes[0]) + 1, len(column) - 1 - int(changes[-1]))
-        if longest > MAX_STUCK_SAMPLES:
+        if longest > most:
             found.append(
-                Finding(
-                    fault="stuck at times", channels=(channel,), measured=float(longest), limit=float(MAX_STUCK_SAMPLES)
-                )
+                Finding(fault="stuck at times", channels=(channel,), measured=float(longest), limit=float(most))
             )
     return found
 

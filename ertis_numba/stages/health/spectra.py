@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages import _bits
-from ertis_numba.stages.health.levels import flip_findings, gain_findings, noise_findings
+from ertis_numba.stages.health.levels import flip_findings, noise_findings
 from ertis_numba.stages.health.limits import COMMON_SHARE, MAX_TONE_DB, MIN_LEVEL_DB, MIN_RISE_DB
 from ertis_numba.stages.health.report import ChannelHealth, Finding
 
@@ -23,6 +23,7 @@ _FIRST_LINE = 3  # a Hann window leaks an offset into the lines before
 _LOWEST_HZ = 20.0  # that can be heard
 _LEAST_SOUND = 1e-3  # of the power; less is the chance of the noise
 _FLOOR_QUANTILE = 0.2
+_TONE_MARGIN_DB = 3.0
 
 
 def by_spectra(
@@ -66,7 +67,9 @@ def by_spectra(
     first = max(_FIRST_LINE, math.ceil(_LOWEST_HZ / line_hz))
     # In the mean of decibels a tone, which is always there, outdoes echoes, which come and go.
     rise_db = _bits.rises(np.stack([_bits.decibels(lines[:, first:]).mean(axis=0) for lines in spectra]))
-    is_common, common = _bits.common_lines(rise_db, MAX_TONE_DB, COMMON_SHARE)
+    # A tone at the limit is beyond it in some channels only, and is common nevertheless.
+    is_common, _ = _bits.common_lines(rise_db, MAX_TONE_DB - _TONE_MARGIN_DB, COMMON_SHARE)
+    _, common = _bits.common_lines(rise_db, MAX_TONE_DB, COMMON_SHARE)
     rise_db[:, is_common] = 0.0
     highest = np.argmax(rise_db, axis=1)
     told = [
@@ -82,7 +85,6 @@ def by_spectra(
         )
         for mic, item in enumerate(found)
     ]
-    findings = [] if unknown else gain_findings(told, level_db)
-    findings += noise_findings(told, quiet_db, white_db=white_db if settings.recording.is_pdm else None)
+    findings = noise_findings(told, quiet_db, white_db=white_db if settings.recording.is_pdm else None)
     findings += flip_findings(told, floor_db) if settings.recording.is_pdm else []
     return told, tuple(float((first + line) * line_hz) for line in common), unknown, findings

@@ -11,6 +11,7 @@ from ertis_numba.geometry import Layout, layout_names, load_layout, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.stages.health.coherence import aligned, correlate, mean_of
+from ertis_numba.stages.health.levels import gain_findings
 from ertis_numba.stages.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.stages.health.report import Finding
 
@@ -21,7 +22,9 @@ _COMPACT_SHARE = 0.75  # of the microphones that a wavefront must fit
 _PERMUTED_SHARE = 0.9  # of those that it fits in another order
 _MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
 _MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
+_MIN_DEPTH_M = 0.01  # of the distances from the emitter; on a ring its sound is that of an echo from ahead
 _PILOTS = 4  # microphones among which the strongest arrival is looked for
+_MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
 _SWAP_S = 8e-6
 _LAG_S = 60e-6
 _PRESENT = 0.6  # of the usual amplitude
@@ -66,7 +69,12 @@ def by_wavefront(
     if echo is None:
         return [], (f"{_WHAT}: {len(channels)} microphones are too few for a wavefront",)
     direct = fit_emitter(times_s, positions_m, speed_m_s)
-    is_direct = direct.share >= max(_COMPACT_SHARE, echo.share) and direct.spread_s < 0.5 * echo.spread_s
+    from_centre_m = np.linalg.norm(positions_m, axis=1)
+    is_direct = (
+        direct.share >= max(_COMPACT_SHARE, echo.share)
+        and direct.spread_s < 0.5 * echo.spread_s
+        and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
+    )
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s)
@@ -171,13 +179,19 @@ def _of_channels(
     offset_s = np.where(beyond, times_s - fitted_s + own.lag_s, here.lag_s)
     coherence = np.maximum(here.coherence, own.coherence)
     usual = float(np.median(here.peak[fit.inliers]))
+    strength = np.maximum(np.maximum(here.peak, own.peak), here.negative)
+    is_same = np.maximum(coherence, here.opposite) >= _COHERENT
+    findings = gain_findings(channels, np.where(is_same, 20 * np.log10(strength), np.nan))
+    if fit.spread_s > _MAX_SPREAD_S:
+        return findings
     inverted = (here.opposite >= _COHERENT) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
+    inverted &= np.abs(times_s - fitted_s) < _SWAP_S  # an echo that is late by half a period is none
     moved = ~inverted & (coherence >= _COHERENT) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
     moved &= np.abs(offset_s) > limit_s
     if np.mean(inverted | moved) > _MAX_SUSPECTS:
-        return []
-    findings = [
+        return findings
+    findings += [
         Finding(
             fault="inverted polarity",
             channels=(channels[mic],),
@@ -203,10 +217,10 @@ def _moved(
         measured = Finding(
             fault="late", channels=(channels[mic],), measured=1e6 * float(offset_s[mic]), limit=1e6 * limit_s
         )
-        for other in left:
+        for other in np.flatnonzero(np.abs(offset_s) > limit_s).tolist():
             apart_s = fitted_s[other] - fitted_s[mic]
             if abs(offset_s[mic] - apart_s) < _SWAP_S and abs(offset_s[other] + apart_s) < _SWAP_S:
-                left.remove(other)
+                left = [rest for rest in left if rest != other]
                 pair = ((mic, other), (other, mic))
                 findings += [
                     replace(
