@@ -158,6 +158,11 @@ def _health(report: "Health") -> dict[str, Any]:
         "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
         "tones_hz": [round(tone_hz, 1) for tone_hz in report.tones_hz],
         "unknown": report.unknown,
+        "not_observable": report.not_observable,
+        "findings": [
+            {**asdict(item), "measured": _rounded(item.measured, 3), "unit": item.unit, "remedy": item.remedy}
+            for item in report.findings
+        ],
         "channels": [
             {**asdict(item), "state": item.state}
             | {name: _rounded(getattr(item, name), digits) for name, (digits, _) in _COLUMNS.items()}
@@ -176,6 +181,14 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
         yield f"cannot tell    {text}"
+    for text in section["not_observable"]:
+        yield f"not observable {text}"
+    for item in section["findings"]:
+        channels = "record" if len(item["channels"]) != 1 else f"channel {item['channels'][0]}"
+        figures = f"{item['measured']:g} {item['unit']}".strip()
+        limit = f"limit {item['limit']:.3g} {item['unit']}".strip()
+        detail = f"; {item['detail']}" if item["detail"] else ""
+        yield f"fault          {channels}: {item['fault']}, {figures} ({limit}){detail}; {item['remedy']}"
 
 
 def _microphones(section: dict[str, Any]) -> _tables.Table:

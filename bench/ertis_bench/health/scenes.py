@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import layout_names, microphones
 from ertis_numba.settings import Array, Call, Recording
@@ -36,11 +37,20 @@ class Base:
     signals : (mic, sample) float64
         Before converters and modulators, without their noise.
     sensor : Sensor
+    scene : Scene
     """
 
     measurement: Measurement
     signals: NDArray[np.float64]
     sensor: Sensor
+    scene: Scene
+
+    def echo_s(self) -> NDArray[np.float64]:
+        """Return the delay of the echo at each microphone, from that at the centre: (mic,) float64."""
+        point = self.scene.points[0]
+        azimuth, elevation = math.radians(point.azimuth_deg or 0.0), math.radians(point.elevation_deg or 0.0)
+        unit = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
+        return np.asarray(-microphones(self.sensor.array).positions_m @ unit / sound_speed_m_s(self.sensor.air))
 
 
 def _array(rng: np.random.Generator, n_mics: int) -> Array:
@@ -72,7 +82,7 @@ def _point(rng: np.random.Generator, level_dbfs: float) -> Point:
     )
 
 
-def _nothing(rng: np.random.Generator) -> dict[str, Any]:
+def _nothing(_: np.random.Generator) -> dict[str, Any]:
     return {}
 
 
@@ -184,4 +194,4 @@ def base(scene: str, seed: int, *, is_pdm: bool) -> Base:
     recording = _PDM if is_pdm else _PCM
     array = Array(layout=names[int(rng.integers(len(names)))])
     simulator = Simulator(_scene(seed, array, recording, Call(), electronics, what))
-    return Base(simulator.render(), simulator.signals(), simulator.sensor)
+    return Base(simulator.render(), simulator.signals(), simulator.sensor, simulator.scene)

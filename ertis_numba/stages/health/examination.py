@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
 from ertis_numba.stages import _bits
 from ertis_numba.stages.health.bits import by_bits
 from ertis_numba.stages.health.kinds import kind_of
@@ -83,22 +84,7 @@ def health(measurement: Measurement) -> Health:
     told, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings)
     found |= {item.channel: item for item in told}
     moved = [(item.channel, columns(item.channel)) for item in moving]
-    noisy = [(channel, column) for channel, column in moved if _has_noise(found[channel])]
-    findings += duplicates(moved if settings.recording.is_pdm else noisy, is_pdm=settings.recording.is_pdm)
-    findings += repeated_blocks(words, tuple(enabled.tolist())) if moving else []
-    if settings.recording.is_pdm:
-        findings += stuck_at_times(moved, most=MAX_STUCK_SAMPLES)
-    else:
-        findings += stuck_at_times(noisy, most=MAX_STUCK_NUMBERS)
-    steady = [
-        (item.channel, columns(item.channel))
-        for item in moving
-        if not {"saturated", "offset"} & {*found[item.channel].faults}
-    ]
-    block = round(_HUM_BLOCK_S * settings.recording.sample_rate_hz)
-    findings += hum(steady, block=block, full_scale=half_scale)
-    if settings.recording.encoding == "int16":
-        findings += swapped_bytes(words, tuple(enabled.tolist()))
+    findings += _by_words(words, moved, found, settings, half_scale)
     deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
     heard = [item.channel for item in told if not set(item.faults) & _DEAF and item.channel not in deaf]
     not_observable: tuple[str, ...] = ()
@@ -106,11 +92,7 @@ def health(measurement: Measurement) -> Health:
         shown, not_observable = by_wavefront(signal_of, heard, settings, n_samples=len(words))
         findings += shown
     findings = [*_of_channels(found.values()), *findings]
-    for finding in findings:
-        for channel in () if kind_of(finding.fault).of_record else finding.channels:
-            if finding.fault not in found[channel].faults:
-                found[channel] = replace(found[channel], faults=(*found[channel].faults, finding.fault))
-    channels = tuple(found.values())
+    channels = _with_faults(found, findings)
     fine = [item for item in channels if not item.faults and item.noise_dbfs is not None]
     noise = [10 ** (item.noise_dbfs / 10) for item in fine if item.noise_dbfs is not None]
     report = Health(
@@ -128,6 +110,40 @@ def health(measurement: Measurement) -> Health:
     gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
     dynamic_range_db = 10 * math.log10(gain / 2) - noise_dbfs
     return replace(report, noise_dbfs=noise_dbfs, dynamic_range_db=dynamic_range_db)
+
+
+def _by_words(
+    words: NDArray[Any],
+    moved: list[tuple[int, NDArray[Any]]],
+    found: dict[int, ChannelHealth],
+    settings: Settings,
+    half_scale: float,
+) -> list[Finding]:
+    """Return what the words themselves show, without a spectrum."""
+    recording, enabled = settings.recording, tuple(found)
+    noisy = [(channel, column) for channel, column in moved if _has_noise(found[channel])]
+    findings = duplicates(moved if recording.is_pdm else noisy, is_pdm=recording.is_pdm)
+    findings += repeated_blocks(words, enabled) if moved else []
+    if recording.is_pdm:
+        findings += stuck_at_times(moved, most=MAX_STUCK_SAMPLES)
+    else:
+        findings += stuck_at_times(noisy, most=MAX_STUCK_NUMBERS)
+    steady = [(channel, column) for channel, column in moved if not {"saturated", "offset"} & {*found[channel].faults}]
+    block = round(_HUM_BLOCK_S * recording.sample_rate_hz)
+    findings += hum(steady, block=block, full_scale=half_scale)
+    if recording.encoding == "int16":
+        findings += swapped_bytes(words, enabled)
+    return findings
+
+
+def _with_faults(found: dict[int, ChannelHealth], findings: Iterable[Finding]) -> tuple[ChannelHealth, ...]:
+    """Return the channels with the names of their findings."""
+    named = dict(found)
+    for finding in findings:
+        for channel in () if kind_of(finding.fault).of_record else finding.channels:
+            if finding.fault not in named[channel].faults:
+                named[channel] = replace(named[channel], faults=(*named[channel].faults, finding.fault))
+    return tuple(named.values())
 
 
 def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 __all__ = ["KINDS", "Kind", "kind_of"]
 
 _DISABLE = "put them under 'disabled' in a layout file for --settings"
-_CABLE = "check its cable and supply"
 _LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
 
 
@@ -32,7 +31,7 @@ KINDS = {
     "stuck at": Kind(),
     "stuck in a pattern": Kind(),
     "stuck at times": Kind(unit="samples", remedy="check the contact of their cable, or disable them in a layout file"),
-    "saturated": Kind(remedy="lower the level of the emitter, or disable them in a layout file"),
+    "saturated": Kind(),
     "offset": Kind(),
     "low-frequency hum": Kind(remedy="check their supply and ground, or disable them in a layout file"),
     "idle tone": Kind(unit="dB"),
@@ -58,7 +57,3 @@ KINDS = {
 def kind_of(fault: str) -> Kind:
     """Return the kind of a fault by its name as reports have it."""
     return KINDS.get(fault) or KINDS[next(name for name in KINDS if fault.startswith(name))]
-
-
-CABLE_REMEDY = _CABLE
-"""Remedy where every channel is faulty."""

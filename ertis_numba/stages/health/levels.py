@@ -11,7 +11,6 @@ from ertis_numba.stages.health.limits import (
     MAX_GAIN_DB,
     MAX_NOISE_DB,
     MAX_WHITE_DB,
-    MIN_LEVEL_DB,
 )
 from ertis_numba.stages.health.report import ChannelHealth, Finding
 
@@ -22,6 +21,7 @@ _DEVIATIONS = 5.0  # of the array's own spread
 _NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
 _LOWEST_NOISE_DB = -100.0  # in the call's band; below it lie rounding and the ends of echoes
 _MAX_LEVEL_DB = 20.0
+_LIMIT_CYCLE_DB = -120.0  # of PDM: overloaded modulators that repeat themselves have no noise to compare
 
 
 def _limit(values_db: NDArray[np.float64], least_db: float) -> tuple[NDArray[np.float64], float]:
@@ -63,7 +63,7 @@ def noise_findings(
     white_db : float or None
         Level of white bits in that band; None of PCM.
     """
-    if len(channels) < 2:
+    if len(channels) < 2 or (white_db is not None and np.median(quiet_db) < _LIMIT_CYCLE_DB):
         return []
     usual_db = np.maximum(quiet_db, _LOWEST_NOISE_DB)
     deviation_db, limit_db = _limit(usual_db, MAX_NOISE_DB)

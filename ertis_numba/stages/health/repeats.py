@@ -107,16 +107,16 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
             block = single[first : first + int(length[longest])]
             if np.mean(block[1:] != block[:-1]) > _MIN_CHANGING:
                 best = int(length[longest]), first, distance
-    length, first, distance = best
-    if length < MIN_REPEATED_SAMPLES:
+    longest_block, first, distance = best
+    if longest_block < MIN_REPEATED_SAMPLES:
         return []
     return [
         Finding(
             fault="repeated blocks",
             channels=channels,
-            measured=float(length),
+            measured=float(longest_block),
             limit=float(MIN_REPEATED_SAMPLES),
-            detail=f"samples {first}-{first + length - 1} come again {distance} samples later",
+            detail=f"samples {first}-{first + longest_block - 1} come again {distance} samples later",
         )
     ]
 

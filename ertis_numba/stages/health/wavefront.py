@@ -23,8 +23,10 @@ _PERMUTED_SHARE = 0.9  # of those that it fits in another order
 _MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
 _MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
 _MIN_DEPTH_M = 0.01  # of the distances from the emitter; on a ring its sound is that of an echo from ahead
+_DIRECT_SPREAD = 0.75  # relative to that of an echo, which has two more unknowns
 _PILOTS = 4  # microphones among which the strongest arrival is looked for
 _MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
+_HALF_PERIOD_S = 12e-6  # of the highest usual carrier
 _SWAP_S = 8e-6
 _LAG_S = 60e-6
 _PRESENT = 0.6  # of the usual amplitude
@@ -72,7 +74,7 @@ def by_wavefront(
     from_centre_m = np.linalg.norm(positions_m, axis=1)
     is_direct = (
         direct.share >= max(_COMPACT_SHARE, echo.share)
-        and direct.spread_s < 0.5 * echo.spread_s
+        and direct.spread_s < _DIRECT_SPREAD * echo.spread_s
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
     fit = direct if is_direct else echo
@@ -185,7 +187,7 @@ def _of_channels(
     if fit.spread_s > _MAX_SPREAD_S:
         return findings
     inverted = (here.opposite >= _COHERENT) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
-    inverted &= np.abs(times_s - fitted_s) < _SWAP_S  # an echo that is late by half a period is none
+    inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # an echo that is late by half a period is none
     moved = ~inverted & (coherence >= _COHERENT) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
     moved &= np.abs(offset_s) > limit_s
@@ -194,7 +196,7 @@ def _of_channels(
     findings += [
         Finding(
             fault="inverted polarity",
-            channels=(channels[mic],),
+            channels=(channels[int(mic)],),
             measured=-float(here.opposite[mic]),
             limit=-_COHERENT,
         )
