@@ -16,6 +16,7 @@ __all__ = ["Compressed", "Fit", "compress", "fit_delays", "fit_emitter", "strong
 
 _OVERSAMPLING = 8  # of the envelope
 _PROMINENCE = 6.0  # of the arrival's amplitude, relative to the median over time
+_FLAT = 0.99
 _TRIALS = 80  # subsets of microphones; half of them may be wrong
 _SINGULAR = 1e-2  # volume of a subset of microphones, relative to the cube of the array
 _DEGENERATE_M = 1e-3  # extent below which an axis of the array has no say
@@ -109,7 +110,10 @@ def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], f
     width = max(1, int(np.ceil(width_s / found.step_s))) + 2
     widened = _highest_around(found.envelope, width)
     common = np.median(widened, axis=0)
-    middle = int(np.argmax(common))
+    highest = int(np.argmax(common))
+    # The median of maxima is flat around the arrival, whose middle is that of the plateau.
+    lower = np.flatnonzero(common[highest:] < _FLAT * common[highest])
+    middle = highest + (int(lower[0]) if len(lower) else len(common) - highest) // 2
     if common[middle] < _PROMINENCE * np.median(common):
         return None
     first, last = max(0, middle - width), min(found.envelope.shape[1], middle + width + 1)

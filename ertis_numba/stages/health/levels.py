@@ -14,14 +14,20 @@ from ertis_numba.stages.health.limits import (
 )
 from ertis_numba.stages.health.report import ChannelHealth, Finding
 
-__all__ = ["flip_findings", "gain_findings", "noise_findings"]
+__all__ = ["flip_findings", "gain_findings", "in_limit_cycles", "noise_findings"]
 
 _MIN_CHANNELS = 5  # of which a median and a spread can be had
 _DEVIATIONS = 5.0  # of the array's own spread
 _NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
 _LOWEST_NOISE_DB = -100.0  # in the call's band; below it lie rounding and the ends of echoes
 _MAX_LEVEL_DB = 20.0
-_LIMIT_CYCLE_DB = -120.0  # of PDM: overloaded modulators that repeat themselves have no noise to compare
+_LIMIT_CYCLE_DB = -120.0  # of PDM, in the call's band: far below the noise of any modulator
+_SHARE_OF_LIMIT_CYCLES = 0.1
+
+
+def in_limit_cycles(quiet_db: NDArray[np.float64]) -> bool:
+    """Return whether so many modulators of PDM repeat themselves without noise that channels cannot be compared."""
+    return float(np.mean(quiet_db < _LIMIT_CYCLE_DB)) > _SHARE_OF_LIMIT_CYCLES
 
 
 def _limit(values_db: NDArray[np.float64], least_db: float) -> tuple[NDArray[np.float64], float]:
@@ -63,7 +69,7 @@ def noise_findings(
     white_db : float or None
         Level of white bits in that band; None of PCM.
     """
-    if len(channels) < 2 or (white_db is not None and np.median(quiet_db) < _LIMIT_CYCLE_DB):
+    if len(channels) < 2 or (white_db is not None and in_limit_cycles(quiet_db)):
         return []
     usual_db = np.maximum(quiet_db, _LOWEST_NOISE_DB)
     deviation_db, limit_db = _limit(usual_db, MAX_NOISE_DB)

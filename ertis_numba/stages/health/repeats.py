@@ -11,6 +11,7 @@ from ertis_numba.stages.health.report import Finding
 
 __all__ = ["duplicates", "hum", "repeated_blocks", "stuck_at_times"]
 
+_MIN_CHANNELS = 4
 _ANCHOR_EVERY = 64  # samples, in the mean
 _MIX = np.uint64(0x9E3779B97F4A7C15)  # the golden ratio in 64 bits, as in SplitMix64
 _SHARE_OF_TWINS = 0.25  # of PCM; a symmetrical array hears some echoes alike, if nothing has noise
@@ -73,7 +74,8 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
     channels : tuple of int
     """
     n_samples = len(words)
-    if n_samples < 2 * MIN_REPEATED_SAMPLES:
+    # The modulators of a few microphones repeat themselves now and then.
+    if n_samples < 2 * MIN_REPEATED_SAMPLES or len(channels) < _MIN_CHANNELS:
         return []
     octets = np.ascontiguousarray(words).view(np.uint8)
     padded = np.zeros((n_samples, -(-octets.shape[1] // 8) * 8), np.uint8)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages import _bits
-from ertis_numba.stages.health.levels import flip_findings, noise_findings
+from ertis_numba.stages.health.levels import flip_findings, in_limit_cycles, noise_findings
 from ertis_numba.stages.health.limits import COMMON_SHARE, MAX_TONE_DB, MIN_LEVEL_DB, MIN_RISE_DB
 from ertis_numba.stages.health.report import ChannelHealth, Finding
 
@@ -63,6 +63,9 @@ def by_spectra(
         unknown = ("a dead microphone: there is no other to compare it with",)
     elif np.median(_bits.decibels(loud) - noise_db) < MIN_RISE_DB:
         unknown = ("dead microphones: no sound stands out of the noise",)
+
+    elif settings.recording.is_pdm and in_limit_cycles(quiet_db):
+        unknown = ("dead microphones: modulators repeat themselves without noise",)
 
     first = max(_FIRST_LINE, math.ceil(_LOWEST_HZ / line_hz))
     # In the mean of decibels a tone, which is always there, outdoes echoes, which come and go.

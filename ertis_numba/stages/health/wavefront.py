@@ -32,6 +32,7 @@ _LAG_S = 60e-6
 _PRESENT = 0.6  # of the usual amplitude
 _DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
 _COHERENT = 0.85
+_INVERTED = 0.97
 _OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
 _MAX_SUSPECTS = 0.25  # of the microphones; where more of them disagree, the arrival is to blame
 
@@ -186,7 +187,7 @@ def _of_channels(
     findings = gain_findings(channels, np.where(is_same, 20 * np.log10(strength), np.nan))
     if fit.spread_s > _MAX_SPREAD_S:
         return findings
-    inverted = (here.opposite >= _COHERENT) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
+    inverted = (here.opposite >= _INVERTED) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
     inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # an echo that is late by half a period is none
     moved = ~inverted & (coherence >= _COHERENT) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
@@ -198,7 +199,7 @@ def _of_channels(
             fault="inverted polarity",
             channels=(channels[int(mic)],),
             measured=-float(here.opposite[mic]),
-            limit=-_COHERENT,
+            limit=-_INVERTED,
         )
         for mic in np.flatnonzero(inverted)
     ]
