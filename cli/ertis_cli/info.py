@@ -148,6 +148,8 @@ def _tell_health(path: Path, *, as_json: bool) -> None:
         for line in _health_lines(section):
             click.echo(line)
         _microphones(section).print()
+        for line in _finding_lines(section):
+            click.echo(line)
 
 
 def _health(report: "Health") -> dict[str, Any]:
@@ -181,6 +183,10 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
         yield f"cannot tell    {text}"
+
+
+def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
+    """Yield each finding with its figures and remedy, and the faults that the scene does not show."""
     for text in section["not_observable"]:
         yield f"not observable {text}"
     for item in section["findings"]:
