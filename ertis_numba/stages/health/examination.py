@@ -2,6 +2,7 @@
 
 import functools
 import math
+import statistics
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Any
@@ -121,13 +122,10 @@ def _by_words(
 ) -> list[Finding]:
     """Return what the words themselves show, without a spectrum."""
     recording, enabled = settings.recording, tuple(found)
-    noisy = [(channel, column) for channel, column in moved if _has_noise(found[channel])]
-    findings = duplicates(moved if recording.is_pdm else noisy, is_pdm=recording.is_pdm)
+    comparable = moved if recording.is_pdm or _have_noise(found.values()) else []
+    findings = duplicates(comparable, is_pdm=recording.is_pdm)
     findings += repeated_blocks(words, enabled) if moved else []
-    if recording.is_pdm:
-        findings += stuck_at_times(moved, most=MAX_STUCK_SAMPLES)
-    else:
-        findings += stuck_at_times(noisy, most=MAX_STUCK_NUMBERS)
+    findings += stuck_at_times(comparable, most=MAX_STUCK_SAMPLES if recording.is_pdm else MAX_STUCK_NUMBERS)
     steady = [(channel, column) for channel, column in moved if not {"saturated", "offset"} & {*found[channel].faults}]
     block = round(_HUM_BLOCK_S * recording.sample_rate_hz)
     findings += hum(steady, block=block, full_scale=half_scale)
@@ -150,9 +148,10 @@ def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
     return np.asarray(words[:, channel])
 
 
-def _has_noise(item: ChannelHealth) -> bool:
-    """Return whether numbers hold noise of their own; without it a symmetrical array hears some echoes alike."""
-    return item.noise_dbfs is not None and item.noise_dbfs > _LOWEST_NOISE_DBFS
+def _have_noise(channels: Iterable[ChannelHealth]) -> bool:
+    """Return whether numbers hold noise; without it a symmetrical array hears some echoes alike."""
+    levels = [item.noise_dbfs for item in channels if item.noise_dbfs is not None]
+    return bool(levels) and statistics.median(levels) > _LOWEST_NOISE_DBFS
 
 
 def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:

@@ -29,9 +29,10 @@ _MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
 _HALF_PERIOD_S = 12e-6  # of the highest usual carrier
 _SWAP_S = 8e-6
 _LAG_S = 60e-6
-_PRESENT = 0.6  # of the usual amplitude
+_PRESENT = 0.85  # of the usual amplitude
 _DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
 _COHERENT = 0.85
+_SAME = 0.95  # coherence of a channel whose delay or level is compared
 _INVERTED = 0.97
 _OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
 _MAX_SUSPECTS = 0.25  # of the microphones; where more of them disagree, the arrival is to blame
@@ -183,13 +184,13 @@ def _of_channels(
     coherence = np.maximum(here.coherence, own.coherence)
     usual = float(np.median(here.peak[fit.inliers]))
     strength = np.maximum(np.maximum(here.peak, own.peak), here.negative)
-    is_same = np.maximum(coherence, here.opposite) >= _COHERENT
+    is_same = np.maximum(coherence, here.opposite) >= _SAME
     findings = gain_findings(channels, np.where(is_same, 20 * np.log10(strength), np.nan))
     if fit.spread_s > _MAX_SPREAD_S:
         return findings
     inverted = (here.opposite >= _INVERTED) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
     inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # an echo that is late by half a period is none
-    moved = ~inverted & (coherence >= _COHERENT) & (here.at_zero < _PRESENT * usual)
+    moved = ~inverted & (coherence >= _SAME) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
     moved &= np.abs(offset_s) > limit_s
     if np.mean(inverted | moved) > _MAX_SUSPECTS:
