@@ -32,6 +32,7 @@ _LAG_S = 60e-6
 _PRESENT = 0.85  # of the usual amplitude
 _DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
 _COHERENT = 0.85
+_COMPACT_COHERENCE = 0.97  # of the median channel; a single echo has 0.995
 _SAME = 0.95  # coherence of a channel whose delay or level is compared
 _INVERTED = 0.97
 _OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
@@ -79,6 +80,8 @@ def by_wavefront(
         and direct.spread_s < _DIRECT_SPREAD * echo.spread_s
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
+    if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
+        return [], (f"{_WHAT}: the strongest arrival is too near for a wavefront",)
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s)
@@ -179,6 +182,8 @@ def _of_channels(
         return []
     # Where the lag may be beyond the gate, the channel is aligned by its own peak.
     own = correlate(aligned(found, times_s + delay_s, _LAG_S) / gain[:, None], reference, found, _LAG_S)
+    if np.median(own.coherence) < _COMPACT_COHERENCE:
+        return []
     beyond = (here.coherence < _COHERENT) & (own.coherence >= _COHERENT)
     offset_s = np.where(beyond, times_s - fitted_s + own.lag_s, here.lag_s)
     coherence = np.maximum(here.coherence, own.coherence)
