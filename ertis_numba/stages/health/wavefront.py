@@ -24,6 +24,7 @@ _MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
 _MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
 _MIN_DEPTH_M = 0.01  # of the distances from the emitter; on a ring its sound is that of an echo from ahead
 _DIRECT_SPREAD = 0.75  # relative to that of an echo, which has two more unknowns
+_MIN_RECORD_CHANNELS = 12  # fewer fit another order or the emitter by chance
 _PILOTS = 4  # microphones among which the strongest arrival is looked for
 _MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
 _HALF_PERIOD_S = 12e-6  # of the highest usual carrier
@@ -84,10 +85,11 @@ def by_wavefront(
         return [], (f"{_WHAT}: the strongest arrival is too near for a wavefront",)
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
-        ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s)
+        enough = len(channels) >= _MIN_RECORD_CHANNELS
+        ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
         return (ordered, ()) if ordered else ([], (f"{_WHAT}: the strongest arrival is not of one wavefront",))
     findings = []
-    if is_direct and abs(direct.emission_s) > MAX_SHIFT_S:
+    if is_direct and len(channels) >= _MIN_RECORD_CHANNELS and abs(direct.emission_s) > MAX_SHIFT_S:
         findings.append(
             Finding(
                 fault="shifted record",
