@@ -21,8 +21,7 @@ from ertis_numba.settings import Call, Recording, Settings
 from ertis_numba.simulation import Electronics, Point, Tone
 from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages import health as stage
-from ertis_numba.stages.health import health, merge
+from ertis_numba.stages.health import health, limits, merge
 from ertis_numba.storage import open_recording, write_energyscapes, write_recording
 from tests import cases, files, rings
 from tests.scenes import SENSOR, line_array, only, scene_of
@@ -359,7 +358,9 @@ def test_info_tells_the_health(sick, tmp_path):
     lines = run("info", sick, "--health").stdout.splitlines()
     assert "10, of which 8 looked at" in lines[1]
     assert lines[9].split()[:4] == ["4", "stuck", "at", "0"]
-    assert len({len(line) for line in lines[4:]}) == 1
+    assert len({len(line) for line in lines[4:37]}) == 1
+    assert lines[37].startswith("not observable ") or lines[37].startswith("fault ")
+    assert any(line.startswith("fault          channel 4: stuck at 0, 0 (limit 0.001); put them") for line in lines)
     image = write_energyscapes(tmp_path / "img.h5", [files.image()])
     done = run("info", image, "--health", code=1)
     assert done.stderr == (
@@ -428,15 +429,24 @@ def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
 
 
 def test_page_has_the_limits():
-    limits = vars(stage)
     page = (ROOT / "docs" / "health.md").read_text()
     for told in (
-        f"less than {100 * limits['_STUCK']:g} % of",
-        f"more than {100 * limits['_SATURATED']:g} % of",
-        f"more than {limits['_OFFSET']:g} |",
-        f"more than {limits['_TONE_DB']:g} dB out of",
-        f"more than {-limits['_DEAD_DB']:g} dB below",
-        f"rise by {limits['_RISE_DB']:g} dB",
-        f"first\n{limits['_MOST_SAMPLES']:,} samples",
+        f"less than {100 * limits.MIN_CHANGES:g} % of",
+        f"more than {100 * limits.MAX_SATURATED:g} % of",
+        f"more than {limits.MAX_OFFSET:g} |",
+        f"more than {limits.MAX_TONE_DB:g} dB out of",
+        f"more than {-limits.MIN_LEVEL_DB:g} dB below",
+        f"rise by {limits.MIN_RISE_DB:g} dB",
+        f"first\n{limits.MAX_SAMPLES:,} samples",
+        f"{limits.MAX_NOISE_DB:g} dB, or five",
+        f"{-limits.MAX_WHITE_DB:g} dB below white bits",
+        f"{-limits.MAX_FLIPPED_DB:g} dB below white bits, up to {-limits.MAX_FLIPS_DB:g} dB",
+        f"{limits.MAX_STUCK_SAMPLES:,} samples, {limits.MAX_STUCK_NUMBERS} of PCM",
+        f"{limits.MAX_HUM:g}, or four",
+        f"{limits.MAX_GAIN_DB:g} dB, or five",
+        f"| {1e6 * limits.MAX_DELAY_S:g} µs |",
+        f"{limits.MIN_REPEATED_SAMPLES} samples",
+        f"{1e6 * limits.MAX_SHIFT_S:g} µs",
+        f"{limits.MAX_SWAP_DB:g} dB |",
     ):
-        assert told in page
+        assert told in page, told

@@ -9,6 +9,7 @@ from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.budgets import form as budgets
 from ertis_bench.gpu_tables import gpu, gpu_short
+from ertis_bench.health.table import health
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
@@ -28,6 +29,7 @@ __all__ = [
     "factorisation",
     "gpu",
     "gpu_short",
+    "health",
     "many",
     "network",
     "network_faults",
@@ -326,6 +328,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "network": {"network": network},
     "network-faults": {"network-faults": network_faults},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
+    "health": {"health": health},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
     "verification": {"verification": verification},
     "budgets": {"budgets": budgets},

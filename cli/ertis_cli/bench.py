@@ -197,6 +197,19 @@ def ptx(**given: Any) -> None:
     _run("ptx", benchmark, **given)
 
 
+@bench.command("health")
+@click.option("--long", is_flag=True, help="1,000 healthy arrays and 30 trials of each fault rather than 40 and one.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the scenes.")
+@_update
+@options.quiet
+@options.as_json
+def of_health(**given: Any) -> None:
+    """Count false alarms of the health checks in healthy arrays, and the faults that they name."""
+    from ertis_bench import health as benchmark
+
+    _run("health", benchmark, **given)
+
+
 @bench.command()
 @click.option("--long", is_flag=True, help="An hour rather than a minute.")
 @click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")

@@ -157,6 +157,8 @@ def _tell_health(path: Path, *, as_json: bool) -> None:
         for line in _health_lines(section):
             click.echo(line)
         _microphones(section).print()
+        for line in _finding_lines(section):
+            click.echo(line)
 
 
 def _health(report: "Health") -> dict[str, Any]:
@@ -167,6 +169,11 @@ def _health(report: "Health") -> dict[str, Any]:
         "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
         "tones_hz": [round(tone_hz, 1) for tone_hz in report.tones_hz],
         "unknown": report.unknown,
+        "not_observable": report.not_observable,
+        "findings": [
+            {**asdict(item), "measured": _rounded(item.measured, 3), "unit": item.unit, "remedy": item.remedy}
+            for item in report.findings
+        ],
         "channels": [
             {**asdict(item), "state": item.state}
             | {name: _rounded(getattr(item, name), digits) for name, (digits, _) in _COLUMNS.items()}
@@ -185,6 +192,18 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
         yield f"cannot tell    {text}"
+
+
+def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
+    """Yield each finding with its figures and remedy, and the faults that the scene does not show."""
+    for text in section["not_observable"]:
+        yield f"not observable {text}"
+    for item in section["findings"]:
+        channels = "record" if len(item["channels"]) != 1 else f"channel {item['channels'][0]}"
+        figures = f"{item['measured']:g} {item['unit']}".strip()
+        limit = f"limit {item['limit']:.3g} {item['unit']}".strip()
+        detail = f"; {item['detail']}" if item["detail"] else ""
+        yield f"fault          {channels}: {item['fault']}, {figures} ({limit}){detail}; {item['remedy']}"
 
 
 def _microphones(section: dict[str, Any]) -> _tables.Table:

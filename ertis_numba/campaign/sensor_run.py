@@ -26,8 +26,13 @@ def faults_of(name: str, measurement: Measurement) -> str:
     report = health(measurement)
     if not report.faults:
         return ""
+    if report.record_faults:
+        details = "; ".join(f"{item.fault}: {item.detail or item.measured}" for item in report.record_faults)
+        remedy = report.record_faults[0].remedy
+        return f"{name} has faults in its record ({details}); {remedy}, or see 'ertis info --health'"
     every = all(channel.faults for channel in report.channels)
-    remedy = "check its cable and supply" if every else "put them under 'disabled' in a layout file for --settings"
+    remedies = dict.fromkeys(item.remedy for item in report.findings)
+    remedy = "check its cable and supply" if every else next(iter(remedies))
     return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
 
 

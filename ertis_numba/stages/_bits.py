@@ -11,6 +11,7 @@ __all__ = [
     "ROUNDING",
     "Shares",
     "bit_shares",
+    "bits_of",
     "common_lines",
     "decibels",
     "octets_of",
@@ -51,10 +52,14 @@ def octets_of(words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(words).view(np.uint8)
 
 
+def bits_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.uint8]:
+    """Return the bits of a channel as 0 and 1: (sample,) uint8."""
+    return np.asarray(octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1))
+
+
 def signal_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.float32]:
     """Return the bits of a channel as −1 and 1: (sample,) float32."""
-    bits = octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1)
-    return np.asarray(2 * bits.astype(np.float32) - 1)
+    return np.asarray(2 * bits_of(octets, channel).astype(np.float32) - 1)
 
 
 def bit_shares(column: NDArray[np.uint8]) -> Shares:

@@ -1,0 +1,318 @@
+"""Table of faults: how each is put into a healthy recording, and the scene in which a single recording shows it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_bench.health.scenes import Base
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import load_layout, microphones
+from ertis_numba.settings import Array
+from ertis_numba.simulation.modulator import Modulator
+
+__all__ = ["FAULTS", "Fault"]
+
+_ONE = Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)
+_APART_S = 25e-6
+_Injected = tuple[NDArray[Any], tuple[int, ...]]
+_Injection = Callable[[Base, np.random.Generator], _Injected]
+_Change = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault that can be put into a recording.
+
+    Attributes
+    ----------
+    inject : callable
+        Returns new words and the faulty channels; none where the whole record is faulty.
+    names : tuple of str
+        Faults of the report that count as named.
+    scene : str
+        ``one echo`` or ``direct sound``; the scene that shows it best.
+    observable : bool
+        A single recording of that scene shows it.
+    why : str
+        Reason, or the condition.
+    encodings : tuple of bool
+        PDM or not.
+    """
+
+    inject: Callable[[Base, np.random.Generator], _Injected]
+    names: tuple[str, ...]
+    scene: str = "one echo"
+    observable: bool = True
+    why: str = "any scene"
+    encodings: tuple[bool, ...] = (True, False)
+
+    def put_into(self, base: Base, rng: np.random.Generator) -> tuple[Measurement, tuple[int, ...]]:
+        """Return the faulty recording and its faulty channels."""
+        words, channels = self.inject(base, rng)
+        return replace(base.measurement, words=np.ascontiguousarray(words)), channels
+
+
+def _column(base: Base, channel: int) -> NDArray[Any]:
+    words = base.measurement.words
+    if base.sensor.recording.is_pdm:
+        return np.asarray(words >> np.uint32(channel) & np.uint32(1)).astype(np.uint8)
+    return words[:, channel].copy()
+
+
+def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Return the words with other samples in some channels."""
+    words = (base.measurement.words if words is None else words).copy()
+    for channel, column in columns.items():
+        if base.sensor.recording.is_pdm:
+            bit = np.uint32(1 << channel)
+            words = words & ~bit | (np.asarray(column).astype(np.uint32) << np.uint32(channel))
+        else:
+            words[:, channel] = column
+    return words
+
+
+def _converted(base: Base, signal: NDArray[np.float64], rng: np.random.Generator) -> NDArray[Any]:
+    """Return the samples that one microphone makes of a signal."""
+    electronics, recording = base.sensor.electronics, base.sensor.recording
+    rms = 10 ** ((electronics.noise_dbfs or -300.0) / 20)
+    if not recording.is_pdm:
+        noisy = signal + rms * rng.standard_normal(len(signal))
+        return np.clip(np.rint(32768 * noisy), -32768, 32767).astype(np.int16)
+    key = rng.integers(0, 2**63, 1).astype(np.uint64)
+    band = base.sensor.call.high_frequency_hz / recording.sample_rate_hz
+    modulator = Modulator(
+        microphones(_ONE), key, np.array([rms]), order=electronics.modulator_order, dither=electronics.dither, band=band
+    )
+    out = np.zeros((len(signal), 1), np.uint8)
+    modulator.process(signal[None], out=out)
+    return out[:, 0] & 1
+
+
+def _signal(change: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]) -> _Injection:
+    """Return the injection that changes the signal of one channel, a function of signal and time."""
+
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        channel = int(rng.integers(len(base.signals)))
+        time_s = np.arange(base.signals.shape[1]) / base.sensor.recording.sample_rate_hz
+        return _with(base, {channel: _converted(base, change(base.signals[channel], time_s), rng)}), (channel,)
+
+    return inject
+
+
+def _samples(change: _Change) -> _Injection:
+    """Return the injection that changes the samples of one channel."""
+
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        channel = int(rng.integers(len(base.signals)))
+        return _with(base, {channel: change(_column(base, channel), rng)}), (channel,)
+
+    return inject
+
+
+def _ordered(source: NDArray[np.intp]) -> _Injection:
+    """Return the injection that gives each channel the samples of another."""
+
+    def inject(base: Base, _: np.random.Generator) -> _Injected:
+        columns = {to: _column(base, int(origin)) for to, origin in enumerate(source) if to != origin}
+        return _with(base, columns), ()
+
+    return inject
+
+
+def _rows(change: _Change) -> _Injection:
+    """Return the injection that changes all words alike."""
+
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        return change(base.measurement.words, rng), ()
+
+    return inject
+
+
+def _stuck(value: int) -> _Injection:
+    return _samples(lambda x, _: np.full_like(x, value if x.dtype == np.uint8 else (-32768, 32767)[value]))
+
+
+def _half_stuck(x: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    first = int(rng.integers(len(x) // 2))
+    out = x.copy()
+    out[first : first + len(x) // 2] = 0
+    return out
+
+
+def _intermittent(x: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    out, length = x.copy(), len(x) // 16
+    for _ in range(4):
+        first = int(rng.integers(len(x) - length))
+        out[first : first + length] = 0
+    return out
+
+
+def _white(x: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    if x.dtype == np.uint8:
+        return (rng.random(len(x)) < 0.5).astype(np.uint8)
+    return rng.integers(-32768, 32768, len(x)).astype(np.int16)
+
+
+def _flipped(share: float) -> _Injection:
+    return _samples(lambda x, rng: x ^ (rng.random(len(x)) < share).astype(np.uint8))
+
+
+def _noisier(more_db: float) -> _Injection:
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        louder = base.sensor.electronics.replace(noise_dbfs=min((base.sensor.electronics.noise_dbfs or 0) + more_db, 0))
+        noisy = replace(base, sensor=base.sensor.replace(electronics=louder))
+        channel = int(rng.integers(len(base.signals)))
+        return _with(base, {channel: _converted(noisy, base.signals[channel], rng)}), (channel,)
+
+    return inject
+
+
+def _amplified(gain_db: float) -> _Injection:
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        quieter = base.sensor.electronics.replace(noise_dbfs=(base.sensor.electronics.noise_dbfs or 0) + gain_db)
+        other = replace(base, sensor=base.sensor.replace(electronics=quieter))
+        channel = int(rng.integers(len(base.signals)))
+        signal = 10 ** (gain_db / 20) * base.signals[channel]
+        return _with(base, {channel: _converted(other, signal, rng)}), (channel,)
+
+    return inject
+
+
+def _late(delay_s: float) -> _Injection:
+    def change(x: NDArray[np.float64], time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(time_s - delay_s, time_s, x, left=0.0)
+
+    return _signal(change)
+
+
+def _swapped(*, apart: bool) -> _Injection:
+    """Return the injection that swaps two microphones whose delays differ by more than microphones may, or by less."""
+
+    def inject(base: Base, rng: np.random.Generator) -> _Injected:
+        delay_s = base.echo_s()
+        one = int(rng.integers(len(delay_s)))
+        differ_s = np.abs(delay_s - delay_s[one])
+        fitting = np.flatnonzero(differ_s > _APART_S) if apart else np.argsort(differ_s)[1:2]
+        if not len(fitting):  # in the middle of the array: the one at its end is far from it
+            fitting = np.argsort(differ_s)[-1:]
+        other = int(rng.choice(fitting))
+        return _with(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
+
+    return inject
+
+
+def _of_layout(base: Base, rng: np.random.Generator) -> _Injected:
+    """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or the other way round."""
+    names = ("eRTIS_v2", "eRTIS_v3D1")
+    own = base.sensor.array.layout
+    other = names[1 - names.index(own)]
+    mine, theirs = load_layout(own).positions_m, load_layout(other).positions_m
+    source = np.argmin(np.linalg.norm(theirs[:, None] - mine[None], axis=2), axis=1)
+    return _ordered(source)(base, rng)
+
+
+def _repeated(words: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    length = 1024
+    first = int(rng.integers(len(words) - 2 * length))
+    out = words.copy()
+    out[first + length : first + 2 * length] = out[first : first + length]
+    return out
+
+
+def _dropped(words: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    first = int(rng.integers(len(words) - 200))
+    return np.concatenate([words[:first], words[first + 50 :], words[:50]])
+
+
+def _shifted(base: Base, rng: np.random.Generator) -> _Injected:
+    shift = round(5000 / 4.5e6 * base.sensor.recording.sample_rate_hz)
+    return np.roll(base.measurement.words, shift if rng.random() < 0.5 else -shift, axis=0), ()
+
+
+def _crosstalk(base: Base, rng: np.random.Generator) -> _Injected:
+    one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
+    return _with(base, {one: _converted(base, base.signals[one] + 0.5 * base.signals[other], rng)}), (one,)
+
+
+def _copied(base: Base, rng: np.random.Generator) -> _Injected:
+    one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
+    return _with(base, {one: _column(base, other)}), (one, other)
+
+
+def _half_missing(base: Base, _: np.random.Generator) -> _Injected:
+    silent = np.zeros(len(base.measurement.words), np.uint8)
+    return _with(base, dict.fromkeys(range(16), silent)), tuple(range(16))
+
+
+def _inverted(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:
+    return 1 - x if x.dtype == np.uint8 else np.clip(-x.astype(np.int32), -32768, 32767).astype(np.int16)
+
+
+def _alternating(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:
+    return (np.arange(len(x)) % 2).astype(x.dtype)
+
+
+_ECHO = "a compact arrival from aside"
+_BITS = (True,)
+_TWISTED = np.arange(32).reshape(4, 8)
+
+FAULTS = {
+    "stuck at 0": Fault(_stuck(0), ("stuck at",)),
+    "stuck at 1": Fault(_stuck(1), ("stuck at",)),
+    "alternating bits": Fault(_samples(_alternating), ("stuck in a pattern",), encodings=_BITS),
+    "stuck half of the time": Fault(_samples(_half_stuck), ("stuck at times",)),
+    "intermittent contact": Fault(_samples(_intermittent), ("stuck at times",)),
+    "white bits, unconnected": Fault(_samples(_white), ("white bits", "noisy")),
+    "noise +20 dB": Fault(_noisier(20.0), ("noisy", "white bits", "flipped bits")),
+    "noise +10 dB": Fault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
+    "gain +10 dB": Fault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
+    "gain -10 dB": Fault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
+    "gain +6 dB": Fault(_amplified(6.5), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "gain -6 dB": Fault(_amplified(-6.5), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "inverted polarity": Fault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
+    "two channels swapped": Fault(
+        _swapped(apart=True), ("swapped",), why="an echo that reaches them 25 µs apart or more"
+    ),
+    "two channels swapped of nearly equal delay": Fault(
+        _swapped(apart=False), ("swapped",), observable=False, why="delays differ by less than microphones may"
+    ),
+    "order reversed": Fault(_ordered(np.arange(32)[::-1]), ("order of channels",), why=_ECHO),
+    "bits reversed in each byte": Fault(_ordered(_TWISTED[:, ::-1].ravel()), ("order of channels",), why=_ECHO),
+    "bytes reversed": Fault(_ordered(_TWISTED[::-1].ravel()), ("order of channels",), why=_ECHO),
+    "order of another layout": Fault(_of_layout, ("order of channels",), why=_ECHO),
+    "two channels identical": Fault(_copied, ("duplicate",)),
+    "1 % of bits flipped": Fault(_flipped(0.01), ("flipped bits", "noisy"), encodings=_BITS),
+    "0.1 % of bits flipped": Fault(_flipped(0.001), ("flipped bits", "noisy"), encodings=_BITS),
+    "1 % of bits flipped in every channel": Fault(
+        _rows(lambda w, rng: w ^ np.packbits(rng.random((len(w), 32)) < 0.01, axis=1).view("<u4")[:, 0]),
+        ("flipped bits",),
+        encodings=_BITS,
+    ),
+    "repeated block": Fault(_rows(_repeated), ("repeated blocks",)),
+    "50 words dropped": Fault(
+        _rows(_dropped), ("shifted record",), observable=False, why="all channels alike; echoes merely come sooner"
+    ),
+    "shifted by 1.1 ms": Fault(_shifted, ("shifted record",), scene="direct sound", why="a direct sound"),
+    "overload": Fault(_signal(lambda x, t: x + 1.5 * np.sin(2.5e5 * t) * (t < 4e-3)), ("saturated",)),
+    "DC offset": Fault(_signal(lambda x, _: x + 0.1), ("offset",)),
+    "hum": Fault(_signal(lambda x, t: x + 0.1 * np.sin(2 * np.pi * 100 * t)), ("low-frequency hum", "offset")),
+    "idle tone": Fault(_signal(lambda x, t: x + 0.02 * np.sin(2 * np.pi * 31e3 * t)), ("idle tone",)),
+    "half of the channels missing": Fault(_half_missing, ("stuck at",)),
+    "late by 50 µs": Fault(_late(50e-6), ("late",), why="a compact arrival"),
+    "late by 1 sample of PDM": Fault(
+        _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, less than microphones differ"
+    ),
+    "late by 10 samples of PDM": Fault(
+        _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, less than microphones differ"
+    ),
+    "bytes of numbers swapped": Fault(
+        _rows(lambda w, _: w.byteswap()), ("order of bytes",), encodings=(False,), why="any scene of 16-bit numbers"
+    ),
+    "crosstalk of -6 dB": Fault(
+        _crosstalk, ("late", "gain"), observable=False, why="a sound of two arrivals looks the same"
+    ),
+}
+"""Every kind of fault by its name."""

@@ -1,0 +1,59 @@
+"""Table of the faults that one recording can show: unit of the measured value, and remedy."""
+
+from dataclasses import dataclass
+
+__all__ = ["KINDS", "Kind", "kind_of"]
+
+_DISABLE = "put them under 'disabled' in a layout file for --settings"
+_LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Description of a fault.
+
+    Attributes
+    ----------
+    unit : str
+        Unit of the measured value and of its limit; empty for a share or a count.
+    remedy : str
+        Imperative sentence without a full stop.
+    of_record : bool
+        Faults of the whole record rather than of single channels.
+    """
+
+    unit: str = ""
+    remedy: str = _DISABLE
+    of_record: bool = False
+
+
+KINDS = {
+    "stuck at": Kind(),
+    "stuck in a pattern": Kind(),
+    "stuck at times": Kind(unit="samples", remedy="check the contact of their cable, or disable them in a layout file"),
+    "saturated": Kind(),
+    "offset": Kind(),
+    "low-frequency hum": Kind(remedy="check their supply and ground, or disable them in a layout file"),
+    "idle tone": Kind(unit="dB"),
+    "dead": Kind(unit="dB"),
+    "gain": Kind(unit="dB", remedy="give their sensitivity as array.gain, or disable them in a layout file"),
+    "noisy": Kind(unit="dB"),
+    "white bits": Kind(unit="dB", remedy="check that a microphone is connected, or disable them in a layout file"),
+    "flipped bits": Kind(unit="dB", remedy="check the clock and the cable, or disable them in a layout file"),
+    "duplicate": Kind(remedy="check the select pins of the microphones that share a line, or disable one of each pair"),
+    "inverted polarity": Kind(remedy="swap their wires, or disable them in a layout file"),
+    "swapped": Kind(unit="µs", remedy=_LAYOUT),
+    "late": Kind(unit="µs", remedy="give their lateness as array.delay_s, or disable them in a layout file"),
+    "order of channels": Kind(unit="µs", remedy=_LAYOUT, of_record=True),
+    "order of bytes": Kind(unit="dB", remedy="swap the bytes of every number when importing", of_record=True),
+    "repeated blocks": Kind(unit="samples", remedy="record again, and check the link to the sensor", of_record=True),
+    "shifted record": Kind(
+        unit="µs", remedy="start the record with the emission, or correct its first sample", of_record=True
+    ),
+}
+"""Every fault by its name; ``stuck at`` is followed by the value."""
+
+
+def kind_of(fault: str) -> Kind:
+    """Return the kind of a fault by its name as reports have it."""
+    return KINDS.get(fault) or KINDS[next(name for name in KINDS if fault.startswith(name))]
