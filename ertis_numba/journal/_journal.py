@@ -14,6 +14,7 @@ from ertis_numba.journal._contents import SUFFIX, Contents
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
 from ertis_numba.journal._log import read_log
+from ertis_numba.journal._log_choice import choose_log
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
 from ertis_numba.journal._rescue import rescue
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
@@ -114,6 +115,8 @@ class Journal(Contents):
         """
         path = Path(path)
         log = read_log(path)
+        if log is not None and log.is_cut:
+            choose_log(path, log)
         # A process that is killed right after it made the file leaves an empty one, or one without tables.
         opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
         try:

@@ -47,6 +47,13 @@ class Log:
     n_lost_commits: int
 
     @property
+    def is_cut(self) -> bool:
+        """Whether frames of this generation follow those that SQLite reads: damaged ones, or a torn end."""
+        _, page_bytes = _format(self.content)
+        place = _HEADER_BYTES + self.n_read * (_FRAME.size + page_bytes)
+        return self.n_lost_commits > 0 or self.content[place + 8 : place + 16] == self.content[16:24]
+
+    @property
     def repaired(self) -> bytes:
         """Copy of the log with checksums of its present content, so that SQLite reads all of it."""
         big_endian, page_bytes = _format(self.content)
