@@ -18,7 +18,7 @@ __all__ = ["PRESETS", "Settings"]
 _WORDS = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
 _WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
-_MAX_EDGE = 2  # of the call's highest frequency
+_MAX_EDGE = 4  # of the call's highest frequency
 _NARROWEST_HZ = 100.0  # a narrower band pass would ring for seconds
 
 PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
@@ -71,8 +71,8 @@ class Settings(Document, frozen=True, kw_only=True):
         most_hz = _MAX_EDGE * self.call.high_frequency_hz
         if given[1] > most_hz:
             raise ArgumentError(
-                f"processing.band_edges_hz ends at {given[1]:g} Hz; the limit is twice the call's highest frequency, "
-                f"{most_hz:g} Hz, as noise beyond it is not predicted"
+                f"processing.band_edges_hz ends at {given[1]:g} Hz; the limit is {most_hz:g} Hz, four times the call's "
+                "highest frequency, as noise beyond it is not predicted"
             )
         highest_hz = self.call.low_frequency_hz - _NARROWEST_HZ
         lowest_hz, nyquist_hz = self.call.high_frequency_hz + _NARROWEST_HZ, self.signal_rate_hz / 2
