@@ -24,11 +24,11 @@ _SAMPLE = 16_384  # bins that tell the noise, to a hundredth
 _FLAT = 1e-12  # of the variance of an array, below which it has none
 _UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
 
-# An error of a plan is alike in neighbouring bins, so it moves a maximum by less than noise of the same power does. The
-# shares are measured: tests/test_uncertainty.py holds them to a coverage, over grids and budgets.
+# An error of a plan is alike in neighbouring bins, so that it moves a maximum along the range by less than noise of the
+# same power. Across, it depends on the direction: these shares of its root mean square hold for unfavourable ones, and
+# are several times too large for others. tests/test_uncertainty.py compares them with trials.
 _OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
-_OF_BEAMS = {(False, 2): 0.9, (True, 2): 0.55}  # in a plane or not, by taps
-_OF_BEAMS_OF_MANY_TAPS = 0.3
+_OF_TWO_BEAM_TAPS, _OF_MORE_BEAM_TAPS = 1.5, 0.6
 
 
 class _PlanError(NamedTuple):
@@ -126,7 +126,7 @@ class PositionUncertainty:
         parts = Planner(self._settings, kernels.load("numpy"), threads=1, texture=echo).parts(accuracy)
         # Half of an error's power changes a magnitude, and so does half of the noise's.
         delays = (_OF_ONE_TAP if accuracy.delay_taps == 1 else _OF_DELAYS) * math.sqrt(2 * parts["delays"])
-        share = _OF_BEAMS.get((self._is_planar, accuracy.beam_taps or 0), _OF_BEAMS_OF_MANY_TAPS)
+        share = _OF_TWO_BEAM_TAPS if accuracy.beam_taps == 2 else _OF_MORE_BEAM_TAPS
         return _PlanError(along=delays, across=math.hypot(delays, share * math.sqrt(2 * parts["beams"])))
 
     def _least_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
