@@ -12,7 +12,7 @@ from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.texture import texture_of
 from ertis_numba.words import word_format
 
-__all__ = ["Prediction", "planner_of", "predict"]
+__all__ = ["Noted", "Prediction", "planner_of", "predict"]
 
 UNCERTAINTY_DB: Final = 1.0
 """Largest amount by which a prediction may be too low: see tests/test_accuracy.py."""
