@@ -33,6 +33,8 @@ def interpolated(image, directions, around, direction, range_index):
         found = tuple(
             now + wanted - again for now, wanted, again in zip(found, first, parabolas(predicted, offsets), strict=True)
         )
+    if max(abs(found[0] - first[0]), abs(found[2] - first[2])) > 0.5:
+        found = first
     top = directions[direction] + found[1]
     return top / np.linalg.norm(top), image.range_m[range_index] + found[0] * step_m, math.exp(found[2])
 

@@ -167,14 +167,14 @@ def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
 HELLOS = {
     "settings of another CRC-32": ({"settings_crc32": 1}, "another CRC-32"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
-    "no text": ({"settings": b"\xff"}, "no text"),
+    "no text": ({"settings": b"\xff"}, "are not text"),
     "a file for a layout": ({"settings": b'[array]\nlayout = "/etc/passwd"'}, "send its positions"),
     "a file for directions": ({"settings": b'[processing]\ndirections = "x.csv"'}, "name a grid"),
     "a name with a line feed": ({"settings": b'[array]\nlayout = "a\\n"'}, "cannot be printed"),
     "a firmware with zeros": ({"firmware": "\0"}, "printable"),
     "a quaternion of length 0": ({"rotation_xyzw": (0.0, 0.0, 0.0, 0.0)}, "rotation_xyzw"),
     "more than is taken": ({"settings": line(8, 8).replace(recording=Recording(n_samples=2**23))}, "this node takes"),
-    "too much": ({"settings": b"#" * 300_000}, "at most"),
+    "too much": ({"settings": b"#" * 300_000}, "exceed 262144 bytes"),
 }
 
 

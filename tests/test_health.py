@@ -377,7 +377,8 @@ def faulty(tmp_path):
     return write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), words=words), second])
 
 
-FAST = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet"]
+# Converter noise is a larger part of so small an image than the default budget permits, which `process` reports, too.
+FAST = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet", "--max-error", "-25"]
 
 
 def test_process_warns_once(faulty, tmp_path):

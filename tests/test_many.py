@@ -88,13 +88,8 @@ def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
     def on_paper(settings):
         return settings.replace(processing=settings.processing.replace(method="paper"))
 
-    def by_capon(settings):
-        return narrow(settings).replace(processing=settings.processing.replace(beamformer="capon"))
-
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=on_paper, explain=True))
     assert "a plan is asked for, and method 'paper' has none; give 'fast'" in found["a.h5"].error
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_capon, verify=True))
-    assert "the true error of beamformer 'capon' is asked for, and only the exact image of" in found["a.h5"].error
 
 
 def test_what_is_there_is_left_alone(runs, out, monkeypatch):

@@ -46,9 +46,7 @@ def spoil_head(file):
     file.write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "said"), [(spoil_energy, "is damaged"), (spoil_head, "is no energyscape file that can be read")]
-)
+@pytest.mark.parametrize(("spoil", "said"), [(spoil_energy, "is damaged"), (spoil_head, "is damaged")])
 def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, said):
     run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
     whole = (out / "a.energy.h5").read_bytes()

@@ -124,7 +124,7 @@ def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measur
         group = file["sensors/sensor"]
         text = group["settings"][()].decode().replace('"int16"', '"float32"')
         del group["settings"]
-        group.create_dataset("settings", data=text.encode())
+        group.create_dataset("settings", data=np.bytes_(text.encode()))
     with pytest.raises(DataError, match=r"pcm holds int16, the settings in the file want float32 .*; change the sett"):
         open_recording(path)
 

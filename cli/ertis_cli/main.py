@@ -34,7 +34,7 @@ COMMANDS = {
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
     "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),
     "record": ("ertis_cli.record:record", "Be the central node that stores what sensors send."),
-    "recover": ("ertis_cli.recover:recover", "Make recordings of what a crash has left."),
+    "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
     "serve": ("ertis_cli.serve:serve", "Be the central node that makes images of what sensors send."),
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
     "status": ("ertis_cli.status:status", "Show how the central node at ADDRESS is, live on a terminal."),

@@ -11,7 +11,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Processing
 
-__all__ = ["AdaptiveBeamform"]
+__all__ = ["AdaptiveBeamform", "require_order"]
 
 _Combine = Callable[[NDArray[np.complex64], NDArray[np.float32]], None]
 
@@ -79,14 +79,25 @@ def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], roots: NDArray[np.comp
     return lambda analytic, out: kernels.combine_dmas(analytic, offsets, roots, order, out)
 
 
-def _roots(weights: NDArray[np.complex64], order: int) -> NDArray[np.complex64]:
-    """Return weights of DMAS: roots, too, and divided by the number of products in the sum."""
-    n_mics = weights.shape[1]
+def require_order(order: int, n_mics: int) -> None:
+    """Refuse an order of DMAS beyond the number of microphones.
+
+    Raises
+    ------
+    ArgumentError
+        It is.
+    """
     if n_mics < order:
         raise ArgumentError(
             f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
             "give an order of at most as many, or another processing.beamformer"
         )
+
+
+def _roots(weights: NDArray[np.complex64], order: int) -> NDArray[np.complex64]:
+    """Return weights of DMAS: roots, too, and divided by the number of products in the sum."""
+    n_mics = weights.shape[1]
+    require_order(order, n_mics)
     exact = weights.astype(np.complex128)
     level = np.abs(exact)
     shrunk = np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)

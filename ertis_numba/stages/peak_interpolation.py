@@ -16,6 +16,7 @@ _ONE_SIDED = 0.25  # mean offset of neighbours relative to their reach, at the e
 _LINE = 0.2  # of the widths of a direction's neighbours, below which they lie in a line
 _CORRECTIONS = 2  # of the error of parabolas: a third one changes nothing
 _MAX_DIFFERENCE = 1.0  # in nepers, between samples and those of a single reflector; beyond, they are of several
+_MAX_SHIFT = 0.5  # by a correction, in bins of range and in nepers; beyond, it has not converged
 _DARK = 1e-6  # amplitude, below the side lobes of any array
 
 
@@ -115,7 +116,9 @@ class PeakInterpolator:
             difference = measured - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
             found = np.where(is_alike[:, None], found + first - self._tops(directions, predicted), first)
-        return found
+        change = np.abs(found - first)
+        is_small = (change[:, 0] <= _MAX_SHIFT) & (change[:, 4] <= _MAX_SHIFT)
+        return np.where(is_small[:, None], found, first)
 
     def _tops(self, directions: NDArray[np.int64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (place, 5) float64: shift along the range in bins, offset of the direction, logarithm of the level.

@@ -16,6 +16,7 @@ from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import INTERPOLATIONS, MOST_ZONES, Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
+from ertis_numba.stages.adaptive import require_order
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import require_int16, whole_limits
 from ertis_numba.stages.costs import Costs, Work, cache_file, costs_of
@@ -156,6 +157,8 @@ class Planner:
         self._spectrum = spectrum_of(settings)
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self._n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
+        if settings.processing.beamformer == "dmas":
+            require_order(settings.processing.dmas_order, self._n_mics)
         self._sensitivity = sensitivity or Sensitivity.of(settings.processing, self._n_mics)
         self._own_s = layout.delay_s[layout.enabled]
         self._aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
