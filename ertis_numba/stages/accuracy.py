@@ -260,10 +260,12 @@ class ErrorModel:
     def arithmetic(self) -> float:
         """Return the error power of single precision.
 
-        PCM microphones may receive the same loud sound and round it alike, so that their errors add up in a beam. PDM
-        bits differ between microphones.
+        PCM microphones may receive the same loud sound outside the band or the window and round it alike, so that their
+        errors add up in a beam. PDM bits are as loud whatever is heard, which the measured figure includes.
         """
-        alike = 1 if self._settings.recording.is_pdm else int(microphones(self._settings.array).enabled.sum())
+        if self._settings.recording.is_pdm:
+            return _ARITHMETIC / self.texture.gain
+        alike = int(microphones(self._settings.array).enabled.sum())
         return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain
 
     def _of(self, power: float) -> float:
