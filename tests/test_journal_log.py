@@ -217,6 +217,23 @@ def test_damaged_tally_changes_nothing(tmp_path):
         assert stored(folder / path.name) == (list(range(10, 10 + COUNT)), ())
 
 
+@pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, place):
+    """SQLite would put the old pages before the damage over the new ones in the main file."""
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    with create(tmp_path, entries(COUNT)) as journal:
+        vars(journal)["_database"].execute("PRAGMA wal_checkpoint(FULL)")
+        for item in tmp_path.glob("rec*"):
+            shutil.copy(item, killed)
+    path = killed / "rec.h5.journal"
+    flip(log_of(path), int(place * log_of(path).stat().st_size))
+    verify(path)
+    (report,) = verify(path)  # the first one has not ruined it
+    assert report.measurements + sum(gap.last - gap.first + 1 for gap in report.gaps) >= COUNT
+    assert report.measurements - len(report.damaged) >= COUNT - 1
+
+
 def test_log_without_its_journal_is_set_aside(tmp_path):
     path = crashed(tmp_path, entries(COUNT))
     log = log_of(path).read_bytes()
