@@ -222,7 +222,7 @@ def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, pla
     """SQLite would put the old pages before the damage over the new ones in the main file."""
     killed = tmp_path / "killed"
     killed.mkdir()
-    with create(tmp_path, entries(COUNT)) as journal:
+    with create(tmp_path, entries(COUNT, settings=LARGE), settings=LARGE) as journal:
         vars(journal)["_database"].execute("PRAGMA wal_checkpoint(FULL)")
         for item in tmp_path.glob("rec*"):
             shutil.copy(item, killed)
