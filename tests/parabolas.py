@@ -40,7 +40,7 @@ def interpolated(image, directions, around, direction, range_index):
 
 
 def amplitude(settings, direction_offset, range_offset_m):
-    """How bright a reflector is elsewhere."""
+    """Amplitude of a reflector at an offset."""
     wave_1_m, power, positions_m = waves_of(settings)
     waves = np.exp(1j * wave_1_m[:, None] * (2 * range_offset_m - positions_m @ direction_offset))
     return max(1e-6, abs(power @ waves.mean(axis=1)))
@@ -67,7 +67,7 @@ def parabolas(logs, offsets):
 
 
 def quadric_top(offsets, rises):
-    """Where a quadric through samples around 0 is highest, and by how much it rises there."""
+    """Top of a quadric through samples around 0: its place and its rise."""
     none = np.zeros(3), 0.0
     reach = np.max(np.linalg.norm(offsets, axis=1))
     if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > 0.25 * reach:

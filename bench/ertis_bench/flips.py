@@ -201,7 +201,7 @@ def _spool(folder: Path) -> Judge:
                 else:
                     found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.words.tobytes())))
         spool.close()
-        # What was discarded may come back: the central node knows it.
+        # Discarded measurements may come back: the central node recognises them.
         return found >= told, bool(notes) or is_gap
 
     return lambda work: _judged(lambda: read(work), wanted=True)

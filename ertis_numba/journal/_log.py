@@ -48,7 +48,7 @@ class Log:
 
     @property
     def is_cut(self) -> bool:
-        """Whether frames of this generation follow those that SQLite reads: damaged ones, or a torn end."""
+        """True if frames of this generation follow those that SQLite reads: damaged ones, or a torn end."""
         _, page_bytes = _format(self.content)
         place = _HEADER_BYTES + self.n_read * (_FRAME.size + page_bytes)
         return self.n_lost_commits > 0 or self.content[place + 8 : place + 16] == self.content[16:24]

@@ -18,7 +18,7 @@ from ertis_numba.waveform import matched_spectrum
 
 __all__ = ["PositionUncertainty"]
 
-_WAVES = 64  # of the call's band, which its widths are told from
+_WAVES = 64  # of the call's band, from which its widths are computed
 _THINNED = 16  # ranges of which one tells the noise
 _SAMPLE = 16_384  # bins that tell the noise, to a hundredth
 _FLAT = 1e-12  # of the variance of an array, below which it has none

@@ -135,7 +135,7 @@ SCENES = {
     "noise": _noise,
     "interference": _interference,
 }
-"""What healthy arrays hear, by name."""
+"""Scenes that healthy arrays record, by name."""
 
 
 def _scene(

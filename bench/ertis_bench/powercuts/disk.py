@@ -124,7 +124,7 @@ class _Names:
 
 
 class Disk:
-    """What has happened to a folder so far.
+    """History of a folder so far.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ _ENTRY: Final = struct.Struct("=IIQQII")
 
 
 class Kind(IntEnum):
-    """What happened; the numbers are those of ``disklog.c``."""
+    """Kinds of records; the numbers are those of ``disklog.c``."""
 
     CREATE = 1
     WRITE = 2

@@ -20,7 +20,7 @@ from ertis_numba.storage.sealing import seal
 __all__ = ["Found", "recover_archive", "recover_capture", "recover_spool"]
 
 Found = dict[str, int]
-"""What ought to be 0: ``lost``, ``twice``, ``wrong``, and ``failed`` where recovery itself fails."""
+"""Counts that must be 0: ``lost``, ``twice``, ``wrong``, and ``failed`` where recovery itself fails."""
 
 _SPOOL_RING_BYTES = 1  # everything is read from the disk
 
@@ -48,7 +48,7 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
         failed, settled = _start(folder)
     archived = _read(folder)
     found = compare(sent, archived, sent.acked())
-    # What a node is told to be stored it discards.
+    # A sensor node discards measurements that are reported as stored.
     claimed = {Key(run.sensor, run.epoch, sequence) for run, last in settled.items() for sequence in range(last + 1)}
     lost = sum(key not in archived.rows and archived.reason(key) is None for key in claimed - sent.acked())
     found["lost"] += lost

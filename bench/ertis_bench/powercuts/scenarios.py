@@ -27,7 +27,7 @@ _PATIENCE_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """Where and how a command runs.
+    """Place and options of a command.
 
     Attributes
     ----------

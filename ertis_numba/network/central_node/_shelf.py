@@ -227,7 +227,7 @@ class Shelf:
         self._tell(Twin(item, differs=differs))
 
     def _differs(self, item: Item, entry: Entry) -> bool:
-        """Whether another measurement is stored under a number, or one that cannot be compared any more."""
+        """Return True if a number holds another measurement, or one that cannot be compared any more."""
         held = self._checksums.find(item.run, item.first)
         if held is None and self.volume is not None:
             held = self.volume.crc32_of(entry)
