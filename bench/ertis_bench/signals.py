@@ -74,7 +74,7 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found: dict[str, dict[str, Any]] = {}
-    with _default_interrupt(), captures.emulated(source, folder) as ports:
+    with _obeyed_signals(), captures.emulated(source, folder) as ports:
         paths = _files(folder, source) | {"port": ports[0]}
         for command in only or COMMANDS:
             found[command] = _to_command(command, paths, folder / "out", rng, count)
@@ -90,13 +90,16 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
 
 
 @contextmanager
-def _default_interrupt() -> Iterator[None]:
-    """Have processes begin with Ctrl-C obeyed, also where a script started this one in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def _obeyed_signals() -> Iterator[None]:
+    """Have processes begin with all signals obeyed, also where a script or ``nohup`` started this one."""
+    ignored = [number for number in _SIGNALS if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _files(folder: Path, source: Path) -> dict[str, str]:
