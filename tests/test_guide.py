@@ -32,7 +32,7 @@ RUN_BY = {
     ("export", "python"): ["test_export::test_page"],
     ("formats", "python"): ["test_guide::test_python_on_formats"],
     ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
-    ("health", "$"): ["test_health::test_page_shows_what_the_commands_print"],
+    ("health", "$"): ["test_health_commands::test_page_shows_what_the_commands_print"],
     ("index", "$"): ["test_guide::test_start"],
     ("index", "python"): ["test_guide::test_start"],
     ("many", "$"): [

@@ -21,11 +21,31 @@ def test_health_names_no_fault_of_a_healthy_array(seed):
     assert false_alarms(seed)[1] == {}
 
 
+@pytest.mark.parametrize(
+    "seed",
+    [
+        60328,  # all modulators alternate for 17,000 samples, without noise
+        60330,  # overlapping echoes shift the carrier of one channel by a period
+        200738,  # echoes cancel at one channel in the loudest eighth of the record
+    ],
+)
+def test_health_names_no_fault_where_a_healthy_array_looks_faulty(seed):
+    assert false_alarms(seed)[1] == {}
+
+
 @pytest.mark.parametrize("name", [name for name, fault in FAULTS.items() if fault.observable])
 def test_health_names_the_fault(name):
     is_named, report = named(name, 0)
     assert is_named, (report.faults, report.not_observable)
     assert all(finding.remedy for finding in report.findings)
+
+
+@pytest.mark.parametrize("gain_db", [6.0, -6.0])
+def test_gain_faults_have_the_gain_of_their_name(gain_db):
+    healthy = base("one echo", 0, is_pdm=False)
+    measurement, [channel] = FAULTS[f"gain {gain_db:+g} dB"].put_into(healthy, np.random.default_rng(0))
+    peak = np.abs(measurement.words[:, channel].astype(float)).max() / 32768
+    assert 20 * np.log10(peak / np.abs(healthy.signals[channel]).max()) == pytest.approx(gain_db, abs=0.3)
 
 
 def test_every_fault_is_in_the_table_of_kinds():

@@ -270,8 +270,8 @@ FAULTS = {
     "noise +10 dB": Fault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
     "gain +10 dB": Fault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
     "gain -10 dB": Fault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
-    "gain +6 dB": Fault(_amplified(6.5), ("gain",), why="an echo; gains that spread by 0.5 dB"),
-    "gain -6 dB": Fault(_amplified(-6.5), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "gain +6 dB": Fault(_amplified(6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "gain -6 dB": Fault(_amplified(-6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
     "inverted polarity": Fault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
     "two channels swapped": Fault(
         _swapped(apart=True), ("swapped",), why="an echo that reaches them 25 µs apart or more"

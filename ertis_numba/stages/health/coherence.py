@@ -1,6 +1,6 @@
 """Correlation of each microphone's arrival with the mean of those in line."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.stages.health.arrival import Compressed
 
-__all__ = ["Coherence", "aligned", "correlate", "mean_of"]
+__all__ = ["Coherence", "aligned", "correlate", "half_bands", "mean_of"]
 
 _LAG_STEP_S = 1e-6
 _NEAR_ZERO_S = 10e-6
@@ -52,6 +52,13 @@ def aligned(found: Compressed, at_s: NDArray[np.float64], lag_s: float) -> NDArr
     low_hz, centre_hz = found.frequency_hz[0], found.frequency_hz.mean()
     signals = scipy.fft.ifft(turned, n_steps, axis=1)[:, steps % n_steps]
     return np.asarray(signals * np.exp(2j * np.pi * (low_hz - centre_hz) * found.step_s * steps))
+
+
+def half_bands(found: Compressed) -> tuple[Compressed, Compressed]:
+    """Return the lower and the upper half of the band."""
+    middle = len(found.frequency_hz) // 2
+    lower = replace(found, bins=found.bins[:, :middle], frequency_hz=found.frequency_hz[:middle])
+    return lower, replace(found, bins=found.bins[:, middle:], frequency_hz=found.frequency_hz[middle:])
 
 
 def mean_of(wide: NDArray[np.complex128], found: Compressed, lag_s: float) -> NDArray[np.complex128]:

@@ -15,7 +15,7 @@ _MIN_CHANNELS = 4
 _ANCHOR_EVERY = 64  # samples, in the mean
 _MIX = np.uint64(0x9E3779B97F4A7C15)  # the golden ratio in 64 bits, as in SplitMix64
 _SHARE_OF_TWINS = 0.25  # of PCM; a symmetrical array hears some echoes alike, if nothing has noise
-_MIN_CHANGING = 0.25  # of samples in a repeated block that differ from the one before
+_MIN_CHANGING = 0.25  # of samples in a repeated block that differ from those a few samples earlier
 
 
 def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> list[Finding]:
@@ -106,8 +106,7 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
         longest = int(np.argmax(length)) if len(length) else 0
         if len(length) and int(length[longest]) > best[0] and distance >= _ANCHOR_EVERY:
             first = int(ends[2 * longest])
-            block = single[first : first + int(length[longest])]
-            if np.mean(block[1:] != block[:-1]) > _MIN_CHANGING:
+            if not _is_cycle(single[first : first + int(length[longest])]):
                 best = int(length[longest]), first, distance
     longest_block, first, distance = best
     if longest_block < MIN_REPEATED_SAMPLES:
@@ -121,6 +120,16 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
             detail=f"samples {first}-{first + longest_block - 1} come again {distance} samples later",
         )
     ]
+
+
+def _is_cycle(block: NDArray[Any]) -> bool:
+    """Return whether a block goes round in a cycle shorter than the blocks that are reported.
+
+    Modulators without noise alternate for thousands of samples. Such stretches are equal wherever they occur.
+    """
+    start = block[: 4 * MIN_REPEATED_SAMPLES]
+    lags = range(1, min(MIN_REPEATED_SAMPLES, len(start)))
+    return any(np.mean(start[lag:] != start[:-lag]) <= _MIN_CHANGING for lag in lags)
 
 
 def hum(columns: Sequence[tuple[int, NDArray[Any]]], *, block: int, full_scale: float) -> list[Finding]:

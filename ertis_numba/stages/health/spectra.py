@@ -24,6 +24,7 @@ _LOWEST_HZ = 20.0  # that can be heard
 _LEAST_SOUND = 1e-3  # of the power; less is the chance of the noise
 _FLOOR_QUANTILE = 0.2
 _TONE_MARGIN_DB = 3.0
+_NEARLY_LOUDEST_DB = 6.0  # below the loudest eighth; weaker sound says less about noisy microphones
 
 
 def by_spectra(
@@ -58,6 +59,7 @@ def by_spectra(
     sensitivity = microphones(settings.array).gain[[item.channel for item in found]]
     sound_db = _bits.decibels(np.maximum(loud - noise, _LEAST_SOUND * loud)) - 20 * np.log10(sensitivity)
     level_db = sound_db - np.median(sound_db)
+    is_deaf = _deaf(power[:, order], noise, 20 * np.log10(sensitivity), few)
     unknown: tuple[str, ...] = ()
     if len(found) == 1:
         unknown = ("a dead microphone: there is no other to compare it with",)
@@ -80,7 +82,7 @@ def by_spectra(
             item,
             faults=item.faults
             + ("idle tone",) * bool(rise_db[mic, highest[mic]] > MAX_TONE_DB)
-            + ("dead",) * bool(not unknown and level_db[mic] < MIN_LEVEL_DB),
+            + ("dead",) * bool(not unknown and is_deaf[mic]),
             level_db=None if unknown else float(level_db[mic]),
             noise_dbfs=float(noise_db[mic]),
             tone_hz=float((first + highest[mic]) * line_hz) if rise_db[mic, highest[mic]] > MAX_TONE_DB else None,
@@ -91,3 +93,33 @@ def by_spectra(
     findings = noise_findings(told, quiet_db, white_db=white_db if settings.recording.is_pdm else None)
     findings += flip_findings(told, floor_db) if settings.recording.is_pdm else []
     return told, tuple(float((first + line) * line_hz) for line in common), unknown, findings
+
+
+def _deaf(
+    power: NDArray[np.float64], noise: NDArray[np.float64], sensitivity_db: NDArray[np.float64], few: int
+) -> NDArray[np.bool_]:
+    """Return the channels that miss the sound in every eighth that is nearly as loud as the loudest: (mic,) bool.
+
+    Two echoes can cancel at one microphone in a single eighth.
+
+    Parameters
+    ----------
+    power : (mic, segment) float64
+        Segments in the order of their loudness.
+    noise : (mic,) float64
+    sensitivity_db : (mic,) float64
+        Calibrated gain.
+    few : int
+        Segments in an eighth.
+    """
+    is_deaf, loudest_db = np.ones(len(power), bool), math.inf
+    for last in range(power.shape[1], few, -few):
+        loud = power[:, max(few, last - few) : last].mean(axis=1)
+        sound_db = _bits.decibels(np.maximum(loud - noise, _LEAST_SOUND * loud)) - sensitivity_db
+        usual_db = float(np.median(sound_db))
+        if not math.isfinite(loudest_db):
+            loudest_db = usual_db
+        if usual_db < loudest_db - _NEARLY_LOUDEST_DB:
+            break
+        is_deaf &= sound_db - usual_db < MIN_LEVEL_DB
+    return np.asarray(is_deaf)

@@ -10,7 +10,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Layout, layout_names, load_layout, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
-from ertis_numba.stages.health.coherence import aligned, correlate, mean_of
+from ertis_numba.stages.health.coherence import aligned, correlate, half_bands, mean_of
 from ertis_numba.stages.health.levels import gain_findings
 from ertis_numba.stages.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.stages.health.report import Finding
@@ -28,7 +28,7 @@ _MIN_RECORD_CHANNELS = 12  # fewer fit another order or the emitter by chance
 _PILOTS = 4  # microphones among which the strongest arrival is looked for
 _MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
 _HALF_PERIOD_S = 12e-6  # of the highest usual carrier
-_SWAP_S = 8e-6
+_AGREEMENT_S = 8e-6  # of the delays of a swapped pair, or of the halves of the band
 _LAG_S = 60e-6
 _PRESENT = 0.85  # of the usual amplitude
 _DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
@@ -200,6 +200,10 @@ def _of_channels(
     moved = ~inverted & (coherence >= _SAME) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
     moved &= np.abs(offset_s) > limit_s
+    # Echoes that overlap shift the carrier by a period, but neither the envelope nor both halves of the band with it.
+    moved &= np.abs(times_s - fitted_s - offset_s) < _HALF_PERIOD_S
+    if moved.any():
+        moved &= _in_half_bands(found, fitted_s + delay_s, offset_s, fit.inliers)
     if np.mean(inverted | moved) > _MAX_SUSPECTS:
         return findings
     findings += [
@@ -212,6 +216,18 @@ def _of_channels(
         for mic in np.flatnonzero(inverted)
     ]
     return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels, limit_s)
+
+
+def _in_half_bands(
+    found: Compressed, at_s: NDArray[np.float64], offset_s: NDArray[np.float64], inliers: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return whether each channel has its offset in either half of the band: (mic,) bool."""
+    agrees = np.ones(len(at_s), bool)
+    for half in half_bands(found):
+        reference = mean_of(aligned(half, at_s, _LAG_S)[inliers], half, _LAG_S)
+        rest = correlate(aligned(half, at_s + offset_s, _LAG_S), reference, half, _LAG_S)
+        agrees &= np.abs(rest.lag_s) < _AGREEMENT_S
+    return agrees
 
 
 def _moved(
@@ -230,7 +246,7 @@ def _moved(
         )
         for other in np.flatnonzero(np.abs(offset_s) > limit_s).tolist():
             apart_s = fitted_s[other] - fitted_s[mic]
-            if abs(offset_s[mic] - apart_s) < _SWAP_S and abs(offset_s[other] + apart_s) < _SWAP_S:
+            if abs(offset_s[mic] - apart_s) < _AGREEMENT_S and abs(offset_s[other] + apart_s) < _AGREEMENT_S:
                 left = [rest for rest in left if rest != other]
                 pair = ((mic, other), (other, mic))
                 findings += [

@@ -1,0 +1,98 @@
+"""Health of short or narrow records, noise and dynamic range, and merged reports."""
+
+import dataclasses
+import json
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.settings import Call, Recording
+from ertis_numba.stages.health import health, merge
+from tests import cases
+from tests.health_recordings import (
+    BY_HAND,
+    real,
+    sound,
+)
+
+
+@pytest.mark.parametrize("n_samples", [0, 1, 2, 33, 255, 256, 257, 4000, 17_000])
+@pytest.mark.parametrize("bits", ["silent", "alternating", "real"])
+def test_short_records(n_samples, bits):
+    rows = {"silent": 0 * real().words, "alternating": np.arange(163_840) % 2 * 0xFFFFFFFF, "real": real().words}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = health(dataclasses.replace(real(), words=rows[bits].astype("<u4")[:n_samples]))
+    json.dumps(dataclasses.asdict(report), allow_nan=False)
+    if n_samples < 256:
+        assert {item.state for item in report.channels} == {"unknown"}
+        assert report.unknown == (f"anything: {n_samples} samples are fewer than 256",)
+    elif bits == "real":
+        assert bool(report.unknown) == (n_samples < 17_000)
+    else:
+        assert len(report.faults) == 1
+
+
+def test_one_microphone_has_nothing_to_be_compared_with():
+    report = health(cases.noise(cases.CASES["one microphone"]))
+    assert report.unknown == ("a dead microphone: there is no other to compare it with",)
+    assert report.noise_dbfs == pytest.approx(-19.5, abs=1.5)
+
+
+@pytest.mark.parametrize("call", [Call(start_frequency_hz=39_500.0, stop_frequency_hz=40_500.0), Call()])
+def test_a_band_too_narrow_for_the_record_is_told(call):
+    measurement = dataclasses.replace(sound(), settings=sound().settings.replace(call=call))
+    assert health(measurement).unknown == (
+        ("dead microphones, tones and noise: 65536 samples do not resolve the call's band",) if call != Call() else ()
+    )
+
+
+@pytest.mark.parametrize("words", [np.zeros(4000, "u4"), np.zeros((4000, 2), "u1"), np.zeros((4000, 1, 1), "u1")])
+def test_words_of_another_array_are_refused(words):
+    with pytest.raises(ertis.DataError, match=r"its settings want uint8 of shape \(4000,\): give the settings"):
+        health(dataclasses.replace(sound(), words=words))
+
+
+def test_noise_of_white_bits_is_what_falls_into_the_band():
+    """Bits have a mean square of 1, spread evenly up to half of their rate."""
+    report = health(cases.noise(cases.SHORT.replace(recording=Recording(n_samples=163_840))))
+    assert report.noise_dbfs == pytest.approx(10 * np.log10(25e3 / 2.25e6), abs=0.3)
+
+
+@pytest.mark.parametrize("name", ["default", "wide band", "line of 8", "16 bits, disabled"])
+def test_dynamic_range_is_that_of_images(name):
+    """A full-scale echo is 1 in an image. What is quietest of a few channels is quieter than their mean."""
+    measurements = [cases.noise(cases.CASES[name], seed) for seed in range(4)]
+    pipeline = ertis.Pipeline(cases.CASES[name])
+    noise = np.mean([np.mean(pipeline.process(measurement).energy ** 2) for measurement in measurements])
+    told = merge([health(measurement) for measurement in measurements]).dynamic_range_db
+    assert told == pytest.approx(-10 * np.log10(noise), abs=1.2)
+
+
+def test_several_measurements_are_merged():
+    healthy, sick = health(sound()), health(BY_HAND["idle tone"]())
+    report = merge([healthy, healthy, sick])
+    assert report.measurements == 3
+    assert report.faults == dict.fromkeys(sick.faults, (3,))
+    assert report.channels[3].noise_dbfs == healthy.channels[3].noise_dbfs
+    assert report.channels[3].tone_hz == sick.channels[3].tone_hz
+    assert merge([healthy]) == healthy
+    quiet = health(dataclasses.replace(sound(), words=np.random.default_rng(1).integers(0, 256, 65_536, np.uint8)))
+    assert merge([quiet, quiet]).unknown == ("dead microphones: no sound stands out of the noise",)
+    assert merge([quiet, healthy]).unknown == ()
+    assert merge([quiet, healthy]).channels[3].level_db == healthy.channels[3].level_db
+    with pytest.raises(ertis.ArgumentError, match="reports are none; give at least one"):
+        merge([])
+    with pytest.raises(ertis.ArgumentError, match="reports are of different channels; give those of one array"):
+        merge([healthy, health(real())])
+
+
+@pytest.mark.alone
+def test_it_is_quick():
+    health(real())
+    start_s = time.perf_counter()
+    health(real())
+    assert time.perf_counter() - start_s < 0.5  # 0.08 s where nothing else runs
