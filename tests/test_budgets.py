@@ -11,9 +11,9 @@ from ertis_cli.main import cli
 from ertis_numba import kernels, verification
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.prediction import planner_of, predict
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.waveform import call_at
@@ -37,10 +37,9 @@ def pcm(settings, *, direct=0.0, hum=0.0, echo=1e-5, n_mics=32):
 def errors(measurement, **pipeline):
     """True and predicted error of the image, and the budget."""
     with Pipeline(measurement.settings, "cpu", 1, **pipeline) as made:
-        image, settings = made.process(measurement), made.settings
+        image = made.process(measurement)
     exact = verification.exact_image(image, measurement).energy
-    planner = planner_of(measurement, settings, CPU, threads=1)
-    return verification.error_db(image.energy, exact), predict(planner, settings)
+    return verification.error_db(image.energy, exact), predict(planner_of(image, measurement, CPU, threads=1))
 
 
 @pytest.mark.parametrize("sound", ["direct", "hum"])
@@ -60,10 +59,9 @@ def test_prediction_does_not_depend_on_the_magnitude_of_samples(beamformer, expo
     given = pcm(settings, direct=0.5, echo=0.01)
     scaled = Measurement(np.ldexp(given.words, exponent), settings)
     with Pipeline(settings, "cpu", 1) as made:
-        plan = made.settings
-    wanted, found = (
-        predict(planner_of(each, plan, CPU, threads=1), plan).predicted_error_db for each in (given, scaled)
-    )
+        wanted, found = (
+            predict(planner_of(made.process(each), each, CPU, threads=1)).predicted_error_db for each in (given, scaled)
+        )
     assert found == pytest.approx(wanted, abs=0.05)
 
 

@@ -260,44 +260,6 @@ class FastChain:
             self._finish(buffers)
         return heard, self._lead
 
-    def sensitivity(
-        self, words: NDArray[np.unsignedinteger[Any]], error_power: float, *, most_beams: int, seed: int = 1
-    ) -> float:
-        """Return the relative error power of the image for weights of an adaptive beamformer with ``error_power``.
-
-        The error of each direction and microphone is an independent complex number with this power relative to the
-        weight. At most ``most_beams`` directions are compared; bright ones are preferred.
-
-        Raises
-        ------
-        ArgumentError
-            The beamformer is delay-and-sum, which is linear.
-        """
-        if self._adaptive is None:
-            raise ArgumentError(
-                "processing.beamformer is 'delay_and_sum'; give an adaptive one to measure its sensitivity"
-            )
-        image = np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
-        heard, _ = self.analytic(words, image)
-        chosen = _brightest(image, most_beams)
-        random = np.random.default_rng(seed)
-        shape = (len(chosen), heard.shape[0], 2)
-        errors = random.normal(scale=math.sqrt(error_power / 2), size=shape).view(np.complex128)[..., 0]
-        with self._taken(self._threads) as buffers:
-            images = []
-            analytic = buffers.lane.send(heard)
-            for factors in (np.ones_like(errors), 1 + errors):
-                combine = self._adaptive.with_weights(self._kernels, self._memory, chosen, factors)
-                out = np.empty((len(chosen), len(self.range_m)), dtype=np.float32)
-                target = buffers.lane.target(out)
-                combine(analytic, target)
-                buffers.lane.fetch(target, out)
-                buffers.lane.wait()
-                images.append(out.astype(np.float64))
-        self._finish(buffers)
-        power = float(np.sum(images[0] ** 2))
-        return float(np.sum((images[1] - images[0]) ** 2)) / power if power else 0.0
-
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
         with self._taken(self._threads) as buffers:
@@ -403,15 +365,6 @@ class FastChain:
         analytic = memory.zeros(self._matched_filter.shape, np.complex64)
         transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
         return _Buffers(lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers())
-
-
-def _brightest(image: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    """Return directions, half of them spread evenly and half of them the brightest: (direction,) intp."""
-    if len(image) <= count:
-        return np.arange(len(image))
-    power = np.sum(np.square(image, dtype=np.float64), axis=1)
-    even = np.linspace(0, len(image) - 1, count - count // 2).astype(np.intp)
-    return np.union1d(even, np.argsort(power)[-(count // 2) :])
 
 
 def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:

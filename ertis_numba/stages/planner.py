@@ -37,6 +37,7 @@ _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
 _TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
+_ROUNDED_DB = 1e-6
 _MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
 _NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
@@ -148,7 +149,8 @@ class Planner:
         max_bytes: int | None = None,
         sensitivity: Sensitivity | None = None,
     ) -> None:
-        self._settings, self._kernels = settings, kernels
+        self.settings = settings
+        self._kernels = kernels
         self._most_bytes = _MOST_BYTES if max_bytes is None else max_bytes
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
@@ -182,7 +184,7 @@ class Planner:
         ArgumentError
             None does; the message has the best there is.
         """
-        wanted_db = self._settings.accuracy.max_error_db
+        wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
         # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
         # that of the beams; see `prediction` for the warning.
@@ -214,12 +216,28 @@ class Planner:
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
         """Return what is expected of a complete plan."""
-        parts, plan = self.parts(accuracy), _plan_of(accuracy)
+        stages_ms = costs_of(self._kernels, self._threads).stages_ms(self._work(_plan_of(accuracy)))
+        return Chosen(self.settings.replace(accuracy=accuracy), self._image_parts(accuracy), stages_ms)
+
+    def error_db(self, accuracy: Accuracy) -> float:
+        """Return the predicted error of the image for a complete plan."""
+        return decibels(sum(self._image_parts(accuracy).values()))
+
+    def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
+        """Return False if a complete plan of an adaptive beamformer keeps the budget for delay-and-sum beams only.
+
+        The answer holds for any sound: it depends neither on the texture nor on the sensitivity of this planner.
+        """
+        if self.settings.processing.beamformer == "delay_and_sum":
+            return True
+        safe = Planner(self.settings, self._kernels, threads=self._threads)
+        return safe.error_db(accuracy) <= accuracy.max_error_db + _ROUNDED_DB
+
+    def _image_parts(self, accuracy: Accuracy) -> dict[str, float]:
+        parts = self.parts(accuracy)
         beams = sum(parts.values())
         amplified = self._sensitivity.output(beams) / beams if 0 < beams < math.inf else 1.0
-        parts = {name: amplified * power for name, power in parts.items()}
-        costs = costs_of(self._kernels, self._threads)
-        return Chosen(self._settings.replace(accuracy=accuracy), parts, costs.stages_ms(self._work(plan)))
+        return {name: amplified * power for name, power in parts.items()}
 
     def parts(self, accuracy: Accuracy) -> dict[str, float]:
         """Return the error power of each step of a complete plan, relative to the exact image."""
@@ -227,7 +245,7 @@ class Planner:
             return self._parts(_plan_of(accuracy))
 
     def _accuracy(self, plan: _Plan) -> Accuracy:
-        return self._settings.accuracy.replace(
+        return self.settings.accuracy.replace(
             precision=plan.precision,
             oversampling=plan.n_phases,
             delay_taps=plan.delay_taps,
@@ -248,7 +266,7 @@ class Planner:
         if nodes is not None:
             parts["beams"] = nodes.error
             parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
-        if self._settings.processing.wavefront == "spherical":
+        if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self._zone_error(plan.zones)
         if plan.precision == "int16":
             parts["samples"] = self._whole_numbers(delays, nodes)
@@ -289,8 +307,8 @@ class Planner:
 
     def _open_plans(self, budget: float) -> list[_Plan]:
         """Return the plans that the settings leave open and that fit into memory."""
-        given = self._settings.accuracy
-        adaptive = self._settings.processing.beamformer != "delay_and_sum"
+        given = self.settings.accuracy
+        adaptive = self.settings.processing.beamformer != "delay_and_sum"
         precisions = ["float32"] if given.precision == "auto" else [given.precision]
         if given.precision == "auto" and self._kernels.tile_ranges and not adaptive:
             precisions.append("int16")
@@ -316,7 +334,7 @@ class Planner:
 
     def _open_delays(self, budget: float, *, adaptive: bool) -> list[tuple[int, int]]:
         """Return which samples and taps are worth a try: those that keep the budget and are not needlessly exact."""
-        given = self._settings.accuracy
+        given = self.settings.accuracy
         phases = _PHASES if given.oversampling is None else (given.oversampling,)
         taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
         if INTERPOLATIONS[given.interpolation] or adaptive:
@@ -333,7 +351,7 @@ class Planner:
 
     def _open_nodes(self, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
         """Return which nodes are worth a try, and that every direction's own beam is."""
-        given = self._settings.accuracy
+        given = self.settings.accuracy
         flat = self._aperture.n_axes in {1, 2} and len(self._window.range_m) >= FEWEST_RANGES
         if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
             return [(0, given.beam_density or 2.0)]
@@ -352,17 +370,17 @@ class Planner:
 
     def _stop_bands_db(self, budget: float) -> list[float]:
         """Return the stop bands that leave some of the budget to other parts, the best one where none does."""
-        if self._settings.accuracy.stop_band_db is not None:
-            return [self._settings.accuracy.stop_band_db]
+        if self.settings.accuracy.stop_band_db is not None:
+            return [self.settings.accuracy.stop_band_db]
         errors = {stop_band_db: self._filter(stop_band_db)[1] for stop_band_db in _STOP_BANDS_DB}
         enough = [stop_band_db for stop_band_db, error in errors.items() if error < budget]
         return enough[:_STOP_BANDS] or [min(errors, key=lambda stop_band_db: errors[stop_band_db])]
 
     def _zone_count(self, budget: float) -> int:
         """Return as many zones as keep their part small; it falls with the square of their number."""
-        if self._settings.accuracy.zones is not None:
-            return self._settings.accuracy.zones
-        if self._settings.processing.wavefront == "plane":
+        if self.settings.accuracy.zones is not None:
+            return self.settings.accuracy.zones
+        if self.settings.processing.wavefront == "plane":
             return 1
         count = 1
         while self._zone_error(count) > _SMALL * budget and count < MOST_ZONES:
@@ -370,7 +388,7 @@ class Planner:
         return count
 
     def _made_zones(self, count: int) -> list[tuple[int, int, float]]:
-        return zones_of(self._settings.replace(accuracy=self._settings.accuracy.replace(zones=count)))
+        return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(zones=count)))
 
     def _zone_error(self, count: int) -> float:
         bend_2 = squared_bend(self._window.range_m, self._zones(count))
@@ -381,7 +399,7 @@ class Planner:
         return self.model.zones(self._aperture, 1.0, sound_speed_m_s=self._speed_m_s)
 
     def _made_delays(self, n_phases: int, interpolation: str, n_taps: int) -> _Delays:
-        step_s = 1 / (self._settings.output_rate_hz * n_phases)
+        step_s = 1 / (self.settings.output_rate_hz * n_phases)
         fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
         return _Delays(
             n_taps=fit.n_taps,
@@ -402,7 +420,7 @@ class Planner:
         return fit.split(delays_s)[1].ravel()
 
     def _count_nodes(self, n_taps: int, density: float) -> int:
-        high_hz = self._settings.call.high_frequency_hz
+        high_hz = self.settings.call.high_frequency_hz
         spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
         return self._aperture.count_nodes(spacing, n_taps)
 
@@ -413,7 +431,7 @@ class Planner:
             self._spectrum,
             n_taps=n_taps,
             density=density,
-            high_hz=self._settings.call.high_frequency_hz,
+            high_hz=self.settings.call.high_frequency_hz,
             sound_speed_m_s=self._speed_m_s,
             estimate=True,
             nearest_m=self._nearest_m,
@@ -423,9 +441,9 @@ class Planner:
 
     def _made_filter(self, stop_band_db: float) -> tuple[NDArray[Any], float]:
         try:
-            taps = chain_taps(self._settings.replace(accuracy=Accuracy(stop_band_db=stop_band_db)))
+            taps = chain_taps(self.settings.replace(accuracy=Accuracy(stop_band_db=stop_band_db)))
         except ArgumentError:
-            if self._settings.accuracy.stop_band_db is not None or stop_band_db == _STOP_BANDS_DB[0]:
+            if self.settings.accuracy.stop_band_db is not None or stop_band_db == _STOP_BANDS_DB[0]:
                 raise
             return np.ones(1, dtype=np.int16), math.inf
         return taps, self.model.filter(taps)
@@ -450,14 +468,14 @@ class Planner:
 
     @property
     def _nearest_m(self) -> float:
-        if self._settings.processing.wavefront == "plane":
+        if self.settings.processing.wavefront == "plane":
             return math.inf
         return max(float(self._window.range_m[0]), NEAREST_M)
 
     @functools.cached_property
     def _n_bins(self) -> int:
-        low_hz, high_hz = matched_band_hz(self._settings)
-        return math.ceil((high_hz - low_hz) * self._window.n_fft / self._settings.signal_rate_hz)
+        low_hz, high_hz = matched_band_hz(self.settings)
+        return math.ceil((high_hz - low_hz) * self._window.n_fft / self.settings.signal_rate_hz)
 
     def _reach_s(self) -> float:
         positions_m = self._aperture.square_m2
