@@ -206,8 +206,8 @@ def form(report: dict[str, Any]) -> str:
     return (
         f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
         f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
-        f"relative to the independent float64 image: in up to {_DIRECTIONS} directions for delay-and-sum, bright ones more "
-        "often, and in all directions for adaptive beamformers. "
+        f"relative to the independent float64 image: in up to {_DIRECTIONS} directions for delay-and-sum, bright ones "
+        "more often, and in all directions for adaptive beamformers. "
         f"{sentence(report['machine'])}"
     )
 

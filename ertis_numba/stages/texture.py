@@ -50,7 +50,10 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     form = word_format(settings)
     words, _ = form.normalised(form.checked(measurement.words))  # all that is measured here is relative
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
-    heard, lead = chain.analytic(words, image)
+    try:
+        heard, lead = chain.analytic(words, image)
+    finally:
+        chain.close()
     analytic = heard[:, :, lead:]
     n_mics, n_phases, _ = analytic.shape
     gain = microphones(settings.array).gain[microphones(settings.array).enabled, None]

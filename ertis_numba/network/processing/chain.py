@@ -42,7 +42,7 @@ class Chain:
 
     def __init__(self, settings: str, device: str) -> None:
         said = Settings.from_toml(settings, "settings of a sensor", find_line=False)
-        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES)
+        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES, predict=False)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self._format = word_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)
