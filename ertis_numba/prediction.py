@@ -8,13 +8,14 @@ import numpy as np
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import microphones
 from ertis_numba.kernels import KernelSet
-from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.planner import TABLE_BYTES, Planner
 from ertis_numba.stages.sensitivity import Sensitivity
-from ertis_numba.stages.texture import texture_of
+from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
 from ertis_numba.verification import sampled_error_db
 
-__all__ = ["BudgetMonitor", "BudgetScope", "Noted", "Prediction", "planner_of", "predict"]
+__all__ = ["BudgetMonitor", "BudgetScope", "Noted", "Prediction", "memory_bytes", "planner_of", "predict"]
 
 BudgetScope = Literal["image", "beams"]
 
@@ -128,6 +129,15 @@ def predict(planner: Planner) -> Prediction:
         budget_applies_to="image" if planner.keeps_budget_of_images(settings.accuracy) else "beams",
         beamformer=beamformer,
     )
+
+
+def memory_bytes(image: Energyscape) -> int:
+    """Return an estimate of the memory for a prediction: tables of a rough image, that image and its squares."""
+    settings = image.settings
+    n_mics = int(microphones(settings.array).enabled.sum())
+    n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
+    table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
+    return table + 20 * image.energy.size
 
 
 class BudgetMonitor:

@@ -27,7 +27,7 @@ from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
 
-__all__ = ["Chosen", "Planner", "complete"]
+__all__ = ["TABLE_BYTES", "Chosen", "Planner", "complete"]
 
 _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
@@ -35,7 +35,7 @@ _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0),
 _STOP_BANDS_DB = (40.0, 60.0, 80.0, 100.0, 120.0, 140.0)
 _STOP_BANDS = 3  # of them are tried: more damping than that is of no use
 _MOST_BYTES = 2**31  # of a plan's signals, and of its delays
-_TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
+TABLE_BYTES = 44  # of a delay and a weight, as they are made and as kernels take them
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
 _ROUNDED_DB = 1e-6
 _MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
@@ -302,7 +302,7 @@ class Planner:
         """Whether signals, tiles and delays fit into memory."""
         nodes = self._nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self._n_directions if nodes is None else nodes.count
-        table = _TABLE_BYTES * n_beams * self._n_mics * plan.delay_taps * len(self._zones(plan.zones))
+        table = TABLE_BYTES * n_beams * self._n_mics * plan.delay_taps * len(self._zones(plan.zones))
         return table + 16 * self._n_mics * plan.n_phases * self._window.n_outputs <= self._most_bytes
 
     def _open_plans(self, budget: float) -> list[_Plan]:
