@@ -10,7 +10,8 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.kernels import KernelSet
-from ertis_numba.stages.planner import TABLE_BYTES, Planner
+from ertis_numba.stages.plan_model import TABLE_BYTES
+from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
 from ertis_numba.verification import sampled_error_db
