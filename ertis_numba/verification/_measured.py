@@ -17,7 +17,7 @@ __all__ = ["Measured", "error_db", "exact_image", "measure", "sampled", "sampled
 
 _MAX_OPERATIONS = 3e9  # complex multiplications: some ten seconds of one core
 _QUICK_OPERATIONS = 3e8
-_MIN_DIRECTIONS = 8
+_MIN_DIRECTIONS = 16
 
 
 @dataclass(frozen=True, slots=True)
