@@ -17,7 +17,8 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it does not let this one in, or not do what was asked
 
-Each class also inherits the builtin that a caller would catch without knowing this package.
+Each class also inherits the builtin that a caller would catch without knowing this package. One warning stands beside
+them: ``ErrorBudgetWarning (UserWarning)``, for images that may exceed their error budget.
 """
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "DamagedError",
     "DataError",
     "DeviceError",
+    "ErrorBudgetWarning",
     "ErtisError",
     "ForeignDataError",
     "FormatVersionError",
@@ -92,3 +94,7 @@ class NetworkError(ErtisError, OSError):
 
 class RefusedError(NetworkError):
     """Another node does not let this one in, or does not do what was asked."""
+
+
+class ErrorBudgetWarning(UserWarning):
+    """Images may exceed the error budget that the pipeline was made for."""

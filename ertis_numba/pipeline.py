@@ -1,13 +1,14 @@
 """From measurements to energyscapes."""
 
+import warnings
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.errors import ArgumentError, DataError, DeviceError, ErrorBudgetWarning
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
@@ -16,6 +17,9 @@ from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.memory import require_memory
 from ertis_numba.words import word_format
+
+if TYPE_CHECKING:
+    from ertis_numba.prediction import BudgetMonitor, Prediction
 
 __all__ = ["Pipeline"]
 
@@ -41,6 +45,10 @@ class Pipeline:
     max_bytes : int, optional
         Limit on the predicted memory, checked before any is allocated. By default, only a plan's tables are limited, to
         2 GiB.
+    predict : bool
+        Predict the error of the first image, and of each image that is 10 dB fainter than all predicted before. Issue
+        an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
+        another image. The paper's method has no budget and no prediction.
 
     Attributes
     ----------
@@ -78,6 +86,7 @@ class Pipeline:
         max_error_db: float | str | None = None,
         graphs: bool = False,
         max_bytes: int | None = None,
+        predict: bool = True,
     ) -> None:
         left_bytes = None if max_bytes is None else require_memory(settings, max_bytes)
         if isinstance(max_error_db, str):
@@ -100,6 +109,8 @@ class Pipeline:
         self._accepted = settings
         self._format = word_format(settings)
         self._closed = False
+        self._monitor = _monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
+        self._warned = False
         self._chain = self._made_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
@@ -128,7 +139,9 @@ class Pipeline:
         words, exponent = self._words_of(measurement)
         energy = self._chain.new_image() if out is None else self._checked_out(out)
         self._chain.process(words, energy, threads=threads)
-        return self._energyscape(_rescaled(energy, exponent), measurement)
+        image = self._energyscape(_rescaled(energy, exponent), measurement)
+        self._check_budget(image, measurement)
+        return image
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, bit by bit as `process` gives them.
@@ -151,10 +164,18 @@ class Pipeline:
         words = [self._words_of(measurement) for measurement in batch]
         energies = [self._chain.new_image() for _ in batch]
         self._chain.process_batch([each for each, _ in words], energies)
-        return [
+        images = [
             self._energyscape(_rescaled(energy, exponent), measurement)
             for energy, (_, exponent), measurement in zip(energies, words, batch, strict=True)
         ]
+        for image, measurement in zip(images, batch, strict=True):
+            self._check_budget(image, measurement)
+        return images
+
+    @property
+    def prediction(self) -> "Prediction | None":
+        """Latest predicted error beside its budget; None before the first image that is not silent."""
+        return None if self._monitor is None else self._monitor.prediction
 
     def close(self) -> None:
         """Give back the memory of the device, when threads that are processing are done. Images that were made stay."""
@@ -168,6 +189,19 @@ class Pipeline:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
+        """Predict the error of an image if it needs a prediction, and issue the warning once."""
+        if self._monitor is None or self._warned:
+            return
+        try:
+            prediction = self._monitor.check(image, measurement)
+            text = prediction.warning if prediction else ""
+        except DeviceError as error:
+            text = f"the error of images is not predicted: {error}"
+        if text:
+            self._warned = True
+            warnings.warn(text, ErrorBudgetWarning, stacklevel=3)
 
     def _made_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
         """Return the chain, its kernels compiled and its buffers made."""
@@ -222,6 +256,16 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
         return out
+
+
+def _monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | None":
+    """Return a monitor of the budget; simulated kernels would take minutes for a prediction."""
+    if kernel_set.simulated:
+        return None
+    # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
+    from ertis_numba.prediction import BudgetMonitor  # noqa: PLC0415
+
+    return BudgetMonitor(kernel_set, threads)
 
 
 def _rescaled(energy: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:

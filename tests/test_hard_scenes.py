@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import (
     Ambient,
@@ -125,12 +126,13 @@ def test_a_target_upon_a_wall():
     assert len(sorted_ways(scene, "occlusion")[0]) == 1  # what touches a wall is not behind it
 
 
-def test_a_sensor_inside_a_sphere():
+def test_a_sensor_inside_a_sphere_is_refused():
     scene = scene_of(
         sensor=FULL,
         spheres=(Sphere(position_m=(0.0, 0.0, 0.0), radius_m=0.5), Sphere(position_m=(0.1, 0.0, 0.0), radius_m=0.5)),
     )
-    assert np.all(np.isfinite(heard(scene, *EFFECTS)))
+    with pytest.raises(ArgumentError, match=r"spheres\[0\] is 0 m from emitter of"):
+        heard(scene, *EFFECTS)
 
 
 def test_two_sensors_in_one_place():

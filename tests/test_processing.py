@@ -206,3 +206,19 @@ def test_threads_of_one_measurement_change_its_image_by_nothing():
         with pytest.raises(ArgumentError, match="threads is 0"):
             pipeline.process(MEASUREMENT, threads=0)
         assert np.array_equal(pipeline.process(MEASUREMENT).energy, wanted.energy)
+
+
+def test_missed_error_budget_is_logged_once_per_sensor():
+    silence = np.zeros_like(MEASUREMENT.words)
+    silence[::2] = ~silence[::2]
+    with driven(device="cpu") as loop:
+        for sensor in ("loud", "quiet"):
+            loop.processing.know(hello(sensor), SHORT)
+        for _ in range(3):
+            loop.offer("loud")
+            loop.offer("quiet", silence)
+            loop.settle()
+        loop.until(lambda: any(event == "error_budget" for event, _ in loop.lines))
+        found = [fields for event, fields in loop.lines if event == "error_budget"]
+    assert [fields["sensor"] for fields in found] == ["quiet"]
+    assert "images may exceed the error budget" in found[0]["text"]

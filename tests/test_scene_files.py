@@ -28,7 +28,10 @@ from ertis_numba.simulation import (
     Wall,
     load_scene,
 )
+from ertis_numba.simulation.limits import require_clear
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR
 
 # ---- there and back --------------------------------------------------------------------------------
@@ -90,7 +93,8 @@ scenes = st.builds(
     sensors=st.lists(sensors, min_size=1, max_size=3).map(
         lambda found: tuple(sensor.replace(name=f"s{number}") for number, sensor in enumerate(found))
     ),
-    points=things(Point, strength_db=st.floats(-300, 120), facing_deg=st.none() | directions),
+    points=things(Point, strength_db=st.floats(-300, 120))
+    | things(Point, diameter_m=st.floats(1e-3, 10), facing_deg=st.none() | directions),
     spheres=things(Sphere, radius_m=st.floats(1e-3, 10)),
     walls=things(Wall, facing_deg=directions, size_m=st.none() | st.tuples(st.floats(0.1, 9), st.floats(0.1, 9))),
     boxes=things(Box, fixed, size_m=st.tuples(*(st.floats(0.1, 9) for _ in range(3)))),
@@ -176,6 +180,14 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         ("[[points]]\nrange_m = 1\nvelocity_m_s = [0, 101, 0]", r"point\.velocity_m_s is 101; give a number from -100"),
         ("[[points]]\nrange_m = 1\nstrength_db = 121", r"point\.strength_db is 121; give a number from -300 to 120"),
         ("[[points]]\nrange_m = 1\ndiameter_m = 11", r"point\.diameter_m is 11; give a number from 0 to 10"),
+        (
+            "[[points]]\nrange_m = 1\nfacing_deg = [0, 10]",
+            r"point\.facing_deg is given, but a point without a diameter .*give point\.diameter_m",
+        ),
+        (
+            "[[sensors]]\nemitter.quality_factor = 5.0",
+            r"emitter\.quality_factor is 5, but the emitter has no resonance; give emitter\.resonance_hz",
+        ),
         ("[[points]]\nrange_m = 1\nfacing_deg = [0, 99]", r"point\.facing_deg elevation is 99; give a number from -90"),
         (
             "[[points]]\nrange_m = 1\nfacing_deg = [999, 0]",
@@ -301,3 +313,37 @@ def test_an_error_in_a_long_scene_is_found_soon():
     with pytest.raises(SettingsError, match=r"scene, line 2002, points\[1000\]: unknown key `rnage_m`"):
         Scene.from_toml("\n".join(lines))
     assert time.perf_counter() - started_s < 5
+
+
+@pytest.mark.parametrize(
+    ("text", "refused"),
+    [
+        (
+            "[[spheres]]\nposition_m = [0, 0, 0]\nradius_m = 1.0",
+            r"spheres\[0\] is 0 m from emitter of sensor and has a radius of 1 m; leave at least 1 mm",
+        ),
+        (
+            "[[sensors]]\nemitter.position_m = [1, 0, 0]\n[[spheres]]\nrange_m = 1.0\nradius_m = 0.1",
+            r"spheres\[0\] is 0 m from emitter of sensor and",
+        ),
+        (
+            "[[sensors]]\nemitter.silent = true\n[[spheres]]\nposition_m = [0.1, 0, 0]\nradius_m = 0.1",
+            r"spheres\[0\] is 0\.1\d* m from microphone \d+ of sensor and has",
+        ),
+        ("[[points]]\nposition_m = [0, 0, 0]", r"points\[0\] is 0 m from emitter of sensor; leave"),
+        (
+            "count = 3\nrate_hz = 1\n[[spheres]]\nposition_m = [2, 0, 0]\nvelocity_m_s = [-1, 0, 0]\nradius_m = 0.5",
+            r"spheres\[0\] is 0 m from emitter of sensor at 2 s and",
+        ),
+    ],
+)
+def test_targets_around_emitters_or_microphones_are_refused(text, refused):
+    with pytest.raises(ArgumentError, match=refused):
+        make_plan(Scene.from_toml(text))
+
+
+def test_clear_targets_and_silent_emitters_inside_spheres_are_accepted():
+    text = (
+        "[[sensors]]\nemitter.silent = true\nemitter.position_m = [1, 0, 0]\n[[spheres]]\nrange_m = 1\nradius_m = 0.1"
+    )
+    require_clear(snapshot(scene := Scene.from_toml(text), scene.sensor(), 0.0))

@@ -92,7 +92,11 @@ def tried(seed: int) -> dict[str, Any] | None:
             predicted_db, stored = images.predicted_error_db, images.error_warning
     if not np.any(image.energy):
         return None
-    chosen, weights = verification.sampled(np.square(image.energy, dtype=np.float64).sum(axis=1), _DIRECTIONS)
+    # Predictions for adaptive beamformers are measured in a sample of the directions: all are compared here.
+    if settings.processing.beamformer == "delay_and_sum":
+        chosen, weights = verification.sampled(np.square(image.energy, dtype=np.float64).sum(axis=1), _DIRECTIONS)
+    else:
+        chosen, weights = np.arange(len(image.energy)), np.ones(len(image.energy))
     verifier, ranges = verification.ExactImage(image, measurement), np.arange(image.energy.shape[1])
     exact = np.stack([verifier.amplitudes(direction, ranges) for direction in chosen.tolist()])
     scale = np.sqrt(weights)[:, None]
@@ -202,7 +206,8 @@ def form(report: dict[str, Any]) -> str:
     return (
         f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
         f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
-        f"relative to the independent float64 image, in up to {_DIRECTIONS} directions, bright ones more often. "
+        f"relative to the independent float64 image: in up to {_DIRECTIONS} directions for delay-and-sum, bright ones "
+        "more often, and in all directions for adaptive beamformers. "
         f"{sentence(report['machine'])}"
     )
 

@@ -15,8 +15,8 @@ from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.stages.accuracy import decibels
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
-from ertis_numba.stages.fast import spectrum_of
 from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["CASES", "run"]
 

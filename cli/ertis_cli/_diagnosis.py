@@ -104,7 +104,7 @@ def _processor(_folder: Path) -> Iterator[Finding]:
         "unset NUMBA_NUM_THREADS to use all" if few else "",
     )
     settings = Settings()
-    with Pipeline(settings, device="cpu") as pipeline:
+    with Pipeline(settings, device="cpu", predict=False) as pipeline:
         silence = Measurement(_silence(settings.recording.n_samples), settings)
         times_s = []
         for _ in range(_RUNS):

@@ -47,6 +47,11 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     accuracy = Accuracy(**plan["accuracy"])
     sample = _INTERPOLATIONS[accuracy.interpolation].format(n=accuracy.delay_taps)
     yield f"plan of {sensor}, for an error of {accuracy.max_error_db:g} dB at the most:"
+    if plan["budget_applies_to"] == "beams":
+        yield (
+            "  no plan keeps this budget for every image of this adaptive beamformer; "
+            "this one keeps it for delay-and-sum beams of the same signals"
+        )
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
     yield f"  {precision}, {kept} kept per range, a delayed one is {sample}"

@@ -132,8 +132,12 @@ def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
     """Return the predicted error and the budget, where a file has them."""
     if reader.predicted_error_db is None:
         return {}
-    warned = {"error_warning": reader.error_warning} if reader.error_warning else {}
-    return {"predicted_error_db": reader.predicted_error_db, "max_error_db": reader.max_error_db, **warned}
+    texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}
+    return {
+        "predicted_error_db": reader.predicted_error_db,
+        "max_error_db": reader.max_error_db,
+        **{name: text for name, text in texts.items() if text},
+    }
 
 
 def _tell_health(path: Path, *, as_json: bool) -> None:

@@ -216,7 +216,7 @@ def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads
     with note_when_slow(PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.pipeline import Pipeline
 
-        return Pipeline(settings, device=device, threads=threads)
+        return Pipeline(settings, device=device, threads=threads, predict=False)
 
 
 def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001

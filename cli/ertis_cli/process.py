@@ -201,7 +201,7 @@ def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as
             yield [stack.enter_context(wait(settings)) for settings in several]
 
     def show(sensor: str, told: dict[str, Any]) -> None:
-        for line in () if as_json else _plans.said_of(sensor, told):
+        for line in () if as_json or quiet else _plans.said_of(sensor, told):
             click.echo(line, err=True)
 
     with making(

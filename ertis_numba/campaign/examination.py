@@ -10,11 +10,11 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.prediction import planner_of
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
 from ertis_numba.stages.beam_nodes import Aperture
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.prediction import planner_of
 
 __all__ = ["examine"]
 
@@ -43,7 +43,7 @@ def examine(
     verify : bool
         Yield the true error of the image of ``first`` beside those that were predicted.
     heard : Planner, optional
-        Planner from `prediction.planner_of`, if there is one already.
+        Planner from `planner_of`, if there is one already.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def examine(
     n_threads = kernel_set.max_threads if threads is None else threads
     planners = {
         "safe": Planner(settings, kernel_set, threads=n_threads),
-        "texture": heard or planner_of(first, settings, kernel_set, threads=n_threads),
+        "texture": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
     }
     if explain:
         yield "plan", _plan(planners, settings)
@@ -90,6 +90,7 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
         "stages_ms": {name: round(time_ms, 3) for name, time_ms in safe.stages_ms.items()},
         "time_ms": round(safe.time_ms, 3),
         "costs": str(planners["safe"].costs_file),
+        "budget_applies_to": "image" if planners["safe"].keeps_budget_of_images(settings.accuracy) else "beams",
         "decimated": settings.recording.is_pdm or settings.decimation != 1,
         "plane_waves": _plane_waves(planners["texture"].model, settings),
     }

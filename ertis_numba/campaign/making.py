@@ -11,8 +11,8 @@ from ertis_numba.campaign.orders import Options
 from ertis_numba.campaign.sensor_run import SensorRun, faults_of
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
-from ertis_numba.stages.prediction import planner_of, predict
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
 
 __all__ = ["Making", "checked", "making"]
@@ -162,10 +162,13 @@ def _look_over(
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
         threads = kernel_set.max_threads if options.threads is None else options.threads
-        heard = planner_of(first, run.pipeline.settings, kernel_set, threads=threads)
-        run.prediction = predict(heard, run.pipeline.settings)
+        heard = planner_of(run.pipeline.process(first), first, kernel_set, threads=threads)
+        run.prediction = predict(heard)
         if run.prediction.warning:
-            warn(f"{recording.path}: sensor {recording.sensor}: {run.prediction.warning}")
+            remedy = "give a lower --max-error"
+            if not options.verify:
+                remedy = f"measure the error with --verify, or {remedy}"
+            warn(f"{recording.path}: sensor {recording.sensor}: {run.prediction.warning}; {remedy}")
     if not (options.explain or options.verify):
         return
     from ertis_numba.campaign.examination import examine  # noqa: PLC0415  it takes time to load, and few want it

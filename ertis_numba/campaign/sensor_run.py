@@ -16,7 +16,7 @@ from ertis_numba.stages.health import health
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 
 if TYPE_CHECKING:
-    from ertis_numba.stages.prediction import Prediction
+    from ertis_numba.prediction import Prediction
 
 __all__ = ["SensorRun", "faults_of"]
 

@@ -149,7 +149,7 @@ def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -
     try:
         for key, given in zip(keys, settings, strict=True):
             if key not in found:  # sensors that are alike share theirs
-                found[key] = Pipeline(given, device=device, threads=threads)
+                found[key] = Pipeline(given, device=device, threads=threads, predict=False)
         yield [found[key] for key in keys]
     finally:
         _keep(found)

@@ -9,8 +9,8 @@ from ertis_numba import fft, kernels
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages.fast import chain_taps
 from ertis_numba.stages.matched_filter import MatchedFilter
+from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.signals import signals_of
 from ertis_numba.stages.window import time_window
 

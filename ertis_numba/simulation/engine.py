@@ -13,6 +13,7 @@ from ertis_numba.geometry import Layout, microphones
 from ertis_numba.simulation import synthesis
 from ertis_numba.simulation.arrivals import arrivals, effect, gains
 from ertis_numba.simulation.converter import Converter
+from ertis_numba.simulation.limits import require_clear
 from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
@@ -98,7 +99,9 @@ class Engine:
 
     def _shot(self, index: int) -> Snapshot:
         checks.whole("index", index, 0)
-        return snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
+        shot = snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
+        require_clear(shot)
+        return shot
 
     def converted(self, signals: NDArray[np.float64], draw: int) -> NDArray[Any]:
         """Return the output words of modulators or converters for signals with all noise but their own.

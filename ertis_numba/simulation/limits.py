@@ -1,12 +1,17 @@
-"""Limits of the models of targets."""
+"""Limits of the models of targets: places that a target cannot have, and notes on inaccurate echoes."""
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
+from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["near_discs"]
+__all__ = ["near_discs", "require_clear"]
+
+_MIN_DISTANCE_M = 1e-3
 
 
 def near_discs(shot: Snapshot) -> list[str]:
@@ -22,4 +27,41 @@ def near_discs(shot: Snapshot) -> list[str]:
         f"{targets.names[k]} is a disc of {targets.diameter_m[k]:g} m at {apart_m[k]:.2g} m from {shot.sensor.name}; "
         f"its echo is accurate from {least_m[k]:.2g} m on. Make it smaller, move it away, or use a wall with size_m"
         for k in np.flatnonzero((targets.diameter_m > 0) & (apart_m < least_m))
+    ]
+
+
+def require_clear(shot: Snapshot) -> None:
+    """Refuse targets that touch or enclose a microphone of the sensor or an emitter.
+
+    Raises
+    ------
+    ArgumentError
+        A surface is closer than 1 mm, or around the place.
+    """
+    targets = shot.targets
+    places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}
+    places |= {
+        f"microphone {channel} of {shot.sensor.name}": place
+        for channel, place in zip(shot.channels, shot.ear.positions_m, strict=True)
+    }
+    apart_m = np.linalg.norm(targets.positions_m[:, None] - np.array([*places.values()]), axis=2)
+    blocked = np.argwhere(apart_m < targets.radius_m[:, None] + _MIN_DISTANCE_M)
+    if not len(blocked):
+        return
+    target, place = blocked[0]
+    at = f" at {shot.time_s:g} s" if shot.scene.moves else ""
+    radius_m = targets.radius_m[target]
+    surface = f" and has a radius of {radius_m:g} m" if radius_m else ""
+    raise ArgumentError(
+        f"{targets.names[target]} is {apart_m[target, place]:.3g} m from {[*places][place]}{at}{surface}; "
+        f"leave at least {1000 * _MIN_DISTANCE_M:g} mm between them"
+    )
+
+
+def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
+    """Return the sensors that emit, and the positions of their emitters."""
+    return [
+        (other, mouth.position_m + other.rotation() @ np.array(other.emitter.position_m))
+        for other, mouth in zip(shot.scene.sensors, shot.mouths, strict=True)
+        if not other.emitter.silent
     ]

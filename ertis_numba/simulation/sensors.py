@@ -20,6 +20,7 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # what can stand in a file
 _LARGEST_M = 0.2  # of an emitter or a microphone
 _MAX_OFFSET_M = 10.0  # one housing; whatever stands farther away is a sensor of its own
 _QUALITY_FACTORS = 1e-6, 200.0  # from a film that sends all alike to a bare crystal
+_QUALITY_FACTOR = 5.0
 _MAX_DRIFT_PPM = 1000.0
 
 
@@ -41,8 +42,8 @@ class Emitter(Table, frozen=True, kw_only=True):
         Position in the sensor frame, whose origin is the centroid of the enabled microphones.
     resonance_hz : float, optional
         Resonance of the transducer, which then filters the call and rings; the response is flat by default.
-    quality_factor : float
-        Quality factor of the resonance: its bandwidth is ``resonance_hz / quality_factor``.
+    quality_factor : float, optional
+        Quality factor of the resonance, whose bandwidth is ``resonance_hz / quality_factor``; 5 by default.
     """
 
     level_db: float = 0.0
@@ -51,18 +52,29 @@ class Emitter(Table, frozen=True, kw_only=True):
     silent: bool = False
     position_m: Vector = (0.0, 0.0, 0.0)
     resonance_hz: float | None = None
-    quality_factor: float = 5.0
+    quality_factor: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_vector("emitter.position_m", self.position_m, _MAX_OFFSET_M)
         if self.resonance_hz is not None:
             checks.between("emitter.resonance_hz", self.resonance_hz, 1e3, 1e6)
-        checks.between("emitter.quality_factor", self.quality_factor, *_QUALITY_FACTORS)
+        if self.quality_factor is not None:
+            checks.between("emitter.quality_factor", self.quality_factor, *_QUALITY_FACTORS)
+            if self.resonance_hz is None:
+                raise ArgumentError(
+                    f"emitter.quality_factor is {self.quality_factor:g}, but the emitter has no resonance; "
+                    "give emitter.resonance_hz, or leave quality_factor out"
+                )
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
         checks.between("emitter.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
         if self.direct_sound_db is not None:
             checks.between("emitter.direct_sound_db", self.direct_sound_db, -300.0, _LOUDEST_DB)
+
+    @property
+    def resonance_quality(self) -> float:
+        """Quality factor of the resonance."""
+        return _QUALITY_FACTOR if self.quality_factor is None else self.quality_factor
 
 
 class Electronics(Table, frozen=True, kw_only=True):

@@ -39,6 +39,11 @@ class Point(Placed, frozen=True, kw_only=True):
         if self.facing_deg is not None:
             checks.between("point.facing_deg azimuth", self.facing_deg[0], -180.0, 180.0)
             checks.between("point.facing_deg elevation", self.facing_deg[1], -90.0, 90.0)
+            if not self.diameter_m:
+                raise ArgumentError(
+                    "point.facing_deg is given, but a point without a diameter returns sound alike in all directions; "
+                    "give point.diameter_m for a disc, or leave facing_deg out"
+                )
 
     def normal_at(self, time_s: float) -> NDArray[np.float64]:
         """Return the unit vector in which a disc faces: (axis,) float64."""

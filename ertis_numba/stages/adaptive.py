@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,6 @@ class AdaptiveBeamform:
         offsets: NDArray[np.int32],
         weights: NDArray[np.complex64],
     ) -> None:
-        self._processing, self._offsets, self._weights = processing, offsets, weights
         n_mics = offsets.shape[1]
         places = memory.table(offsets)
         combine: dict[str, Callable[[], _Combine]] = {
@@ -62,13 +60,6 @@ class AdaptiveBeamform:
     def __call__(self, analytic: NDArray[np.complex64], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         self._combine(analytic, out)
-
-    def with_weights(
-        self, kernels: KernelSet, memory: Memory, beams: NDArray[np.intp], factors: NDArray[np.complex128]
-    ) -> Self:
-        """Return the same beamformer for some of the directions, its weights multiplied by (beam, mic) factors."""
-        weights = (self._weights[beams] * factors).astype(np.complex64)
-        return type(self)(self._processing, kernels, memory, np.ascontiguousarray(self._offsets[beams]), weights)
 
 
 def _coherence_factor(kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64]) -> _Combine:

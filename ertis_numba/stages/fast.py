@@ -2,89 +2,34 @@
 
 import functools
 import math
-import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
-from ertis_numba.kernels import KernelSet, Lane
-from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
-from ertis_numba.stages.beamform import Buffers, beamform
+from ertis_numba.stages.beamform import beamform
+from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import FilterPcm, demodulation
-from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum, one_thread
+from ertis_numba.stages.fitting import DelayFit, one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
+from ertis_numba.stages.plan_elements import ahead_of, chain_taps, ringing_db, spectrum_of, zones_of
 from ertis_numba.stages.window import time_window
-from ertis_numba.stages.zones import zone_edges
-from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
 
-__all__ = ["FastChain", "ahead_of", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
+__all__ = ["FastChain"]
 
 _TINY = 1e-30
-_PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
-_MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
-_SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
-
-
-def spectrum_of(settings: Settings) -> Spectrum:
-    """Return where the matched filter has its power, as if its input were white."""
-    step, edges_hz = settings.decimation, settings.processing.band_edges_hz
-    processing = Processing(range_decimation=step, decimation=step, band_edges_hz=edges_hz)
-    recording = Recording(sample_rate_hz=settings.recording.sample_rate_hz)
-    return _spectrum_of(Settings(call=settings.call, recording=recording, processing=processing))
-
-
-@functools.lru_cache(maxsize=8)
-def _spectrum_of(settings: Settings) -> Spectrum:
-    """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
-    return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
-
-
-def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return the decimation filter of a complete plan; PCM that is not decimated needs none."""
-    if settings.decimation == 1 and not settings.recording.is_pdm:
-        return whole_taps(np.ones(1))
-    stop_band_db = settings.accuracy.stop_band_db or 60.0
-    taps = decimation_taps(
-        sample_rate_hz=settings.recording.sample_rate_hz,
-        decimation=settings.decimation,
-        pass_hz=matched_band_hz(settings)[1],
-        stop_band_db=stop_band_db,
-    )
-    return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)
-
-
-def ringing_db(settings: Settings) -> float:
-    """Return the level below its peak at which the ringing of the matched filter may be cut off.
-
-    The noise of PDM bits hides ringing below the stop band. PCM has no such noise. Sound outside the window may exceed
-    the image by the whole dynamic range, and ringing that is cut off or wraps around must stay below the error budget.
-    """
-    if not settings.recording.is_pdm:
-        return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
-    return max(60.0, 1.2 * (settings.accuracy.stop_band_db or 60.0) - 12.0)
-
-
-class _Buffers(NamedTuple):
-    """What one measurement at a time is written to on its way."""
-
-    lane: Lane
-    room: tuple[NDArray[np.float32], ...]
-    signals: NDArray[np.float32]
-    analytic: NDArray[np.complex64]
-    transforms: fft.Transforms
-    beamform: Buffers
 
 
 class FastChain:
@@ -112,7 +57,7 @@ class FastChain:
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
         self._memory = kernels.memory(graphs=graphs)
-        self._change = threading.Condition()
+        self._pool = BufferPool()
         with one_thread():
             self._make(settings, kernels, threads)
 
@@ -205,9 +150,6 @@ class FastChain:
                 table.offsets(window.n_outputs),
                 table.weights.astype(np.complex64),
             )
-        self._spare: list[_Buffers] = []
-        self._n_busy = 0
-        self._closed = False
 
     def process(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
@@ -226,7 +168,7 @@ class FastChain:
         if self._memory.n_lanes == 1:
             self._side_by_side(pairs)
             return
-        under_way: deque[_Buffers] = deque()
+        under_way: deque[MeasurementBuffers] = deque()
         try:
             for each, out in pairs:
                 if len(under_way) == self._memory.n_lanes:
@@ -242,10 +184,10 @@ class FastChain:
             for each, out in pairs:
                 self._finish(self._begin(each, out, self._threads))
         else:
-            deque(self._pool.map(lambda pair: self._finish(self._begin(pair[0], pair[1], 1)), pairs), maxlen=0)
+            deque(self._executor.map(lambda pair: self._finish(self._begin(pair[0], pair[1], 1)), pairs), maxlen=0)
 
     @functools.cached_property
-    def _pool(self) -> ThreadPoolExecutor:
+    def _executor(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
 
     def analytic(
@@ -259,44 +201,6 @@ class FastChain:
         finally:
             self._finish(buffers)
         return heard, self._lead
-
-    def sensitivity(
-        self, words: NDArray[np.unsignedinteger[Any]], error_power: float, *, most_beams: int, seed: int = 1
-    ) -> float:
-        """Return the relative error power of the image for weights of an adaptive beamformer with ``error_power``.
-
-        The error of each direction and microphone is an independent complex number with this power relative to the
-        weight. At most ``most_beams`` directions are compared; bright ones are preferred.
-
-        Raises
-        ------
-        ArgumentError
-            The beamformer is delay-and-sum, which is linear.
-        """
-        if self._adaptive is None:
-            raise ArgumentError(
-                "processing.beamformer is 'delay_and_sum'; give an adaptive one to measure its sensitivity"
-            )
-        image = np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
-        heard, _ = self.analytic(words, image)
-        chosen = _brightest(image, most_beams)
-        random = np.random.default_rng(seed)
-        shape = (len(chosen), heard.shape[0], 2)
-        errors = random.normal(scale=math.sqrt(error_power / 2), size=shape).view(np.complex128)[..., 0]
-        with self._taken(self._threads) as buffers:
-            images = []
-            analytic = buffers.lane.send(heard)
-            for factors in (np.ones_like(errors), 1 + errors):
-                combine = self._adaptive.with_weights(self._kernels, self._memory, chosen, factors)
-                out = np.empty((len(chosen), len(self.range_m)), dtype=np.float32)
-                target = buffers.lane.target(out)
-                combine(analytic, target)
-                buffers.lane.fetch(target, out)
-                buffers.lane.wait()
-                images.append(out.astype(np.float64))
-        self._finish(buffers)
-        power = float(np.sum(images[0] ** 2))
-        return float(np.sum((images[1] - images[0]) ** 2)) / power if power else 0.0
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
         """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
@@ -323,17 +227,14 @@ class FastChain:
 
     def close(self) -> None:
         """Give back the memory of the device, when the measurements that are under way are done."""
-        with self._change:
-            self._closed = True
-            self._change.wait_for(lambda: not self._n_busy)
-            self._spare.clear()
+        self._pool.close()
         for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
             self.__dict__.pop(name, None)
         self._memory.close()
 
     def _begin(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
-    ) -> _Buffers:
+    ) -> MeasurementBuffers:
         """Begin one measurement; its image is in ``out`` when the lane is done."""
         with self._taken(threads) as buffers:
             here = buffers.lane.send(words)
@@ -348,13 +249,13 @@ class FastChain:
                 buffers.lane.fetch(image, out)
         return buffers
 
-    def _finish(self, buffers: _Buffers) -> None:
+    def _finish(self, buffers: MeasurementBuffers) -> None:
         try:
             buffers.lane.wait()
         finally:
-            self._give_back(buffers)
+            self._pool.release(buffers)
 
-    def _image(self, buffers: _Buffers, out: NDArray[np.float32], threads: int) -> None:
+    def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
         self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
         if self._adaptive is None:
             self._beamform(buffers.analytic, buffers.beamform, out)
@@ -362,70 +263,21 @@ class FastChain:
             self._adaptive(buffers.analytic, out)
 
     @contextmanager
-    def _taken(self, threads: int) -> Iterator[_Buffers]:
-        """Run the enclosed kernels on buffers that no other thread uses; there are as many as ever ran at once.
-
-        Who has begun gives them back; so does this where that fails.
-
-        Raises
-        ------
-        ArgumentError
-            The chain is closed.
-        """
-        with self._change:
-            if self._closed:
-                raise ArgumentError("the pipeline is closed; make another one")
-            buffers = self._spare.pop() if self._spare else None
-            self._n_busy += 1
-        try:
-            buffers = self._new_buffers() if buffers is None else buffers
-            with self._kernels.threads(threads), buffers.lane.entered():
-                yield buffers
-        except BaseException:
-            self._give_back(None)  # what was begun on the buffers may not be over
-            raise
-
-    def _give_back(self, buffers: _Buffers | None) -> None:
-        with self._change:
-            if buffers is not None:
-                self._spare.append(buffers)
-            self._n_busy -= 1
-            self._change.notify_all()
+    def _taken(self, threads: int) -> Iterator[MeasurementBuffers]:
+        """Run the enclosed kernels on buffers that no other thread uses, until `_finish` releases them."""
+        with self._pool.acquired(self._new_buffers) as buffers, self._kernels.threads(threads), buffers.lane.entered():
+            yield buffers
 
     @functools.cached_property
     def _no_image(self) -> NDArray[np.float32]:
         """An array of an image's shape and of no size, for images that nobody fetches from a GPU."""
         return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
 
-    def _new_buffers(self) -> _Buffers:
+    def _new_buffers(self) -> MeasurementBuffers:
         memory, lane = self._memory, self._memory.lane()
         signals = memory.zeros(self._demodulate.shape, np.float32)
         analytic = memory.zeros(self._matched_filter.shape, np.complex64)
         transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
-        return _Buffers(lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers())
-
-
-def _brightest(image: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    """Return directions, half of them spread evenly and half of them the brightest: (direction,) intp."""
-    if len(image) <= count:
-        return np.arange(len(image))
-    power = np.sum(np.square(image, dtype=np.float64), axis=1)
-    even = np.linspace(0, len(image) - 1, count - count // 2).astype(np.intp)
-    return np.union1d(even, np.argsort(power)[-(count // 2) :])
-
-
-def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
-    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
-
-    Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
-    golden ratio's multiples any few of them are spread evenly.
-    """
-    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0 * step_s if fit.is_fitted else np.zeros(1)
-
-
-def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
-    """Return first range, the one after the last, and the distance whose delays hold, of each zone of a plan."""
-    range_m = time_window(settings, largest_delay_s=0.0, n_taps=1).range_m
-    if settings.processing.wavefront == "plane":
-        return [(0, len(range_m), math.inf)]
-    return zone_edges(range_m, settings.accuracy.zones or 1)
+        return MeasurementBuffers(
+            lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers()
+        )

@@ -8,7 +8,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.demodulate import demodulation
-from ertis_numba.stages.fast import chain_taps
+from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.window import TimeWindow
 from ertis_numba.words import word_format
 

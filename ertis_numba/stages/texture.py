@@ -18,7 +18,10 @@ from ertis_numba.stages.fitting import WAVES
 from ertis_numba.waveform import matched_band_hz, matched_filter, matched_spectrum
 from ertis_numba.words import word_format
 
-__all__ = ["texture_of"]
+__all__ = ["ROUGH_DELAY_TAPS", "ROUGH_ZONES", "texture_of"]
+
+ROUGH_DELAY_TAPS = 2
+ROUGH_ZONES = 8
 
 _TILE = 96  # ranges
 _MOST_MICS = 8  # whose noise is looked at
@@ -38,11 +41,11 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
             precision="float32",
             oversampling=min(64, max(2, math.ceil(2 * (high_hz - low_hz) / settings.output_rate_hz))),
             interpolation="linear",
-            delay_taps=2,
+            delay_taps=ROUGH_DELAY_TAPS,
             beam_taps=0,
             beam_density=2.0,
             stop_band_db=60.0,
-            zones=8,
+            zones=ROUGH_ZONES,
         ),
         processing=settings.processing.replace(beamformer="delay_and_sum"),
     )
@@ -50,7 +53,10 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
     form = word_format(settings)
     words, _ = form.normalised(form.checked(measurement.words))  # all that is measured here is relative
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
-    heard, lead = chain.analytic(words, image)
+    try:
+        heard, lead = chain.analytic(words, image)
+    finally:
+        chain.close()
     analytic = heard[:, :, lead:]
     n_mics, n_phases, _ = analytic.shape
     gain = microphones(settings.array).gain[microphones(settings.array).enabled, None]

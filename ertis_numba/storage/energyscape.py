@@ -91,8 +91,16 @@ class EnergyscapeWriter(Writer[Energyscape]):
         """
         self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
 
-    def note_error(self, sensor: str, *, predicted_error_db: float, max_error_db: float, error_warning: str) -> None:
-        """Store the predicted error of a sensor's images, the budget, and a warning if images may exceed it.
+    def note_error(
+        self,
+        sensor: str,
+        *,
+        predicted_error_db: float,
+        max_error_db: float,
+        budget_applies_to: Literal["image", "beams"],
+        error_warning: str,
+    ) -> None:
+        """Store the predicted error of a sensor's images, the budget, its scope, and a warning if images may exceed it.
 
         Call this before the sensor's first energyscape is written.
 
@@ -107,6 +115,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._predicted[sensor] = {
             "predicted_error_db": predicted_error_db,
             "max_error_db": max_error_db,
+            "budget_applies_to": budget_applies_to,
             "error_warning": error_warning,
         }
 
@@ -190,6 +199,9 @@ class EnergyscapeReader(Reader[Energyscape]):
     predicted_error_db, max_error_db : float, or None
         Error that the error model predicted for the first image, and the budget. None in older files and for images of
         the paper's method.
+    budget_applies_to : str
+        ``beams`` if the budget is that of delay-and-sum beams only, because no plan keeps it for images of the adaptive
+        beamformer; otherwise ``image``. Empty if the file does not hold it.
     error_warning : str
         Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
     """
@@ -205,6 +217,7 @@ class EnergyscapeReader(Reader[Energyscape]):
     rotation_xyzw: NDArray[np.float64] | None
     predicted_error_db: float | None
     max_error_db: float | None
+    budget_applies_to: str
     error_warning: str
 
     def _load(self) -> None:
@@ -215,8 +228,9 @@ class EnergyscapeReader(Reader[Energyscape]):
             _number(self.path, name, said[name]) if name in said else None
             for name in ("predicted_error_db", "max_error_db")
         )
-        warning = said.get("error_warning", "")
-        self.error_warning = warning.decode("utf-8", "replace") if isinstance(warning, bytes) else str(warning)
+        self.budget_applies_to, self.error_warning = (
+            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning")
+        )
         if "translation_m" not in said and "rotation_xyzw" not in said:
             self.translation_m = self.rotation_xyzw = None
             return
@@ -239,6 +253,10 @@ class EnergyscapeReader(Reader[Energyscape]):
             settings=self.settings,
             stamp=self._rows.stamp(index, self.sensor),
         )
+
+
+def _text(value: object) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def _number(path: Path, name: str, value: Any) -> float:

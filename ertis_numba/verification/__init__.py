@@ -1,7 +1,7 @@
 """Errors of images relative to exact ones, which are computed independently in float64."""
 
 from ertis_numba.verification._exact import ExactImage
-from ertis_numba.verification._measured import Measured, error_db, exact_image, measure, sampled
+from ertis_numba.verification._measured import Measured, error_db, exact_image, measure, sampled, sampled_error_db
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
 
 __all__ = [
@@ -14,4 +14,5 @@ __all__ = [
     "measure",
     "peak_errors",
     "sampled",
+    "sampled_error_db",
 ]

@@ -272,5 +272,5 @@ class Film:
         if pipeline is None or pipeline.settings.air != measurement.settings.air:
             if pipeline is not None:
                 pipeline.close()
-            pipeline = self._pipelines[name] = Pipeline(measurement.settings, device=self._device)
+            pipeline = self._pipelines[name] = Pipeline(measurement.settings, device=self._device, predict=False)
         return pipeline.process(measurement)

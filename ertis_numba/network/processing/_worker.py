@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.frames import Measurement
+from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.processing.child import pipe_of_child
 from ertis_numba.network.processing.notes import (
     Failed,
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from ertis_numba.network.processing.chain import Chain
     from ertis_numba.network.processing.pipe import Pipe
 
+_DRAIN_S: Final = 0.1
 _NEGLECTED: Final = 3  # deadlines after which a worker that hangs ends by itself, where nobody is left to kill it
 
 
@@ -39,6 +42,7 @@ class _Worker:
         self._deadline_s = float(arguments[6])
         self._views: dict[int, View] = {}
         self._chains: dict[int, Chain] = {}
+        self._predictions = Predictions(self._device)
 
     def run(self) -> None:
         from ertis_numba import kernels  # noqa: PLC0415  in this process alone
@@ -51,9 +55,11 @@ class _Worker:
         self._threads = min(self._threads, most)
         self._pipe.send(Ready(device=self._device if loaded is None else loaded.device, threads=most))
         while not self._pipe.closed:
-            self._pipe.wait(None)
+            self._pipe.wait(_DRAIN_S if self._predictions.busy else None)
             for order in self._pipe.receive():
                 self._obey(order)
+            for prediction in self._predictions.drain():
+                self._pipe.send(prediction)
 
     def _obey(self, order: ToWorker) -> None:
         match order:
@@ -99,6 +105,9 @@ class _Worker:
         place = view.image_as(chain.shape, self._dtype)
         words = view.words(order.words_bytes)
         image = chain.image(words, place if self._dtype == "float32" else None, threads=order.threads)
+        if order.predict_for:
+            measurement = Measurement(chain.format.of_bytes(bytes(words)), image.settings)
+            self._predictions.add(order.predict_for, image.replace(energy=image.energy.copy()), measurement)
         if self._dtype != "float32":
             np.copyto(place, image.energy, casting="same_kind")
         if not order.points:

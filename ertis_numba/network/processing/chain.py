@@ -38,13 +38,15 @@ class Chain:
     pipeline : Pipeline
     shape : (direction, range)
         Of its images.
+    format : WordFormat
+        Layout of the samples in a measurement.
     """
 
     def __init__(self, settings: str, device: str) -> None:
         said = Settings.from_toml(settings, "settings of a sensor", find_line=False)
-        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES)
+        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES, predict=False)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
-        self._format = word_format(self.pipeline.settings)
+        self.format = word_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)
 
     def image(
@@ -57,9 +59,9 @@ class Chain:
         DataError
             They are not as many as the settings say.
         """
-        if len(words) != self._format.n_bytes:
+        if len(words) != self.format.n_bytes:
             raise DataError(f"a measurement has {len(words)} bytes, which its settings do not say; say Hello again")
-        array = self._format.of_bytes(words)
+        array = self.format.of_bytes(words)
         return self.pipeline.process(Measurement(array, self.pipeline.settings), out, threads=threads)
 
     def points(self, image: Energyscape, most: int) -> NDArray[np.float32]:
@@ -70,7 +72,7 @@ class Chain:
 
     def times_s(self, threads: int, at_once: int) -> tuple[float, float]:
         """Return how long one measurement takes on all threads, and as one of several at once that share them."""
-        silence = bytes(self._format.n_bytes)
+        silence = bytes(self.format.n_bytes)
         out = np.empty(self.shape, np.float32)
         wide_s = _median_s(lambda: self.image(silence, out, threads=threads))
         if at_once == 1:

@@ -17,6 +17,7 @@ __all__ = [
     "Grouped",
     "Made",
     "Memory",
+    "Predicted",
     "Prepare",
     "Prepared",
     "Process",
@@ -62,6 +63,8 @@ class Process(_Note, frozen=True, kw_only=True):
     words_bytes: int
     threads: int
     points: bool
+    predict_for: str = ""
+    """Sensor whose images need a predicted error, if any."""
 
 
 class Forget(_Note, frozen=True, kw_only=True):
@@ -119,7 +122,14 @@ class Failed(_Note, frozen=True, kw_only=True):
     again: bool
 
 
-FromWorker = Ready | Prepared | Unusable | Made | Failed
+class Predicted(_Note, frozen=True, kw_only=True):
+    """Warning that a sensor's images may exceed their error budget."""
+
+    sensor: str
+    warning: str
+
+
+FromWorker = Ready | Prepared | Unusable | Made | Failed | Predicted
 
 
 class Begin(_Note, frozen=True, kw_only=True):

@@ -67,6 +67,7 @@ class Processing:
         self._quarantine: Quarantine | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
+        self._predicted: dict[str, int] = {}  # number of the kind whose error was predicted, by sensor
         self._order = Order()
         self._load = Load()
         self._took = Latencies()
@@ -235,6 +236,9 @@ class Processing:
                 if runner.takes(job.kind):
                     self._queues.take(job)
                     job.points = self._publisher.wants_points(job.data.sensor)
+                    sensor, kind = job.data.sensor, job.kind.number
+                    job.predict = self._predicted.get(sensor) != kind
+                    self._predicted[sensor] = kind
                     self._order.add(job)
                     runner.submit(job)
                     found = True

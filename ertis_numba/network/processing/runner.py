@@ -50,6 +50,8 @@ class Job:
         Whether somebody wants the points, too.
     tries : int
         That have failed.
+    predict : bool
+        Predict the error of the image, and log a warning if images may exceed the budget.
     slot : Slot, optional
         Where words and image are, once it is `Done`; to be given back.
     """
@@ -63,6 +65,7 @@ class Job:
     tries: int = 0
     slot: Slot | None = None
     n_points: int = 0
+    predict: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from ertis_numba.network.processing.notes import (
     Forget,
     FromWorker,
     Made,
+    Predicted,
     Prepare,
     Prepared,
     Process,
@@ -117,6 +118,7 @@ class Workers:
                 words_bytes=job.words.nbytes,
                 threads=worker.mode.threads,
                 points=job.points,
+                predict_for=job.data.sensor if job.predict else "",
             )
         )
 
@@ -201,17 +203,7 @@ class Workers:
         if worker.child is None:
             return found
         for note in worker.child.pipe.receive():
-            match note:
-                case Ready(device=device, threads=threads):
-                    self._loaded(worker, device, threads)
-                case Prepared():
-                    found += self._became_ready(worker, note)
-                case Unusable(kind=kind, text=text):
-                    worker.preparing, worker.deadline_s = None, float("inf")
-                    if self._kinds.pop(kind, None) is not None:
-                        found.append(KindFailed(kind, text))
-                case Made() | Failed():
-                    found += self._finished(worker, note)
+            found += self._events_of(worker, note)
         if worker.child.ended:
             found += self._died(worker)
         elif worker.child.pipe.closed:  # `tick` clears up, when it is gone and writes no more
@@ -220,6 +212,22 @@ class Workers:
         else:
             self._next_kind(worker)
         return found
+
+    def _events_of(self, worker: Worker, note: FromWorker) -> list[Event]:
+        match note:
+            case Ready(device=device, threads=threads):
+                self._loaded(worker, device, threads)
+            case Prepared():
+                return self._became_ready(worker, note)
+            case Unusable(kind=kind, text=text):
+                worker.preparing, worker.deadline_s = None, float("inf")
+                if self._kinds.pop(kind, None) is not None:
+                    return [KindFailed(kind, text)]
+            case Predicted(sensor=sensor, warning=warning):
+                self._log.warning("error_budget", sensor=sensor, text=warning)
+            case Made() | Failed():
+                return self._finished(worker, note)
+        return []
 
     def _loaded(self, worker: Worker, device: str, threads: int) -> None:
         worker.ready, worker.deadline_s = True, float("inf")

@@ -22,7 +22,7 @@ def emitter_response(emitter: Emitter, frequency_hz: NDArray[np.float64]) -> NDA
     if emitter.resonance_hz is None:
         return np.ones(frequency_hz.shape, dtype=np.complex128)
     ratio = frequency_hz / emitter.resonance_hz
-    damped = 1j * ratio / emitter.quality_factor
+    damped = 1j * ratio / emitter.resonance_quality
     return np.asarray(damped / (1 - ratio**2 + damped))
 
 
@@ -30,4 +30,4 @@ def ringing_s(emitter: Emitter) -> float:
     """Return the time until ringing has decayed by 120 dB, in seconds."""
     if emitter.resonance_hz is None:
         return 0.0
-    return -math.log(_RUNG_OUT) * emitter.quality_factor / (math.pi * emitter.resonance_hz)
+    return -math.log(_RUNG_OUT) * emitter.resonance_quality / (math.pi * emitter.resonance_hz)

@@ -1,0 +1,66 @@
+"""Predicted errors of images in a worker: one thread computes them while the worker makes further images."""
+
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from ertis_numba.network.processing.notes import Predicted
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Energyscape, Measurement
+
+__all__ = ["Predictions"]
+
+_MAX_BYTES: Final = 256_000_000
+
+
+class Predictions:
+    """Predictions for the first images of sensors; one at a time.
+
+    Attributes
+    ----------
+    busy : bool
+        A prediction is not finished, or not yet drained.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._waiting: deque[tuple[str, Energyscape, Measurement]] = deque()
+        self._found: deque[Predicted] = deque()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A prediction is not finished, or not yet drained."""
+        return bool(self._waiting or self._found or self._thread)
+
+    def add(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
+        """Predict the error of an image of a sensor; the arrays must not change."""
+        self._waiting.append((sensor, image, measurement))
+
+    def drain(self) -> list[Predicted]:
+        """Return finished predictions, and start the next one."""
+        if self._thread is not None and not self._thread.is_alive():
+            self._thread = None
+        if self._thread is None and self._waiting:
+            self._thread = threading.Thread(target=self._predict, args=self._waiting.popleft(), daemon=True)
+            self._thread.start()
+        found = []
+        while self._found:
+            found.append(self._found.popleft())
+        return found
+
+    def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
+        from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
+        from ertis_numba.prediction import memory_bytes, planner_of, predict  # noqa: PLC0415
+
+        try:
+            needed = memory_bytes(image)
+            if needed > _MAX_BYTES:
+                text = f"the error of images is not predicted: that takes {needed / 1e6:.0f} MB"
+            else:
+                text = predict(planner_of(image, measurement, kernels.load(self._device), threads=1)).warning
+        except Exception as error:  # noqa: BLE001  a failed prediction must not end a worker that makes images
+            text = f"the error of images is not predicted: {type(error).__name__}: {error}"
+        if text:
+            self._found.append(Predicted(sensor=sensor, warning=text))

@@ -1,0 +1,177 @@
+"""Error predicted for the image of one measurement, and the warning if it may exceed the budget."""
+
+import threading
+from dataclasses import dataclass
+from typing import Final, Literal, TypedDict
+
+import numpy as np
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.kernels import KernelSet
+from ertis_numba.stages.plan_model import TABLE_BYTES
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
+from ertis_numba.verification import sampled_error_db
+
+__all__ = ["BudgetMonitor", "BudgetScope", "Noted", "Prediction", "memory_bytes", "planner_of", "predict"]
+
+BudgetScope = Literal["image", "beams"]
+
+UNCERTAINTY_DB: Final = 1.0
+"""Largest amount by which a prediction may be too low: see tests/test_accuracy.py."""
+ADAPTIVE_UNCERTAINTY_DB: Final = 2.0
+"""The same for adaptive beamformers, whose error is measured in a sample of the directions.
+
+From 32 directions, it was too low by up to 1.6 dB over 156 random settings of `ertis bench budgets`.
+"""
+
+_MAX_DIRECTIONS: Final = 64
+_FAINTER: Final = 0.1
+_ROWS: Final = 16
+
+
+class Noted(TypedDict):
+    """Prediction as files and reports hold it."""
+
+    predicted_error_db: float
+    max_error_db: float
+    budget_applies_to: BudgetScope
+    error_warning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Predicted and permitted error of the images of a sensor.
+
+    Attributes
+    ----------
+    predicted_error_db : float
+        Error of one measurement's image relative to the exact image. The error model predicts it for delay-and-sum; for
+        adaptive beamformers, it is measured in a sample of the directions.
+    max_error_db : float
+        The budget.
+    uncertainty_db : float
+        Largest amount by which the prediction may be too low.
+    budget_applies_to : {"image", "beams"}
+        ``beams`` if no plan keeps the budget for any image of an adaptive beamformer. The plan then keeps it for the
+        delay-and-sum beams of the same signals.
+    beamformer : str
+    """
+
+    predicted_error_db: float
+    max_error_db: float
+    uncertainty_db: float = UNCERTAINTY_DB
+    budget_applies_to: BudgetScope = "image"
+    beamformer: str = "delay_and_sum"
+
+    def as_dict(self) -> Noted:
+        """Return the prediction in the form for files and reports."""
+        return {
+            "predicted_error_db": self.predicted_error_db,
+            "max_error_db": self.max_error_db,
+            "budget_applies_to": self.budget_applies_to,
+            "error_warning": self.warning,
+        }
+
+    @property
+    def warning(self) -> str:
+        """Warning in one line; empty if the budget is kept."""
+        if self.predicted_error_db + self.uncertainty_db <= self.max_error_db:
+            return ""
+        scope = ""
+        if self.budget_applies_to == "beams":
+            scope = f"; the plan keeps the budget for delay-and-sum beams only, not for images of {self.beamformer}"
+        return (
+            f"images may exceed the error budget: predicted {self.predicted_error_db:.1f} dB "
+            f"(up to {self.uncertainty_db:g} dB more), accuracy.max_error_db is {self.max_error_db:g} dB{scope}"
+        )
+
+
+def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet, *, threads: int) -> Planner:
+    """Return a planner with the signal model of a measurement, and with its sensitivity for adaptive beamformers.
+
+    The sensitivity is the ratio of two error powers. One is that of the image, measured in a sample of the directions.
+    The other is predicted for the delay-and-sum beams of the same signals.
+
+    Parameters
+    ----------
+    image : Energyscape
+        Image of ``measurement`` with a complete plan.
+    measurement : Measurement
+    kernels : KernelSet
+    threads : int
+    """
+    settings = image.settings
+    texture = texture_of(measurement, settings, kernels, threads=threads)
+    if settings.processing.beamformer == "delay_and_sum":
+        return Planner(settings, kernels, threads=threads, texture=texture)
+    beams = Planner(settings, kernels, threads=threads, texture=texture, sensitivity=Sensitivity())
+    try:
+        error_db = sampled_error_db(image, measurement, max_directions=_MAX_DIRECTIONS)
+    except DataError:  # The exact image is silent there, so nothing is known of the image.
+        return beams
+    power = sum(beams.parts(settings.accuracy).values())
+    sensitivity = Sensitivity(10 ** (error_db / 10) / power)
+    return Planner(settings, kernels, threads=threads, texture=texture, sensitivity=sensitivity)
+
+
+def predict(planner: Planner) -> Prediction:
+    """Return a planner's prediction for its complete plan, with the budget."""
+    settings = planner.settings
+    beamformer = settings.processing.beamformer
+    adaptive = beamformer != "delay_and_sum"
+    return Prediction(
+        predicted_error_db=round(planner.error_db(settings.accuracy), 2),
+        max_error_db=settings.accuracy.max_error_db,
+        uncertainty_db=ADAPTIVE_UNCERTAINTY_DB if adaptive else UNCERTAINTY_DB,
+        budget_applies_to="image" if planner.keeps_budget_of_images(settings.accuracy) else "beams",
+        beamformer=beamformer,
+    )
+
+
+def memory_bytes(image: Energyscape) -> int:
+    """Return an estimate of the memory for a prediction: tables of a rough image, that image and its squares."""
+    settings = image.settings
+    n_mics = int(microphones(settings.array).enabled.sum())
+    n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
+    table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
+    return table + 20 * image.energy.size
+
+
+class BudgetMonitor:
+    """Prediction for the first image, and for each that is 10 dB fainter than all images predicted before.
+
+    Relative errors grow as images become fainter. Several threads may use one monitor.
+
+    Parameters
+    ----------
+    kernels : KernelSet
+    threads : int
+
+    Attributes
+    ----------
+    prediction : Prediction or None
+        The latest; None before the first image that is not silent.
+    """
+
+    def __init__(self, kernels: KernelSet, threads: int) -> None:
+        self._kernels, self._threads = kernels, threads
+        self._lock = threading.Lock()
+        self._faintest = float("inf")
+        self.prediction: Prediction | None = None
+
+    def check(self, image: Energyscape, measurement: Measurement) -> Prediction | None:
+        """Return a new prediction if the image needs one."""
+        rows = image.energy[:: max(1, len(image.energy) // _ROWS)]
+        level = float(np.vdot(rows, rows)) / rows.size
+        if not 0 < level < _FAINTER * self._faintest:
+            return None
+        with self._lock:
+            if not level < _FAINTER * self._faintest:
+                return None
+            self._faintest = level
+            self.prediction = predict(planner_of(image, measurement, self._kernels, threads=self._threads))
+            return self.prediction

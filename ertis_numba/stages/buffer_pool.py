@@ -1,0 +1,79 @@
+"""Buffers of the measurements that a chain processes at the same time."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import fft
+from ertis_numba.errors import ArgumentError
+from ertis_numba.kernels import Lane
+from ertis_numba.stages.beamform import Buffers
+
+__all__ = ["BufferPool", "MeasurementBuffers"]
+
+
+class MeasurementBuffers(NamedTuple):
+    """Buffers of one measurement in progress."""
+
+    lane: Lane
+    room: tuple[NDArray[np.float32], ...]
+    signals: NDArray[np.float32]
+    analytic: NDArray[np.complex64]
+    transforms: fft.Transforms
+    beamform: Buffers
+
+
+class BufferPool:
+    """As many buffers as measurements ever were in progress at once."""
+
+    def __init__(self) -> None:
+        self._change = threading.Condition()
+        self._spare: list[MeasurementBuffers] = []
+        self._n_busy = 0
+        self._closed = False
+
+    @contextmanager
+    def acquired(self, make: Callable[[], MeasurementBuffers]) -> Iterator[MeasurementBuffers]:
+        """Run the enclosed code with buffers that no other thread uses; `release` them after the lane is done.
+
+        If the enclosed code fails, the buffers are dropped, because kernels may still use them.
+
+        Parameters
+        ----------
+        make : callable
+            Returns new buffers; called if none are spare.
+
+        Raises
+        ------
+        ArgumentError
+            The pool is closed.
+        """
+        with self._change:
+            if self._closed:
+                raise ArgumentError("the pipeline is closed; make another one")
+            buffers = self._spare.pop() if self._spare else None
+            self._n_busy += 1
+        try:
+            yield make() if buffers is None else buffers
+        except BaseException:
+            self.release(None)
+            raise
+
+    def release(self, buffers: MeasurementBuffers | None) -> None:
+        """Return acquired buffers, or None if they were dropped."""
+        with self._change:
+            if buffers is not None:
+                self._spare.append(buffers)
+            self._n_busy -= 1
+            self._change.notify_all()
+
+    def close(self) -> None:
+        """Wait until no buffers are in use, and drop all."""
+        with self._change:
+            self._closed = True
+            self._change.wait_for(lambda: not self._n_busy)
+            self._spare.clear()

@@ -1,0 +1,75 @@
+"""Elements of a complete plan: spectrum, decimation filter, ringing, fractional-delay offsets and focal zones."""
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
+from ertis_numba.stages.window import time_window
+from ertis_numba.stages.zones import zone_edges
+from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
+
+__all__ = ["ahead_of", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
+
+_PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
+_MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
+_SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
+
+
+def spectrum_of(settings: Settings) -> Spectrum:
+    """Return where the matched filter has its power, as if its input were white."""
+    step, edges_hz = settings.decimation, settings.processing.band_edges_hz
+    processing = Processing(range_decimation=step, decimation=step, band_edges_hz=edges_hz)
+    recording = Recording(sample_rate_hz=settings.recording.sample_rate_hz)
+    return _spectrum_of(Settings(call=settings.call, recording=recording, processing=processing))
+
+
+@functools.lru_cache(maxsize=8)
+def _spectrum_of(settings: Settings) -> Spectrum:
+    """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
+    return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
+
+
+def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
+    """Return the decimation filter of a complete plan; PCM that is not decimated needs none."""
+    if settings.decimation == 1 and not settings.recording.is_pdm:
+        return whole_taps(np.ones(1))
+    stop_band_db = settings.accuracy.stop_band_db or 60.0
+    taps = decimation_taps(
+        sample_rate_hz=settings.recording.sample_rate_hz,
+        decimation=settings.decimation,
+        pass_hz=matched_band_hz(settings)[1],
+        stop_band_db=stop_band_db,
+    )
+    return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)
+
+
+def ringing_db(settings: Settings) -> float:
+    """Return the level below its peak at which the ringing of the matched filter may be cut off.
+
+    The noise of PDM bits hides ringing below the stop band. PCM has no such noise. Sound outside the window may exceed
+    the image by the whole dynamic range, and ringing that is cut off or wraps around must stay below the error budget.
+    """
+    if not settings.recording.is_pdm:
+        return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
+    return max(60.0, 1.2 * (settings.accuracy.stop_band_db or 60.0) - 12.0)
+
+
+def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
+    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
+
+    Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
+    golden ratio's multiples any few of them are spread evenly.
+    """
+    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0 * step_s if fit.is_fitted else np.zeros(1)
+
+
+def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
+    """Return first range, the one after the last, and the distance whose delays hold, of each zone of a plan."""
+    range_m = time_window(settings, largest_delay_s=0.0, n_taps=1).range_m
+    if settings.processing.wavefront == "plane":
+        return [(0, len(range_m), math.inf)]
+    return zone_edges(range_m, settings.accuracy.zones or 1)

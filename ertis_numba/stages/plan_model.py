@@ -1,0 +1,269 @@
+"""Complete plans: their predicted errors, their work and their memory."""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.settings import Accuracy, Settings
+from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture
+from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
+from ertis_numba.stages.beamform import whole_limits
+from ertis_numba.stages.costs import Work
+from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.plan_elements import ahead_of, chain_taps, spectrum_of, zones_of
+from ertis_numba.stages.window import time_window
+from ertis_numba.stages.zones import NEAREST_M, squared_bend
+from ertis_numba.waveform import matched_band_hz
+
+__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Plan", "PlanModel", "plan_of"]
+
+COARSEST_STOP_BAND_DB = 40.0
+TABLE_BYTES = 44
+"""Bytes of a delay and a weight, as they are made and as kernels take them."""
+
+_MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
+_MAX_FITS = 288  # four times the fits that one search tries
+
+
+class Plan(NamedTuple):
+    """A complete plan."""
+
+    precision: str
+    n_phases: int
+    interpolation: str
+    delay_taps: int
+    beam_taps: int
+    density: float
+    stop_band_db: float
+    zones: int
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """What a choice of nodes means: how many, their errors, and the sum of a beam's squared weights."""
+
+    count: int
+    n_pairs: int
+    error: float
+    squares: float
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """What a choice of samples means."""
+
+    n_taps: int
+    error: float
+    sum_of_weights: float
+    squares: float
+
+
+class PlanModel:
+    """Predictions about complete plans for one kind of measurement.
+
+    Parameters
+    ----------
+    settings : Settings
+    texture : Texture, optional
+        See `ErrorModel`.
+    tile_ranges : int
+        Ranges in a tile of 16-bit numbers.
+
+    Attributes
+    ----------
+    settings : Settings
+    errors : ErrorModel
+    aperture : Aperture
+    window : TimeWindow
+    n_mics, n_directions : int
+    delays, nodes, filter : callable
+        Cached properties of a choice of delayed samples, of beam-grid points and of a stop band.
+    """
+
+    def __init__(self, settings: Settings, texture: Texture | None, *, tile_ranges: int) -> None:
+        self.settings = settings
+        self._tile_ranges = tile_ranges
+        self.errors = ErrorModel(settings, texture)
+        self._spectrum = spectrum_of(settings)
+        layout, grid = microphones(settings.array), direction_grid(settings.processing)
+        self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
+        self._own_s = layout.delay_s[layout.enabled]
+        self.aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+        amplitudes = 1 / layout.gain[layout.enabled]
+        self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
+        self.n_directions = len(grid)
+        self._speed_m_s = sound_speed_m_s(settings.air)
+        self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
+        if settings.accuracy.beam_taps:
+            require_nodes(self.aperture, len(self.window.range_m))
+        self.delays = functools.cache(self._made_delays)
+        self._zones = functools.cache(self._made_zones)
+        self.nodes = functools.cache(self._made_nodes)
+        self.filter = functools.cache(self._made_filter)
+
+    def parts(self, plan: Plan) -> dict[str, float]:
+        """Return the error power of each step of a plan, relative to the exact image."""
+        delays = self.delays(plan.n_phases, plan.interpolation, plan.delay_taps)
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        _, filter_error = self.filter(plan.stop_band_db)
+        parts = dict.fromkeys(PARTS, 0.0)
+        parts["delays"], parts["filter"] = delays.error, filter_error
+        parts["arithmetic"] = self.errors.arithmetic()
+        if nodes is not None:
+            parts["beams"] = nodes.error
+            parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
+        if self.settings.processing.wavefront == "spherical":
+            parts["zones"] = self.zone_error(plan.zones)
+        if plan.precision == "int16":
+            parts["samples"] = self._whole_numbers(delays, nodes)
+        return parts
+
+    def work(self, plan: Plan) -> Work:
+        """Return the work of a plan, which its predicted time depends on."""
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        taps, _ = self.filter(plan.stop_band_db)
+        tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
+        return Work(
+            n_mics=self.n_mics,
+            n_words=self._n_words,
+            n_samples=self.window.n_samples,
+            n_taps=len(taps),
+            tap_bits=8 * taps.dtype.itemsize,
+            n_fft=self.window.n_fft,
+            n_bins=self._n_bins,
+            n_phases=plan.n_phases,
+            n_outputs=self.window.n_outputs,
+            n_directions=self.n_directions,
+            n_ranges=len(self.window.range_m),
+            n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.zones)),
+            n_beams=self.n_directions if nodes is None else nodes.count,
+            n_terms=self.n_mics * plan.delay_taps,
+            n_pairs=0 if nodes is None else nodes.n_pairs,
+            precision=plan.precision,
+        )
+
+    def n_bytes(self, plan: Plan) -> int:
+        """Return the memory of a plan's signals and delays."""
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        n_beams = self.n_directions if nodes is None else nodes.count
+        table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.zones))
+        return table + 16 * self.n_mics * plan.n_phases * self.window.n_outputs
+
+    def zone_error(self, count: int) -> float:
+        """Return the error power of a number of focal zones."""
+        bend_2 = squared_bend(self.window.range_m, self._zones(count))
+        return self._zone_scale * bend_2
+
+    def _made_zones(self, count: int) -> list[tuple[int, int, float]]:
+        return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(zones=count)))
+
+    @functools.cached_property
+    def _zone_scale(self) -> float:
+        return self.errors.zones(self.aperture, 1.0, sound_speed_m_s=self._speed_m_s)
+
+    def _made_delays(self, n_phases: int, interpolation: str, n_taps: int) -> Delays:
+        step_s = 1 / (self.settings.output_rate_hz * n_phases)
+        fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
+        return Delays(
+            n_taps=fit.n_taps,
+            error=self.errors.delays(fit, n_mics=self.n_mics, fractions=self._few_fractions(fit, step_s)),
+            sum_of_weights=float(np.max(weights.sum(axis=1))),
+            squares=float(np.mean(np.sum(weights**2, axis=1))),
+        )
+
+    def _few_fractions(self, fit: DelayFit, step_s: float) -> NDArray[np.float64] | None:
+        """Return the fractions of all delays, if the delays are too few to spread evenly over a step."""
+        if self.n_mics * (1 + 2 * self._reach_s() / step_s) > _MANY_FRACTIONS:
+            return None
+        delays_s = (
+            self._own_s
+            - ahead_of(fit, self.n_mics, step_s)
+            + self.aperture.delays_s(self.aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
+        )
+        return fit.split(delays_s)[1].ravel()
+
+    def count_nodes(self, n_taps: int, density: float) -> int:
+        """Return the number of beam-grid points."""
+        high_hz = self.settings.call.high_frequency_hz
+        spacing = self.aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
+        return self.aperture.count_nodes(spacing, n_taps)
+
+    def _made_nodes(self, n_taps: int, density: float) -> Nodes:
+        require_nodes(self.aperture, len(self.window.range_m))
+        nodes = BeamNodes(
+            self.aperture,
+            self._spectrum,
+            n_taps=n_taps,
+            density=density,
+            high_hz=self.settings.call.high_frequency_hz,
+            sound_speed_m_s=self._speed_m_s,
+            estimate=True,
+            nearest_m=self._nearest_m,
+        )
+        n_pairs = n_taps**self.aperture.n_axes // 2
+        return Nodes(self.count_nodes(n_taps, density), n_pairs, self.errors.beams(nodes), nodes.squares)
+
+    def _made_filter(self, stop_band_db: float) -> tuple[NDArray[Any], float]:
+        try:
+            taps = chain_taps(self.settings.replace(accuracy=Accuracy(stop_band_db=stop_band_db)))
+        except ArgumentError:
+            if self.settings.accuracy.stop_band_db is not None or stop_band_db == COARSEST_STOP_BAND_DB:
+                raise
+            return np.ones(1, dtype=np.int16), math.inf
+        return taps, self.errors.filter(taps)
+
+    def _whole_numbers(self, delays: Delays, nodes: Nodes | None) -> float:
+        weight_limit, limit = whole_limits(self.n_mics * delays.sum_of_weights)
+        squares = 1.0 if nodes is None else nodes.squares
+        error = self.errors.samples(
+            n_terms=delays.n_taps, terms=delays.squares, limit=limit, weight_limit=weight_limit, taps=squares
+        )
+        if nodes is not None:
+            filled = limit * weight_limit * self.n_mics * delays.sum_of_weights / 2**31
+            error += self.errors.nodes(
+                n_mics=self.n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
+            )
+        return error * self._spread
+
+    @property
+    def _nearest_m(self) -> float:
+        if self.settings.processing.wavefront == "plane":
+            return math.inf
+        return max(float(self.window.range_m[0]), NEAREST_M)
+
+    @functools.cached_property
+    def _n_bins(self) -> int:
+        low_hz, high_hz = matched_band_hz(self.settings)
+        return math.ceil((high_hz - low_hz) * self.window.n_fft / self.settings.signal_rate_hz)
+
+    def _reach_s(self) -> float:
+        positions_m = self.aperture.square_m2
+        return math.sqrt(float(np.max(positions_m, initial=0.0))) / self._speed_m_s
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
+    """Return a fit and the magnitudes of its weights; kept, as most of a planner's time would go into them."""
+    fit = DelayFit(interpolation, n_taps, step_s, spectrum)
+    return fit, np.abs(fit.weights(fit.fractions))
+
+
+def plan_of(accuracy: Accuracy) -> Plan:
+    """Return a complete plan."""
+    return Plan(
+        accuracy.precision,
+        accuracy.oversampling or 1,
+        accuracy.interpolation,
+        accuracy.delay_taps or 1,
+        accuracy.beam_taps or 0,
+        accuracy.beam_density or 2.0,
+        accuracy.stop_band_db or 60.0,
+        accuracy.zones or 1,
+    )
