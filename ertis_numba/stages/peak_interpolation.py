@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Air, Settings
+from ertis_numba.stages.plan_response import deviation_of
 from ertis_numba.stages.point_spread import PointSpread
 
 __all__ = ["PeakInterpolator", "Tops"]
@@ -71,6 +72,7 @@ class PeakInterpolator:
         self._row[wanted] = np.arange(len(wanted))
         self._fits = _Fits.of(directions, neighbours, wanted)
         self._point_spread = PointSpread(settings) if settings.processing.method == "fast" else None
+        self._deviation = deviation_of(settings, directions)
 
     def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
         """Return the maxima near some bins of an image.
@@ -112,7 +114,7 @@ class PeakInterpolator:
         steps_m = step_m * (columns - columns[:, 1:2]).astype(np.float64)
         first = found
         for _ in range(_CORRECTIONS):
-            predicted = self._predicted(spread, found, directions, offsets, steps_m, step_m, image.settings.air)
+            predicted = self._predicted(spread, found, directions, rows, offsets, steps_m, step_m, image.settings.air)
             difference = measured - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
             found = np.where(is_alike[:, None], found + first - self._tops(directions, predicted), first)
@@ -140,6 +142,7 @@ class PeakInterpolator:
         spread: PointSpread,
         found: NDArray[np.float64],
         directions: NDArray[np.int64],
+        rows: NDArray[np.int64],
         offsets: NDArray[np.float64],
         steps_m: NDArray[np.float64],
         step_m: float,
@@ -151,7 +154,8 @@ class PeakInterpolator:
         tops = tops / np.linalg.norm(tops, axis=1)[:, None]
         away = offsets + (middles - tops)[:, None]
         away_m = steps_m - step_m * found[:, :1]
-        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), air).reshape(away_m.shape)
+        deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
+        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), air, deviation=deviation).reshape(away_m.shape)
         return np.asarray(np.log(np.maximum(amplitude, _DARK)) + found[:, 4:])
 
 

@@ -19,8 +19,9 @@ from ertis_numba.waveform import matched_spectrum
 __all__ = ["PositionUncertainty"]
 
 _WAVES = 64  # of the call's band, from which its widths are computed
-_THINNED = 16  # ranges of which one tells the noise
-_SAMPLE = 16_384  # bins that tell the noise, to a hundredth
+_SAMPLE = 32_768  # bins from which the noise is estimated, to a hundredth
+_BLOCKS = 16  # of ranges, the noise of each of which is estimated
+_QUIET = 0.25  # quantile of these estimates: side lobes of strong echoes raise those near echoes
 _FLAT = 1e-12  # of the variance of an array, below which it has none
 _UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
 
@@ -150,6 +151,7 @@ def _noise(image: Energyscape) -> float:
     """Return the root mean square of the noise of an image; 0 if it is unknown."""
     if image.settings.processing.beamformer != "delay_and_sum":
         return 0.0
-    some = image.energy[:, ::_THINNED]
-    some = some[:: max(1, some.size // _SAMPLE)]
-    return float(np.median(some)) / math.sqrt(math.log(2))
+    some = image.energy[:: max(1, image.energy.size // _SAMPLE)]
+    blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)
+    level = float(np.quantile([np.median(block) for block in blocks], _QUIET))
+    return level / math.sqrt(math.log(2))
