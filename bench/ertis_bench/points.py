@@ -12,6 +12,7 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
@@ -45,12 +46,13 @@ class Trials:
 
     def __init__(self, directions: str, max_error_db: float) -> None:
         self._is_planar = directions.startswith("2d")
+        limits_deg = Processing().elevation_limits_deg if self._is_planar else (-50.0, 50.0)
         processing = Processing(
+            elevation_limits_deg=limits_deg,
             directions=directions,
             range_m=(0.6, 1.1),
             azimuth_limits_deg=(-70.0, 70.0),
             range_decimation=_RANGE_DECIMATION,
-            **({} if self._is_planar else {"elevation_limits_deg": (-50.0, 50.0)}),
         )
         recording = Recording(sample_rate_hz=_RATE_HZ, n_samples=_N_SAMPLES, encoding="float32")
         settings = Settings(recording=recording, processing=processing, accuracy=Accuracy(max_error_db=max_error_db))
@@ -92,7 +94,9 @@ class Trials:
         point = cloud.position_m[0].astype(np.float64)
         found_m = float(np.linalg.norm(point))
         across_m = range_m * float(point / found_m @ self._least_resolved(azimuth_rad, elevation_rad))
-        return np.array([found_m - range_m, across_m]) / cloud.uncertainty_m[0]
+        if cloud.uncertainty_m is None:
+            raise DataError("points have no uncertainty; give settings with a complete plan")
+        return np.asarray(np.array([found_m - range_m, across_m]) / cloud.uncertainty_m[0].astype(np.float64))
 
     def _least_resolved(
         self, azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]

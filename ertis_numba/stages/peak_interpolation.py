@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape
-from ertis_numba.settings import Air, Settings
+from ertis_numba.settings import Settings
 from ertis_numba.stages.plan_response import deviation_of
 from ertis_numba.stages.point_spread import PointSpread
 
@@ -15,7 +15,8 @@ __all__ = ["PeakInterpolator", "Tops"]
 
 _ONE_SIDED = 0.25  # mean offset of neighbours relative to their reach, at the edge of a grid
 _LINE = 0.2  # of the widths of a direction's neighbours, below which they lie in a line
-_CORRECTIONS = 2  # of the error of parabolas: a third one changes nothing
+_MAX_CORRECTIONS = 8  # of the error of parabolas: coarse grids need more than fine ones
+_CONVERGED = 1e-5  # change by a correction, in bins of range, in unit vectors and in nepers
 _MAX_DIFFERENCE = 1.0  # in nepers, between samples and those of a single reflector; beyond, they are of several
 _MAX_SHIFT = 0.5  # by a correction, in bins of range and in nepers; beyond, it has not converged
 _DARK = 1e-6  # amplitude, below the side lobes of any array
@@ -112,12 +113,19 @@ class PeakInterpolator:
         rows, columns = bins
         offsets = self._directions[rows] - self._directions[directions][:, None]
         steps_m = step_m * (columns - columns[:, 1:2]).astype(np.float64)
-        first = found
-        for _ in range(_CORRECTIONS):
-            predicted = self._predicted(spread, found, directions, rows, offsets, steps_m, step_m, image.settings.air)
-            difference = measured - predicted
+        first, found, active = found, found.copy(), np.arange(len(found))
+        for _ in range(_MAX_CORRECTIONS):
+            here = found[active]
+            predicted = self._predicted(
+                spread, here, directions[active], rows[active], offsets[active], steps_m[active], step_m, image
+            )
+            difference = measured[active] - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
-            found = np.where(is_alike[:, None], found + first - self._tops(directions, predicted), first)
+            correction = first[active] - self._tops(directions[active], predicted)
+            found[active] = np.where(is_alike[:, None], here + correction, first[active])
+            active = active[is_alike & (np.abs(correction).max(axis=1) > _CONVERGED)]
+            if not len(active):
+                break
         change = np.abs(found - first)
         is_small = (change[:, 0] <= _MAX_SHIFT) & (change[:, 4] <= _MAX_SHIFT)
         return np.where(is_small[:, None], found, first)
@@ -146,7 +154,7 @@ class PeakInterpolator:
         offsets: NDArray[np.float64],
         steps_m: NDArray[np.float64],
         step_m: float,
-        air: Air,
+        image: Energyscape,
     ) -> NDArray[np.float64]:
         """Return the log amplitudes of reflectors at the found positions: (place, sample) float64."""
         middles = self._directions[directions]
@@ -155,7 +163,9 @@ class PeakInterpolator:
         away = offsets + (middles - tops)[:, None]
         away_m = steps_m - step_m * found[:, :1]
         deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
-        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), air, deviation=deviation).reshape(away_m.shape)
+        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation).reshape(
+            away_m.shape
+        )
         return np.asarray(np.log(np.maximum(amplitude, _DARK)) + found[:, 4:])
 
 

@@ -1,5 +1,6 @@
 """Point-spread function: the image of a single reflector, from array and call."""
 
+import functools
 import math
 
 import numpy as np
@@ -53,9 +54,8 @@ class PointSpread:
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
         self._path_m = np.arange(count) * (period_m / count)
         shares = power / power.sum()
-        self._frequency_hz = bins * rate_hz / n_fft
         self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * self._path_m)
-        self._shares, self._count = shares, count
+        self._shares, self._wave_1_m, self._count = shares, wave_1_m, count
         self._pulse = np.fft.ifft(shares, count) * count * self._turn
 
     def __call__(
@@ -82,14 +82,16 @@ class PointSpread:
         path_m = scale * (2 * range_offset_m[:, None] - direction_offset @ self._positions_m.T)
         pulse = self._at(path_m, self._pulse)
         if deviation is not None:
-            pulse = pulse * (1 + deviation.mean)
-            pulse += deviation.slope_s * self._at(path_m, self._tilted(deviation.centre_hz))
+            carrier_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi)
+            pulse = pulse * (1 + deviation.mean + deviation.slope_s * (carrier_hz - deviation.centre_hz))
+            pulse += deviation.slope_s * self._at(path_m, self._tilted_hz)
         return np.asarray(np.abs((pulse * np.exp(1j * self._carrier_1_m * path_m)).mean(axis=1)))
 
-    def _tilted(self, centre_hz: float) -> NDArray[np.complex128]:
-        """Return the pulse whose spectrum is weighted by the frequency relative to a centre."""
-        shares = self._shares * (self._frequency_hz - centre_hz)
-        return np.asarray(np.fft.ifft(shares, self._count) * self._count * self._turn)
+    @functools.cached_property
+    def _tilted_hz(self) -> NDArray[np.complex128]:
+        """The pulse whose spectrum is weighted by the frequency relative to the carrier."""
+        offset_hz = (self._wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)
+        return np.asarray(np.fft.ifft(self._shares * offset_hz, self._count) * self._count * self._turn)
 
     def _at(self, path_m: NDArray[np.float64], pulse: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return a pulse at some paths; that at negative paths is the conjugate."""
