@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from ertis_bench.points import Trials
 
 N_TRIALS = 100

@@ -114,6 +114,7 @@ class PeakInterpolator:
         offsets = self._directions[rows] - self._directions[directions][:, None]
         steps_m = step_m * (columns - columns[:, 1:2]).astype(np.float64)
         first, found, active = found, found.copy(), np.arange(len(found))
+        last = np.full(len(found), np.inf)
         for _ in range(_MAX_CORRECTIONS):
             here = found[active]
             predicted = self._predicted(
@@ -122,8 +123,12 @@ class PeakInterpolator:
             difference = measured[active] - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
             correction = first[active] - self._tops(directions[active], predicted)
-            found[active] = np.where(is_alike[:, None], here + correction, first[active])
-            active = active[is_alike & (np.abs(correction).max(axis=1) > _CONVERGED)]
+            size = np.abs(correction).max(axis=1)
+            is_smaller = size < last[active]  # corrections of noise need not converge
+            corrected = np.where(is_smaller[:, None], here + correction, here)
+            found[active] = np.where(is_alike[:, None], corrected, first[active])
+            last[active] = size
+            active = active[is_alike & is_smaller & (size > _CONVERGED)]
             if not len(active):
                 break
         change = np.abs(found - first)
