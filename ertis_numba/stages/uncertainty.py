@@ -27,7 +27,7 @@ _UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within 
 
 # Interpolation subtracts errors of a plan that it predicts. This share of their root mean square is left: errors are
 # taken as straight lines over frequency, and samples are rounded. `ertis bench points` measures it.
-_OF_PREDICTED = 0.002
+_OF_PREDICTED = 0.02
 # Fractional delays depend on the range if wavefronts are spherical, and are not predicted. Their errors are alike in
 # neighbouring bins, so that they move a maximum by less than noise of the same power.
 _OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
