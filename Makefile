@@ -65,6 +65,7 @@ bench: $(VENV)/ready  ## measure this machine and write bench/README.md
 	$(BIN)/ertis bench accuracy --update README.md --update bench/README.md --plot docs/pictures/front.png
 	$(BIN)/ertis bench factorisation --update docs/accuracy.md
 	$(BIN)/ertis bench verification --update docs/accuracy.md
+	$(BIN)/ertis bench points --update docs/accuracy.md
 	$(BIN)/ertis bench scaling --update bench/README.md
 	$(BIN)/ertis bench simulation --update bench/README.md
 	$(BIN)/ertis bench many --update docs/many.md

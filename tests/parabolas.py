@@ -19,7 +19,8 @@ def interpolated(image, directions, around, direction, range_index):
     measured = np.log(np.maximum([float(image.energy[each]) for each in bins], TINY))
     offsets = directions[around] - directions[direction]
     first = found = parabolas(measured, offsets)
-    for _ in range(2):
+    last = math.inf
+    for _ in range(8):
         top = directions[direction] + found[1]
         top, at_m = top / np.linalg.norm(top), image.range_m[range_index] + found[0] * step_m
         predicted = np.array(
@@ -29,10 +30,14 @@ def interpolated(image, directions, around, direction, range_index):
         difference = measured - predicted
         if np.max(np.abs(difference - difference[1])) >= 1:
             found = first
-            continue
-        found = tuple(
-            now + wanted - again for now, wanted, again in zip(found, first, parabolas(predicted, offsets), strict=True)
-        )
+            break
+        change = [wanted - again for wanted, again in zip(first, parabolas(predicted, offsets), strict=True)]
+        size = max(np.max(np.abs(part)) for part in change)
+        if size >= last:
+            break
+        found, last = tuple(now + part for now, part in zip(found, change, strict=True)), size
+        if size <= 1e-5:
+            break
     if max(abs(found[0] - first[0]), abs(found[2] - first[2])) > 0.5:
         found = first
     top = directions[direction] + found[1]

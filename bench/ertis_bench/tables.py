@@ -15,6 +15,7 @@ from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.tables import network, network_faults
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_bench.points import form as points
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.reliability_tables import reliability
 from ertis_bench.verification import form as verification
@@ -35,6 +36,7 @@ __all__ = [
     "network_faults",
     "paper",
     "place",
+    "points",
     "ptx",
     "reliability",
     "scaling",
@@ -332,5 +334,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
     "verification": {"verification": verification},
     "budgets": {"budgets": budgets},
+    "points": {"points": points},
 }
 """What each command writes between which markers: a file chooses a form by the marker that it has."""

@@ -113,6 +113,21 @@ def budgets(**given: Any) -> None:
 
 
 @bench.command()
+@click.option(
+    "--count", type=click.IntRange(min=1), default=400, show_default=True, metavar="N", help="Points of each cell."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the places.")
+@_update
+@options.quiet
+@options.as_json
+def points(**given: Any) -> None:
+    """Compare errors of points with their uncertainties, over grids, budgets and noise; nothing is timed."""
+    from ertis_bench import points as benchmark
+
+    _run("points", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

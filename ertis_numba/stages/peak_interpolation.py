@@ -7,14 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape
-from ertis_numba.settings import Air, Settings
+from ertis_numba.settings import Settings
+from ertis_numba.stages.plan_response import deviation_of
 from ertis_numba.stages.point_spread import PointSpread
 
 __all__ = ["PeakInterpolator", "Tops"]
 
 _ONE_SIDED = 0.25  # mean offset of neighbours relative to their reach, at the edge of a grid
 _LINE = 0.2  # of the widths of a direction's neighbours, below which they lie in a line
-_CORRECTIONS = 2  # of the error of parabolas: a third one changes nothing
+_MAX_CORRECTIONS = 8  # of the error of parabolas: coarse grids need more than fine ones
+_CONVERGED = 1e-5  # change by a correction, in bins of range, in unit vectors and in nepers
 _MAX_DIFFERENCE = 1.0  # in nepers, between samples and those of a single reflector; beyond, they are of several
 _MAX_SHIFT = 0.5  # by a correction, in bins of range and in nepers; beyond, it has not converged
 _DARK = 1e-6  # amplitude, below the side lobes of any array
@@ -71,6 +73,7 @@ class PeakInterpolator:
         self._row[wanted] = np.arange(len(wanted))
         self._fits = _Fits.of(directions, neighbours, wanted)
         self._point_spread = PointSpread(settings) if settings.processing.method == "fast" else None
+        self._deviation = deviation_of(settings, directions)
 
     def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
         """Return the maxima near some bins of an image.
@@ -110,12 +113,24 @@ class PeakInterpolator:
         rows, columns = bins
         offsets = self._directions[rows] - self._directions[directions][:, None]
         steps_m = step_m * (columns - columns[:, 1:2]).astype(np.float64)
-        first = found
-        for _ in range(_CORRECTIONS):
-            predicted = self._predicted(spread, found, directions, offsets, steps_m, step_m, image.settings.air)
-            difference = measured - predicted
+        first, found, active = found, found.copy(), np.arange(len(found))
+        last = np.full(len(found), np.inf)
+        for _ in range(_MAX_CORRECTIONS):
+            here = found[active]
+            predicted = self._predicted(
+                spread, here, directions[active], rows[active], offsets[active], steps_m[active], step_m, image
+            )
+            difference = measured[active] - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
-            found = np.where(is_alike[:, None], found + first - self._tops(directions, predicted), first)
+            correction = first[active] - self._tops(directions[active], predicted)
+            size = np.abs(correction).max(axis=1)
+            is_smaller = size < last[active]  # corrections of noise need not converge
+            corrected = np.where(is_smaller[:, None], here + correction, here)
+            found[active] = np.where(is_alike[:, None], corrected, first[active])
+            last[active] = size
+            active = active[is_alike & is_smaller & (size > _CONVERGED)]
+            if not len(active):
+                break
         change = np.abs(found - first)
         is_small = (change[:, 0] <= _MAX_SHIFT) & (change[:, 4] <= _MAX_SHIFT)
         return np.where(is_small[:, None], found, first)
@@ -140,10 +155,11 @@ class PeakInterpolator:
         spread: PointSpread,
         found: NDArray[np.float64],
         directions: NDArray[np.int64],
+        rows: NDArray[np.int64],
         offsets: NDArray[np.float64],
         steps_m: NDArray[np.float64],
         step_m: float,
-        air: Air,
+        image: Energyscape,
     ) -> NDArray[np.float64]:
         """Return the log amplitudes of reflectors at the found positions: (place, sample) float64."""
         middles = self._directions[directions]
@@ -151,7 +167,10 @@ class PeakInterpolator:
         tops = tops / np.linalg.norm(tops, axis=1)[:, None]
         away = offsets + (middles - tops)[:, None]
         away_m = steps_m - step_m * found[:, :1]
-        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), air).reshape(away_m.shape)
+        deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
+        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation).reshape(
+            away_m.shape
+        )
         return np.asarray(np.log(np.maximum(amplitude, _DARK)) + found[:, 4:])
 
 

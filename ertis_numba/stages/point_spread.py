@@ -1,5 +1,6 @@
 """Point-spread function: the image of a single reflector, from array and call."""
 
+import functools
 import math
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Air, Settings
+from ertis_numba.stages.plan_response import Deviation
 from ertis_numba.waveform import matched_filter
 
 __all__ = ["PULSE_M", "PointSpread"]
@@ -51,11 +53,18 @@ class PointSpread:
         period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.reach_m
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
         self._path_m = np.arange(count) * (period_m / count)
-        pulse = np.fft.ifft(power / power.sum(), count) * count
-        self._pulse = pulse * np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * self._path_m)
+        shares = power / power.sum()
+        self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * self._path_m)
+        self._shares, self._wave_1_m, self._count = shares, wave_1_m, count
+        self._pulse = np.fft.ifft(shares, count) * count * self._turn
 
     def __call__(
-        self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64], air: Air | None = None
+        self,
+        direction_offset: NDArray[np.float64],
+        range_offset_m: NDArray[np.float64],
+        air: Air | None = None,
+        *,
+        deviation: Deviation | None = None,
     ) -> NDArray[np.float64]:
         """Return the amplitude, which is 1 at zero offset: (place,) float64.
 
@@ -66,9 +75,26 @@ class PointSpread:
         range_offset_m : (place,) float64
         air : Air, optional
             That of the settings by default.
+        deviation : Deviation, optional
+            Errors of the beam at each place.
         """
         scale = 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
         path_m = scale * (2 * range_offset_m[:, None] - direction_offset @ self._positions_m.T)
-        pulse = np.interp(np.abs(path_m), self._path_m, self._pulse)  # of negative paths the conjugate
-        pulse.imag[path_m < 0] *= -1
+        pulse = self._at(path_m, self._pulse)
+        if deviation is not None:
+            carrier_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi)
+            pulse = pulse * (1 + deviation.mean + deviation.slope_s * (carrier_hz - deviation.centre_hz))
+            pulse += deviation.slope_s * self._at(path_m, self._tilted_hz)
         return np.asarray(np.abs((pulse * np.exp(1j * self._carrier_1_m * path_m)).mean(axis=1)))
+
+    @functools.cached_property
+    def _tilted_hz(self) -> NDArray[np.complex128]:
+        """The pulse whose spectrum is weighted by the frequency relative to the carrier."""
+        offset_hz = (self._wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)
+        return np.asarray(np.fft.ifft(self._shares * offset_hz, self._count) * self._count * self._turn)
+
+    def _at(self, path_m: NDArray[np.float64], pulse: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return a pulse at some paths; that at negative paths is the conjugate."""
+        found = np.interp(np.abs(path_m), self._path_m, pulse)
+        found.imag[path_m < 0] *= -1
+        return np.asarray(found)

@@ -19,16 +19,18 @@ from ertis_numba.waveform import matched_spectrum
 __all__ = ["PositionUncertainty"]
 
 _WAVES = 64  # of the call's band, from which its widths are computed
-_THINNED = 16  # ranges of which one tells the noise
-_SAMPLE = 16_384  # bins that tell the noise, to a hundredth
+_SAMPLE = 32_768  # bins from which the noise is estimated, to a hundredth
+_BLOCKS = 16  # of ranges, the noise of each of which is estimated
+_QUIET = 1 / 3  # quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest
 _FLAT = 1e-12  # of the variance of an array, below which it has none
 _UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
 
-# An error of a plan is alike in neighbouring bins, so that it moves a maximum along the range by less than noise of the
-# same power. Across, it depends on the direction: these shares of its root mean square hold for unfavourable ones, and
-# are several times too large for others. tests/test_uncertainty.py compares them with trials.
+# Interpolation subtracts errors of a plan that it predicts. This share of their root mean square is left: errors are
+# taken as straight lines over frequency, and samples are rounded. `ertis bench points` measures it.
+_OF_PREDICTED = 0.02
+# Fractional delays depend on the range if wavefronts are spherical, and are not predicted. Their errors are alike in
+# neighbouring bins, so that they move a maximum by less than noise of the same power.
 _OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
-_OF_TWO_BEAM_TAPS, _OF_MORE_BEAM_TAPS = 1.5, 0.6
 
 
 class _PlanError(NamedTuple):
@@ -53,15 +55,16 @@ class PositionUncertainty:
     - λ is the least variance of the microphones' positions along any direction across the line of sight (H. L. Van
       Trees, Optimum Array Processing, 2002, section 8.4). For an image of one elevation, that direction is the azimuth.
 
-    The noise is estimated from the median of the image; the median of a Rayleigh variable is √ln 2 of its root mean
-    square. If echoes fill an image, they count as noise.
+    The noise is estimated from medians of blocks of ranges; the median of a Rayleigh variable is √ln 2 of its root mean
+    square. The lower tercile of these estimates counts, as side lobes of strong echoes raise the others. If echoes
+    fill an image, they count as noise.
 
-    A complete plan in the image's settings contributes its predicted errors for a single echo, as noise of the same
-    power times a measured share. A direction that could not be interpolated, for example at the edge of a grid,
+    Interpolation subtracts the predicted errors of a complete plan. The plan contributes a measured share of these
+    errors, which is left, as noise. A direction that could not be interpolated, for example at the edge of a grid,
     contributes the spacing of the grid.
 
     A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown. This is the case
-    for beamformers other than delay-and-sum, whose noise is not Rayleigh-distributed, and if at least half of the image
+    for beamformers other than delay-and-sum, whose noise is not Rayleigh-distributed, and if much of the image
     is 0, as after `clean`. Errors of layout, temperature and near-field curvature are not included, nor is interference
     between echoes at the same place.
 
@@ -125,9 +128,11 @@ class PositionUncertainty:
         echo = Texture.echo(self._settings, n_mics)
         parts = Planner(self._settings, kernels.load("numpy"), threads=1, texture=echo).parts(accuracy)
         # Half of an error's power changes a magnitude, and so does half of the noise's.
-        delays = (_OF_ONE_TAP if accuracy.delay_taps == 1 else _OF_DELAYS) * math.sqrt(2 * parts["delays"])
-        share = _OF_TWO_BEAM_TAPS if accuracy.beam_taps == 2 else _OF_MORE_BEAM_TAPS
-        return _PlanError(along=delays, across=math.hypot(delays, share * math.sqrt(2 * parts["beams"])))
+        delays, beams = (math.sqrt(2 * parts[name]) for name in ("delays", "beams"))
+        share = _OF_PREDICTED
+        if self._settings.processing.wavefront == "spherical":
+            share = _OF_ONE_TAP if accuracy.delay_taps == 1 else _OF_DELAYS
+        return _PlanError(along=share * delays, across=math.hypot(share * delays, _OF_PREDICTED * beams))
 
     def _least_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least variance of the array across the lines of sight: (point,) float64."""
@@ -150,6 +155,7 @@ def _noise(image: Energyscape) -> float:
     """Return the root mean square of the noise of an image; 0 if it is unknown."""
     if image.settings.processing.beamformer != "delay_and_sum":
         return 0.0
-    some = image.energy[:, ::_THINNED]
-    some = some[:: max(1, some.size // _SAMPLE)]
-    return float(np.median(some)) / math.sqrt(math.log(2))
+    some = image.energy[:: max(1, image.energy.size // _SAMPLE)]
+    blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)
+    level = float(np.quantile([np.median(block) for block in blocks], _QUIET))
+    return level / math.sqrt(math.log(2))

@@ -1,0 +1,122 @@
+"""Beam pattern errors of a plan: deviations of its beams from exact ones, for each microphone."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.fast import ahead_of, spectrum_of
+from ertis_numba.stages.fitting import DelayFit, one_thread
+
+__all__ = ["Deviation", "deviation_of"]
+
+_WAVES = 9  # over which errors of a plan are smooth
+
+
+class Deviation(NamedTuple):
+    """Relative error of each beam at each microphone, as a straight line over frequency.
+
+    Attributes
+    ----------
+    centre_hz : float
+    mean : (direction, mic) complex64
+        Error at the centre.
+    slope_s : (direction, mic) complex64
+        Its change per hertz.
+    """
+
+    centre_hz: float
+    mean: NDArray[np.complex64]
+    slope_s: NDArray[np.complex64]
+
+    def of(self, directions: NDArray[np.int64]) -> "Deviation":
+        """Return the deviation of some directions' beams."""
+        return Deviation(self.centre_hz, self.mean[directions], self.slope_s[directions])
+
+
+def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
+    """Return the deviation of a complete plan of the fast method; None where the plan's beams are exact or unknown.
+
+    It covers beams interpolated between beam-grid points, and samples interpolated between those kept. The latter
+    depend on the range if wavefronts are spherical, and are left out then.
+
+    Parameters
+    ----------
+    settings : Settings
+    directions : (direction, axis) float64
+        Unit vectors of the whole grid.
+    """
+    plan = settings.accuracy
+    if settings.processing.method != "fast" or None in {plan.oversampling, plan.delay_taps, plan.beam_taps}:
+        return None
+    return _deviation_of(settings, np.ascontiguousarray(directions, np.float64).tobytes())
+
+
+@functools.lru_cache(maxsize=4)
+def _deviation_of(settings: Settings, directions: bytes) -> Deviation | None:
+    with one_thread():
+        return _computed(settings, np.frombuffer(directions).reshape(-1, 3))
+
+
+def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
+    plan, layout, spectrum = settings.accuracy, microphones(settings.array), spectrum_of(settings)
+    aperture = Aperture.of(layout.enabled_positions_m, directions)
+    speed_m_s = sound_speed_m_s(settings.air)
+    is_plane = settings.processing.wavefront == "plane"
+    chosen = np.unique(np.linspace(0, len(spectrum.power) - 1, _WAVES).astype(np.intp))
+    frequency_hz = spectrum.frequency_hz[chosen]
+    power = spectrum.power[chosen] / spectrum.power[chosen].sum()
+    centre_hz = float(power @ frequency_hz)
+    offset_hz = frequency_hz - centre_hz
+    nodes = None
+    if plan.beam_taps and aperture.n_axes in {1, 2}:
+        nodes = BeamNodes(
+            aperture,
+            spectrum,
+            n_taps=plan.beam_taps,
+            density=plan.beam_density or 2.0,
+            high_hz=settings.call.high_frequency_hz,
+            sound_speed_m_s=speed_m_s,
+        )
+    elif not is_plane:
+        return None
+    points = aperture.directions if nodes is None else nodes.points
+    delays_s = aperture.delays_s(points, sound_speed_m_s=speed_m_s)
+    step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
+    fit = DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum)
+    ahead_s = ahead_of(fit, delays_s.shape[1], step_s)
+    taken_s = layout.delay_s[layout.enabled] - ahead_s + delays_s
+    first, fractions = fit.split(taken_s)
+    weights = fit.weights(fractions)
+    shape = (len(directions), delays_s.shape[1])
+    mean, slope_s = np.zeros(shape, dtype=np.complex128), np.zeros(shape, dtype=np.complex128)
+    exact_s = aperture.delays_s(aperture.directions, sound_speed_m_s=speed_m_s)
+    gains = np.ones((shape[1], len(chosen))) if nodes is None else nodes.gain(frequency_hz)
+    delay_gains = fit.gain(frequency_hz)
+    for k, each_hz in enumerate(frequency_hz):
+        turn = 2j * math.pi * each_hz
+        made = np.exp(turn * delays_s)
+        if is_plane:
+            steps = np.exp(turn * step_s * np.arange(fit.n_taps))
+            made *= delay_gains[k] * np.exp(turn * (first * step_s - taken_s)) * (weights @ steps)
+        if nodes is not None:
+            made = _interpolated(nodes, made)
+        error = gains[:, k] * made * np.exp(-turn * exact_s) - 1
+        mean += power[k] * error
+        slope_s += power[k] * offset_hz[k] / float(power @ offset_hz**2) * error
+    return Deviation(centre_hz, mean.astype(np.complex64), slope_s.astype(np.complex64))
+
+
+def _interpolated(nodes: BeamNodes, made: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return beams of all directions, (direction, mic), from those of beam-grid points."""
+    beams = np.zeros((len(nodes.rows), made.shape[1]), dtype=np.complex128)
+    for pair in range(nodes.places.shape[1]):
+        for one in (0, 1):
+            beams[nodes.rows] += nodes.weights[:, pair, one, None] * made[nodes.places[:, pair] + one]
+    return beams
