@@ -241,7 +241,8 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
         assert all(budgets[preset] <= max_error_db for preset, max_error_db in ERROR_PRESETS_DB.items())
         exact_row = rows[-1]
         assert exact_row["on_front"]  # nothing is more exact
-        assert (exact_row["peaks_lost"], exact_row["peak_level_db"]) == (0, 0.0)
+        assert exact_row["peaks_lost"] == 0
+        assert exact_row["peak_level_db"] <= 0.001  # -100 dB of the strongest are more of a faint one
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert full.read_text("utf-8").count("the paper's method |") == 2
     assert "| float32, nearest sample of 2 per range, 40 dB |" in full.read_text("utf-8")
