@@ -181,9 +181,11 @@ class Reflector:
     azimuth_deg, elevation_deg, range_m : float
         In the sensor frame, when the emission began.
     level_db : float
-        Level of its echo below the strongest of the same measurement, so at most 0.
+        Level of its echo relative to the strongest of the sensor's own call, so at most 0, except for other emitters.
     velocity_m_s : (x, y, z)
         In the sensor frame, relative to the sensor.
+    emitter : str
+        Another sensor, if this is the echo of its call; images show it, but at no place where anything is.
     """
 
     name: str
@@ -192,6 +194,7 @@ class Reflector:
     range_m: float
     level_db: float
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emitter: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

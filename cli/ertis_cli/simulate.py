@@ -175,7 +175,9 @@ def _print(effects: list[dict[str, Any]]) -> None:
 
 def _summary(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> str:
     several = f" of {options.counted(len(truth), 'sensor')}" if len(truth) > 1 else ""
-    most = max(len(reflectors) for entry in truth.values() for reflectors in entry.reflectors)
+    most = max(
+        sum(not each.emitter for each in reflectors) for entry in truth.values() for reflectors in entry.reflectors
+    )
     return f"{target}: {options.counted(scene.count, 'measurement')}{several}, {options.counted(most, 'reflector')}"
 
 
