@@ -223,3 +223,13 @@ def test_refuses_usage(arguments, match):
     done = listen("tcp://127.0.0.1:1", *arguments)
     assert done.exit_code == 2
     assert match in done.stderr
+
+
+def test_silence_is_reported_once(monkeypatch):
+    monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.05)
+    with Publisher() as publisher:
+        done = listen(publisher.address, "--duration", "1")
+    told = [line for line in done.stderr.splitlines() if "has come from" in line]
+    assert len(told) == 1
+    assert "no energyscape has come from tcp://" in told[0]
+    assert "does 'ertis capture --to' run?" in told[0]

@@ -21,8 +21,9 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
 
     A reflector stands at half of the way of its sound, in the direction from which the sound comes; by a wall, that
     is the place of its mirror image. Its level is that of the mean amplitude over the microphones and the
-    call's band, relative to the strongest echo of the own call, and the strongest come first; its velocity is relative to the sensor, and only along
-    the line of sight where walls are involved. Calls of other sensors reach the image if cross-emission is simulated.
+    call's band, relative to the strongest echo of the own call, and the strongest come first. Its velocity is relative
+    to the sensor, and only along the line of sight where walls are involved. Calls of other sensors reach the image if
+    cross-emission is simulated.
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}
