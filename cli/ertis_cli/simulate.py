@@ -195,4 +195,6 @@ def _report(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> dict[
 
 def _row(reflector: "Reflector") -> dict[str, Any]:
     row = {name: getattr(reflector, name) for name in reflector.__slots__}
+    if not reflector.emitter:  # the sensor's own call, as almost always
+        del row["emitter"]
     return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}
