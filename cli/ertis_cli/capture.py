@@ -204,13 +204,14 @@ def capture(
             n=n,
             duration_s=duration,
             patience_s=patience,
-            mounting=_mounting(mounting, list(sonars), quiet=quiet),
+            mounting=_mountings.mountings(mounting, sonars),
             on_stored=watch.stored,
             on_note=watch.note,
             on_back=watch.back,
             on_tick=watch.tick,
         )
         checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices)
+        _note_mounting(mounting, list(sonars), quiet=quiet)
         signals.obey(session.stop)
         made.clear()
         if send is None:
@@ -279,12 +280,9 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
         click.echo(sealed.remark, err=True)
 
 
-def _mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> "dict[str, _mountings.Mounting] | None":
-    """Return where sensors are, or tell that it is unknown."""
-    if path is None:
-        remedy = "give --mounting FILE to lay their images over one another"
-        _mountings.note_unknown(sensors, remedy, quiet=quiet)
-    return _mountings.mountings(path, sensors)
+def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> None:
+    remedy = "give --mounting FILE to lay their images over one another"
+    _mountings.note_unknown(sensors if path is None else [], remedy, quiet=quiet)
 
 
 def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
