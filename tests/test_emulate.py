@@ -279,7 +279,7 @@ def test_pulses_wait_until_a_scene_is_rendered(emulate, tmp_path):
     scene = Scene.from_toml(SCENE)
     engine = Engine(scene, scene.sensors[0], frozenset(EFFECTS))
     assert all(np.array_equal(came, engine.render(index % 2).words) for index, came in enumerate(words))
-    assert "the first 2 pulses come more slowly" in ended(process, signal.SIGINT)[2]
+    assert "rendering 2 measurements of each sensor as pulses come" in ended(process, signal.SIGINT)[2]
 
 
 def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):

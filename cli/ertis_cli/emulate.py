@@ -154,8 +154,8 @@ def emulate(
         signals.obey(ended.set)
         if sync_rate is not None:
             if stage is not None:
-                told = options.counted(stage.count, "pulse")
-                options.say(f"the first {told} come more slowly, as the scene is rendered meanwhile", quiet=quiet)
+                told = f"{options.counted(stage.count, 'measurement')} of each sensor"
+                options.say(f"rendering {told} as pulses come; the first round is slower", quiet=quiet)
             stack.enter_context(SyncChain(devices, sync_rate, before=partial(_get_ready, devices, given)))
         _look_after(devices, sorted(absences), ended)
     options.say("the emulated sensors have ended", quiet=quiet)
@@ -230,12 +230,14 @@ def _accepts(refusal: "Refusal", name: str, demand: "Demand") -> bool:
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
-    """Make the measurements of a pulse before it comes, of the devices that will take it."""
-    for device in devices:
-        registers = device.registers
-        words, passive, _ = given[device.name]
-        if registers.armed and device.error is None:
-            chosen = words if (registers.active and registers.amplifier) or passive is None else passive
+    """Make the measurements of a pulse before it comes, also of devices that are about to be armed."""
+    registers = {device.name: device.registers for device in devices if device.error is None}
+    if not any(each.armed for each in registers.values()):
+        return
+    for name, each in registers.items():
+        words, passive, _ = given[name]
+        if each.armed or each.n_codes:
+            chosen = words if (each.active and each.amplifier) or passive is None else passive
             chosen[pulse % len(chosen)]  # which keeps it
 
 
