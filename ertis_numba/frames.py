@@ -7,6 +7,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Settings
 
 __all__ = ["Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"]
@@ -124,9 +125,9 @@ class PointCloud:
         Envelope amplitude, as in `Energyscape`.
     settings : Settings
     stamp : Stamp
-    translation_m : (x, y, z)
-        Where the sensor is on its platform.
-    rotation_xyzw : (x, y, z, w)
+    translation_m : (x, y, z), optional
+        Where the sensor is on its platform; None if its mounting is unknown.
+    rotation_xyzw : (x, y, z, w), optional
         The unit quaternion that turns the sensor frame into the platform's.
     uncertainty_m : (point, 2) float32, optional
         Standard deviations of the position along range and across it, as `PointExtractor` tells them; None where they
@@ -137,8 +138,8 @@ class PointCloud:
     energy: NDArray[np.float32]
     settings: Settings
     stamp: Stamp = Stamp()
-    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    translation_m: tuple[float, float, float] | None = None
+    rotation_xyzw: tuple[float, float, float, float] | None = None
     uncertainty_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
@@ -149,7 +150,18 @@ class PointCloud:
         return replace(self, **changes)
 
     def on_platform_m(self) -> NDArray[np.float32]:
-        """Return the positions in the platform's frame: (point, axis) float32."""
+        """Return the positions in the platform's frame: (point, axis) float32.
+
+        Raises
+        ------
+        ArgumentError
+            The mounting of the sensor is unknown.
+        """
+        if self.translation_m is None or self.rotation_xyzw is None:
+            raise ArgumentError(
+                f"the mounting of sensor {self.stamp.sensor!r} is unknown, so its points have no place on a platform; "
+                "use position_m, which is in the sensor's frame, or give 'ertis capture' a --mounting"
+            )
         axis, w = np.array(self.rotation_xyzw[:3]), self.rotation_xyzw[3]
         position_m = self.position_m.astype(np.float64)
         # v + 2 w (q × v) + 2 q × (q × v), the rotation of v by the unit quaternion (q, w)
@@ -169,9 +181,11 @@ class Reflector:
     azimuth_deg, elevation_deg, range_m : float
         In the sensor frame, when the emission began.
     level_db : float
-        Level of its echo below the strongest of the same measurement, so at most 0.
+        Level of its echo relative to the strongest of the sensor's own call, so at most 0, except for other emitters.
     velocity_m_s : (x, y, z)
         In the sensor frame, relative to the sensor.
+    emitter : str
+        Another sensor, if this is the echo of its call; images show it, but at no place where anything is.
     """
 
     name: str
@@ -180,6 +194,7 @@ class Reflector:
     range_m: float
     level_db: float
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emitter: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,13 +1,18 @@
 """Errors against a known truth, in images whose content is known by formula."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Peak, Reflector
+from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
+from ertis_numba.simulation import Scene
+from ertis_numba.simulation.plan import Plan, Verdict
+from ertis_numba.simulation.render import Simulator
 from ertis_numba.stages.compare import Comparison, Match, compare, errors_of
 from tests.test_detect import image_of
 
@@ -216,3 +221,43 @@ def test_errors_of_nothing_are_none():
 def test_refuses():
     with pytest.raises(ArgumentError, match="min_level_db is 3; give a number from -1000 to 0"):
         compare(ideal(MIDDLE), [], min_level_db=3.0)
+
+
+def test_echoes_of_other_sensors_calls_are_explained_and_not_missed():
+    """A peak at half of the way of another call is not false; another call that is not seen is not missed."""
+    other = replace(RIGHT, name="east: points[0]", emitter="east")
+    unseen = replace(true(20, 1.1), name="east: points[1]", emitter="east")
+    assert counts(compare(ideal(LEFT, MIDDLE, RIGHT), [LEFT, MIDDLE, other, unseen])) == (2, 0, 0, 1)
+
+
+def test_echoes_of_several_sensors_are_explained_by_who_emitted():
+    """Two sensors, each with the echoes of both calls in its image."""
+    scene = Scene.from_toml(FACING)
+    for name in ("west", "east"):
+        simulator = Simulator(scene, sensor=name, plan=Plan(tuple(Verdict(name=e, on=True, reason="") for e in NEEDED)))
+        measurement = simulator.render()
+        comparison = compare(
+            Pipeline(measurement.settings).process(measurement), simulator.reflectors(), min_level_db=-12
+        )
+        assert (len(comparison.matched), len(comparison.missed), len(comparison.false)) == (1, 0, 0)
+        assert comparison.explained
+
+
+NEEDED = ("propagation", "spreading", "cross_emission", "modulation")
+FACING = """
+[[sensors]]
+name = "west"
+recording.n_samples = 65536
+processing.directions = "2d:61"
+processing.range_m = [0.4, 1.4]
+[[sensors]]
+name = "east"
+position_m = [1.6, 0.0, 0.0]
+yaw_deg = 180.0
+recording.n_samples = 65536
+processing.directions = "2d:61"
+processing.range_m = [0.4, 1.4]
+[[points]]
+position_m = [0.7, 0.4, 0.0]
+strength_db = -6.0
+"""

@@ -7,16 +7,21 @@ import subprocess
 import sys
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 import serial
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.devices.setup import Setup
+from ertis_numba.devices.sonar import Sonar
+from ertis_numba.errors import SonarError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.simulation import Scene
-from ertis_numba.simulation.render import render
-from ertis_numba.storage import write_recording
+from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.storage import open_recording, write_recording
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
 from tests.files import noise
 
@@ -98,7 +103,7 @@ def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
     assert second.returncode == 1
     code, out, errors = ended(process, signal.SIGINT)
     assert (code, out) == (130, "")
-    assert errors.strip() == "ertis: error: interrupted"
+    assert errors.strip() == "the emulated sensors have ended"
     assert not link.is_symlink()
 
 
@@ -177,7 +182,8 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
         ask(port, b"!G,131072,0,0\n")
         for counter, active in enumerate((1, 1, 0, 1)):
             port.write(b"!A,%d,0,0\n" % active)
-            words = render(scene if active else silent, counter % 2).words
+            heard = scene if active else silent  # with all effects: to decide which ones matter takes longer
+            words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).words
             assert is_block(block(port), counter, words)
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
@@ -205,3 +211,91 @@ def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
     done = CliRunner().invoke(cli, ["emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
     assert (done.exit_code, done.stdout) == (1, "")
     assert "recording.n_samples is 40960; a sensor measures multiples of 32768 up to 16777216" in done.stderr
+
+
+def captured(port, settings):
+    """Tell a device what ``ertis capture`` tells it, and measure once."""
+    with Sonar.open(port) as sonar:
+        sonar.configure(Setup.of(settings))
+        return sonar.measure().words
+
+
+def test_a_scene_is_rendered_for_the_call_that_a_sensor_is_given(emulate, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    process = emulate(tmp_path / "scene.toml", "--quiet")
+    settings = Settings.from_preset("short_20_80")
+    words = captured(process.stdout.readline().rstrip(), settings)
+    (sensor,) = Scene.from_toml(SCENE).sensors
+    sensor = sensor.replace(call=settings.call, recording=settings.recording, processing=settings.processing)
+    scene = Scene.from_toml(SCENE).replace(sensors=(sensor,))
+    assert np.array_equal(words, Engine(scene, sensor, frozenset(EFFECTS)).render().words)
+    assert ended(process, signal.SIGTERM)[0] == 143
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("scene", "only was given a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"),
+        ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),
+    ],
+)
+def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, source, told):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    process = emulate(*([tmp_path / "scene.toml"] if source == "scene" else [recording, "--sensor", "left"]), "--quiet")
+    port = process.stdout.readline().rstrip()
+    settings = Settings(
+        call=Call(start_frequency_hz=25e3, stop_frequency_hz=50e3), recording=Recording(n_samples=N_SAMPLES)
+    )
+    settings = settings.replace(processing=Processing(range_m=(0.3, 0.5)))
+    for _ in range(2):  # the second time, the device still holds the call
+        with pytest.raises(SonarError, match="'ertis emulate' tells why"):
+            captured(port, settings)
+        assert process.stderr.readline().startswith(f"ertis: warning: {told}")
+    accepted = settings.replace(call=Call())
+    assert len(captured(port, accepted)) == N_SAMPLES
+    assert ended(process, signal.SIGTERM) == (143, "", "")
+
+
+def test_a_point_on_a_sensor_is_reported(emulate, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE + "[[points]]\nposition_m = [0.0, 0.0, 0.0]\n")
+    process = emulate(tmp_path / "scene.toml")
+    process.stdout.readline()
+    _, _, errors = ended(process, signal.SIGTERM)
+    assert "note: points[1] is on sensor only, within 0.01 m; its echo hides all others" in errors
+    assert "rendering 2 measurements ..." in errors
+    assert not any("rehears" in line or "Traceback" in line for line in errors.splitlines())
+
+
+def test_pulses_wait_until_a_scene_is_rendered(emulate, tmp_path):
+    """With a SYNC line the port is there before anything is rendered, and all pulses have their words."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    process = emulate(tmp_path / "scene.toml", "--sync-rate", 5)
+    with Sonar.open(process.stdout.readline().rstrip()) as sonar:
+        settings = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
+        sonar.configure(Setup.of(settings))
+        sonar.arm()
+        blocks = sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S)
+        words = [next(blocks).words for _ in range(3)]
+    scene = Scene.from_toml(SCENE)
+    engine = Engine(scene, scene.sensors[0], frozenset(EFFECTS))
+    assert all(np.array_equal(came, engine.render(index % 2).words) for index, came in enumerate(words))
+    assert "rendering 2 measurements of each sensor as pulses come" in ended(process, signal.SIGINT)[2]
+
+
+def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "links"))
+    with pytest.raises(SonarError, match="there is no serial port 'left'"):
+        Sonar.open("left")
+    command = ["capture", "--port", "left", "-n", "2", "--settings", str(tmp_path / "settings.toml"), "--no-check-bits"]
+    command += ["-o", str(tmp_path / "new.h5"), "--mounting", str(tmp_path / "where.toml"), "--json", "--quiet"]
+    (tmp_path / "settings.toml").write_text(
+        f"[recording]\nn_samples = {N_SAMPLES}\n[processing]\nrange_m = [0.3, 0.5]\n"
+    )
+    (tmp_path / "where.toml").write_text('[[sensors]]\nname = "left"\nposition_m = [1.0, 2.0, 3.0]\n')
+    refused = CliRunner().invoke(cli, command)
+    assert (refused.exit_code, "there is no serial port 'left'" in refused.stderr) == (1, True)
+    emulate(recording, "--sensor", "left")
+    done = CliRunner().invoke(cli, [*command, "--wait", str(TIMEOUT_S)])
+    assert done.exit_code == 0, done.stderr
+    with open_recording(tmp_path / "new.h5") as made:
+        assert made.translation_m.tolist() == [1.0, 2.0, 3.0]

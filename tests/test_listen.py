@@ -223,3 +223,16 @@ def test_refuses_usage(arguments, match):
     done = listen("tcp://127.0.0.1:1", *arguments)
     assert done.exit_code == 2
     assert match in done.stderr
+
+
+@pytest.mark.parametrize(("n_received", "lines"), [(0, 1), (3, 0)])
+def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
+    monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.0)
+    heard = Heard(as_json=False, quiet=False)
+    heard.silent("tcp://here", ("energyscape",), 0)  # nobody answers yet, which is reported elsewhere
+    heard.subscribed("tcp://here", (), ("energyscape",))
+    for _ in range(2):
+        heard.silent("tcp://here", ("energyscape",), n_received)
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == lines
+    assert all("no energyscape has come from tcp://here yet; does 'ertis capture --to' run?" in line for line in told)

@@ -110,11 +110,17 @@ def test_files_named_are_there(page):
 
 
 @pytest.mark.parametrize("name", ["README.md", "docs/index.md", "docs/network.md", "docs/applications.md"])
-def test_pages_say_when_an_emulated_sensor_is_there(name):
-    """Commands that follow at once find none, as its scene is rendered first."""
-    before, emulating, _ = (ROOT / name).read_text().partition("$ ertis emulate")
-    assert emulating
-    (said,) = re.findall(
-        r"port\s+is printed|has printed\s+its ports?|has printed\s+their ports", before[-600:].replace("`", "")
-    )
-    assert said
+def test_blocks_that_emulate_can_be_pasted_as_they_are(name):
+    """Commands that follow at once find no sensor, so they wait for it."""
+    blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis emulate" in block]
+    assert blocks
+    for block in blocks:
+        _, *after = re.findall(r"^\$ ertis (?:emulate .*|capture .*|devices)$", block, re.MULTILINE)
+        assert "capture" in after[0]
+        assert "--wait" in after[0]
+
+
+def test_network_blocks_give_the_mounting_of_their_sensors():
+    for page in ("README.md", "docs/network.md", "docs/applications.md"):
+        (captured,) = re.findall(r"^\$ ertis capture .*--to .*$", (ROOT / page).read_text(), re.MULTILINE)
+        assert "--mounting examples/platform.toml" in captured

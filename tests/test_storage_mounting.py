@@ -10,7 +10,12 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.frames import PointCloud
+from ertis_numba.journal import Entry, Journal
+from ertis_numba.network.messages import Hello, decode, encode
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
+from ertis_numba.storage.sealing import seal
+from ertis_numba.storage.truth import Truth
 from tests.files import SMALL, image, noise
 from tests.test_storage_sensors import TURNED, of
 
@@ -69,6 +74,7 @@ def test_what_nobody_said_is_not_in_the_file(tmp_path):
     assert place_of(path, "left") == (None, None)
     with h5py.File(path) as file:
         assert not {"translation_m", "rotation_xyzw"} & file["sensors/left"].attrs.keys()
+        assert file["sensors/left"].attrs["mounting"] == b"unknown"
     run("export", path, "-o", tmp_path / "a.ply")
     assert "frame left" in plyfile.PlyData.read(tmp_path / "a.ply").comments
 
@@ -111,3 +117,118 @@ def test_half_a_mounting_is_damage(tmp_path, spoil, told):
         spoil(file["sensors/left"].attrs)
     with pytest.raises(DamagedError, match=f"img.h5.*{told}"):
         open_energyscapes(path)
+
+
+def older(path, **changes):
+    """Make a file one of those before the attribute ``mounting``."""
+    with h5py.File(path, "r+") as file:
+        attributes = file["sensors/left"].attrs
+        del attributes["mounting"]
+        for name, value in changes.items():
+            attributes[name] = value
+    return path
+
+
+ORIGIN = {"translation_m": np.zeros(3), "rotation_xyzw": np.array([0.0, 0.0, 0.0, 1.0])}
+
+
+def test_recordings_without_a_mounting_are_exported_in_the_sensors_own_frame(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
+    with open_recording(path) as recording:
+        assert (recording.translation_m, recording.rotation_xyzw) == (None, None)
+    done = CliRunner().invoke(cli, ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"])
+    assert done.exit_code == 0, done.stderr
+    assert "note: the mounting of sensor left is unknown; all is in the frame of the sensor" in done.stderr
+    assert "frame left" in plyfile.PlyData.read(tmp_path / "a.ply").comments
+    info = CliRunner().invoke(cli, ["info", str(path), "--json"])
+    assert '"mounting": "unknown"' in info.stdout
+
+
+def test_several_sensors_without_a_mounting_are_not_laid_over_one_another(tmp_path):
+    both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
+    path = write_recording(tmp_path / "rec.h5", both)
+    command = ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"]
+    done = CliRunner().invoke(cli, command)
+    assert done.exit_code == 1
+    assert "where sensors left, right are on their platform is not known" in done.stderr
+    (tmp_path / "where.toml").write_text('[[sensors]]\nname = "left"\n[[sensors]]\nname = "right"\nyaw_deg = 90.0\n')
+    given = write_recording(tmp_path / "given.h5", both, mounting=PLACES)
+    for file in (tmp_path / "where.toml", given):
+        run(*command, "--mounting", file, "--force")
+        assert "frame base_link" in plyfile.PlyData.read(tmp_path / "a.ply").comments
+    done = CliRunner().invoke(cli, [*command, "--mounting", str(path), "--force"])
+    assert done.exit_code == 1
+    assert "rec.h5 does not hold the mounting of any sensor; give a scene" in done.stderr
+
+
+def test_processing_keeps_that_a_mounting_is_unknown(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
+    done = CliRunner().invoke(cli, ["process", str(path), "-o", str(tmp_path / "img.h5"), "--device", "cpu"])
+    assert done.exit_code == 0, done.stderr
+    assert done.stderr.count("note: the mounting of sensor left is unknown") == 1
+    assert place_of(tmp_path / "img.h5", "left") == (None, None)
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_origin_of_older_recordings_is_unknown_unless_simulated(tmp_path, simulated):
+    truth = {"left": Truth(scene="", seed=1, reflectors=((),))} if simulated else None
+    path = older(write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)), truth=truth), **ORIGIN)
+    with open_recording(path) as recording:
+        assert (recording.translation_m is not None) == simulated
+
+
+def test_mountings_of_older_files_are_kept(tmp_path):
+    given = {"left": PLACES["left"]}
+    path = older(write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)), mounting=given))
+    with open_recording(path) as recording:
+        assert recording.translation_m.tolist() == list(PLACES["left"][0])
+
+
+def test_the_origin_remains_known_if_it_was_given(tmp_path):
+    given = {"left": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)), mounting=given)
+    with open_recording(path) as recording:
+        assert recording.translation_m.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("value", ["maybe", 3])
+def test_a_mounting_of_another_kind_is_damage(tmp_path, value):
+    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
+    with h5py.File(path, "r+") as file:
+        file["sensors/left"].attrs["mounting"] = value
+    with pytest.raises(DamagedError, match=r"attribute mounting is .*wanted 'given' or 'unknown'"):
+        open_recording(path)
+
+
+def test_journals_keep_that_a_mounting_is_unknown(tmp_path):
+    with Journal.create(tmp_path / "rec.h5.journal", target="rec.h5") as journal:
+        journal.add_sensor("left", SMALL)
+        journal.append([Entry(each, 0) for each in of("left", noise(SMALL, 1))])
+    with Journal.open(tmp_path / "rec.h5.journal") as journal:
+        assert (journal.sensors["left"].translation_m, journal.sensors["left"].rotation_xyzw) == (None, None)
+    assert seal(tmp_path / "rec.h5.journal").recording == tmp_path / "rec.h5"
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.translation_m is None
+
+
+def test_point_clouds_of_an_unknown_mounting_have_no_place_on_a_platform():
+    cloud = PointCloud(np.ones((1, 3), np.float32), np.ones(1, np.float32), SMALL)
+    with pytest.raises(ArgumentError, match="the mounting of sensor 'sensor' is unknown"):
+        cloud.on_platform_m()
+
+
+@pytest.mark.parametrize("place", [None, (1.0, 2.0, 3.0)])
+def test_mountings_travel_over_the_wire(place):
+    rotation = None if place is None else (0.0, 0.0, 0.0, 1.0)
+    hello = Hello(sensor="a", epoch=1, next_sequence=0, settings_crc32=0, translation_m=place, rotation_xyzw=rotation)
+    assert decode(encode(hello)) == hello
+    assert Hello(sensor="a", epoch=1, next_sequence=0, settings_crc32=0).translation_m is None
+
+
+def test_processing_refuses_to_write_a_picture(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
+    done = CliRunner().invoke(cli, ["process", str(path), "-o", str(tmp_path / "x.png")])
+    assert done.exit_code == 2
+    assert "x.png is a picture" in done.stderr
+    assert "'ertis plot'" in done.stderr
+    assert not (tmp_path / "x.png").exists()

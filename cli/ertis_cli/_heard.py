@@ -1,6 +1,7 @@
 """What is told of what a central node publishes."""
 
 import functools
+import time
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ __all__ = ["Heard"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
 _SOON_S = 3.0
+_SILENT_S = 5.0
 _STAMP = ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
@@ -29,6 +31,7 @@ class Heard:
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self._said = self._noted = False
+        self._subscribed_s: float | None = None  # None once something has come, or its absence was reported
 
     def head(self) -> None:
         """Print what the columns are."""
@@ -46,7 +49,24 @@ class Heard:
                     "products": list(products),
                 }
             )
+        if not self._said:
+            self._subscribed_s = time.monotonic()
         self._said = True
+
+    def silent(self, address: str, products: tuple[str, ...], n_received: int) -> None:
+        """Report, after a while and once, that a publisher answers but nothing has come."""
+        if self._subscribed_s is None or (not n_received and time.monotonic() - self._subscribed_s < _SILENT_S):
+            return
+        self._subscribed_s = None
+        if n_received:
+            return
+        text = (
+            f"no {' and no '.join(products)} has come from {address} yet; does 'ertis capture --to' run? "
+            "See 'ertis status'"
+        )
+        if self._as_json:
+            options.print_json({"event": "waiting", "address": address, "text": text})
+        options.say(text, quiet=self._quiet)
 
     def unanswered(self, address: str, since_s: float) -> None:
         """Tell, after a while and once, that nobody has answered; where that is told, `note` tells who does then."""

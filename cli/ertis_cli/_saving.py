@@ -64,7 +64,8 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
                 image = cast("Energyscape", arrival.item)  # as was asked
                 if image.stamp.sensor not in mounted:
                     mounted.add(image.stamp.sensor)
-                    writer.note_mounting(image.stamp.sensor, arrival.translation_m, arrival.rotation_xyzw)
+                    if arrival.translation_m is not None and arrival.rotation_xyzw is not None:
+                        writer.note_mounting(image.stamp.sensor, arrival.translation_m, arrival.rotation_xyzw)
                 writer.write(image)
 
             yield write

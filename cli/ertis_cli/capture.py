@@ -1,7 +1,10 @@
 """``ertis capture``: sensors to a recording."""
 
+import errno
 import re
 import sys
+import threading
+import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,14 +12,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ertis_cli import _network, options
+from ertis_cli import _mountings, _network, options
 from ertis_cli._saving import taken_back
 from ertis_cli._sending import Sending
 from ertis_cli._signals import Signals, stopped_by_signals
 from ertis_cli._watch import Watch, report
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from ertis_numba.capture import Session
     from ertis_numba.devices.bits import BitCheck
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
 
 __all__ = ["capture"]
+
+_LOOK_S = 0.1  # how often ports are looked for
 
 
 @click.command()
@@ -60,11 +65,15 @@ __all__ = ["capture"]
 )
 @_network.key
 @_network.server_key
+@_mountings.mounting
 @click.option(
-    "--mounting",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Where sensors are: a scene, or its [[sensors]].",
+    "--wait",
+    "wait_s",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    show_default=True,
+    metavar="S",
+    help="Wait so many seconds for ports that are not there yet.",
 )
 @click.option(
     "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor, or SYNC pulses."
@@ -122,6 +131,7 @@ def capture(
     key: str | None,
     server_key: str | None,
     mounting: Path | None,
+    wait_s: float,
     n: int | None,
     duration: float | None,
     trigger: Literal["command", "sync"],
@@ -181,6 +191,7 @@ def capture(
         made = stack.enter_context(taken_back(spool))
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
+        _wait_for(ports, wait_s, signals, quiet=quiet)
         sonars = _named(ports, names, [stack.enter_context(Sonar.open(port, passive=listen_only)) for port in ports])
         target = target or Path(_default_name(list(sonars)))
         if send is None:
@@ -193,13 +204,14 @@ def capture(
             n=n,
             duration_s=duration,
             patience_s=patience,
-            mounting=_mounting(mounting, sonars),
+            mounting=_mountings.mountings(mounting, sonars),
             on_stored=watch.stored,
             on_note=watch.note,
             on_back=watch.back,
             on_tick=watch.tick,
         )
         checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices)
+        _note_mounting(mounting, list(sonars), quiet=quiet)
         signals.obey(session.stop)
         made.clear()
         if send is None:
@@ -268,22 +280,29 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
         click.echo(sealed.remark, err=True)
 
 
-def _mounting(
-    path: Path | None, sensors: "Iterable[str]"
-) -> "dict[str, tuple[Sequence[float], Sequence[float]]] | None":
-    """Return where sensors are, which a scene says when it begins."""
-    if path is None:
-        return None
-    from ertis_numba.errors import ArgumentError
-    from ertis_numba.simulation.scene import load_scene
+def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> None:
+    remedy = "give --mounting FILE to lay their images over one another"
+    _mountings.note_unknown(sensors if path is None else [], remedy, quiet=quiet)
 
-    known = {sensor.name: sensor for sensor in load_scene(path).sensors}
-    for name in sensors:
-        if name not in known:
-            raise ArgumentError(
-                f"{path} says nothing of sensor {name!r}; add it, or call it one of {', '.join(known)} by --name"
-            )
-    return {name: (known[name].path().position_at(0.0).tolist(), known[name].quaternion().tolist()) for name in sensors}
+
+def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
+    """Wait until all ports are there, or refuse the first that is not."""
+    from ertis_numba.devices.ports import resolve
+    from ertis_numba.errors import SonarError
+
+    end_s, never = time.monotonic() + wait_s, threading.Event()
+    with options.note_when_slow(f"waiting for {', '.join(ports)} ...", quiet=quiet):
+        for port in ports:
+            while True:
+                if signals.came:
+                    signals.end()
+                try:
+                    resolve(port)
+                    break
+                except SonarError as error:
+                    if error.errno != errno.ENOENT or time.monotonic() >= end_s:
+                        raise
+                never.wait(_LOOK_S)
 
 
 def _configured(

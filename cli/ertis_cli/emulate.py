@@ -1,30 +1,28 @@
 """``ertis emulate``: devices that answer and measure like real ones, on pseudo terminals."""
 
 import json
+import sys
 import threading
 import time
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
-from ertis_cli._signals import broken_off_by_signals, interrupt_later
+from ertis_cli._signals import broken_off_by_signals, interrupt_later, stopped_by_signals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    import numpy as np
-    from numpy.typing import NDArray
+    from ertis_cli._emulation import Stage
+    from ertis_numba.devices.emulator import Demand, Emulator
 
-    from ertis_numba.devices.emulator import Emulator
-    from ertis_numba.simulation import Scene
-    from ertis_numba.simulation.render import Simulator
-    from ertis_numba.storage import RecordingReader
-
-    Given = Mapping[str, tuple[Any, Any]]  # by sensor: measurements, and those without emission
+    Refusal = Callable[[str, Demand], str]
+    # By sensor: measurements, those without emission, and why there are none for what the sensor was told.
+    Given = Mapping[str, tuple[Any, Any, Refusal]]
 
 __all__ = ["emulate"]
 
@@ -101,6 +99,12 @@ def emulate(
     Each sensor is a device of its own, on a pseudo terminal whose path is printed when it is ready. It takes the
     commands of a real one, and measures what the scene lets it hear, or what was recorded, over and over.
     Measurements without emission are those of the scene while all sensors are silent.
+
+    A scene is rendered for the call that 'ertis capture' gives the sensor: that of the scene or of a preset. Without
+    --sync-rate, all measurements with the scene's call are rendered first. With it, they are rendered as pulses come,
+    and the first pulses come more slowly. A recording has one call only; with another one, the sensor does not measure.
+
+    The same file gives 'ertis capture' the mounting of the sensors: --mounting SCENE.toml|REC.h5.
     """
     from ertis_numba.devices.emulator import Emulator, SyncChain
     from ertis_numba.devices.emulator.faults import Faults
@@ -122,10 +126,10 @@ def emulate(
         links = {name: link or emulated_folder() / name for name in names}
         for each in links.values():  # the same
             HeldLink(each).release()
-        if is_scene:
-            given = _rendered(path, names, count=count, seed=seed, quiet=quiet)
-        else:
-            given = _replayed(path, names, stack)
+        stage = _staged(path, names, count=count, seed=seed, quiet=quiet) if is_scene else None
+        if stage is not None and sync_rate is None:
+            _render_all(stage, names, quiet=quiet)
+        given = _replayed(path, names, stack) if stage is None else _rendered(stage, names)
         log = None if log_path is None else stack.enter_context(log_path.open("a", encoding="utf-8"))
         devices = [
             stack.enter_context(
@@ -136,17 +140,26 @@ def emulate(
                     faults=Faults((seed or 0) + place, kinds) if kinds else None,
                     link=links[name],
                     log=log,
+                    accepts=partial(_accepts, refusal, name),
                     on_port=partial(_tell, name, quiet=quiet),
                 )
             )
-            for place, (name, (words, passive)) in enumerate(given.items())
+            for place, (name, (words, passive, refusal)) in enumerate(given.items())
         ]
+        signals = stack.enter_context(stopped_by_signals())
         for device in devices:
             row = {"sensor": device.name, "port": device.port, "link": str(device.link)}
             click.echo(json.dumps(row) if as_json else device.port)
+        ended = threading.Event()
+        signals.obey(ended.set)
         if sync_rate is not None:
-            stack.enter_context(SyncChain(devices, sync_rate))
-        _look_after(devices, sorted(absences))
+            if stage is not None:
+                told = f"{options.counted(stage.count, 'measurement')} of each sensor"
+                options.say(f"rendering {told} as pulses come; the first round is slower", quiet=quiet)
+            stack.enter_context(SyncChain(devices, sync_rate, before=partial(_get_ready, devices, given)))
+        _look_after(devices, sorted(absences), ended)
+    options.say("the emulated sensors have ended", quiet=quiet)
+    sys.exit(128 + signals.came[0])
 
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
@@ -168,72 +181,74 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
     return list(settings)
 
 
-def _rendered(path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool) -> "Given":
-    """Render the scene, then the same with all sensors silent."""
+def _staged(path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool) -> "Stage":
+    """Return the scene, ready to be rendered; the first run compiles kernels."""
+    from ertis_cli._emulation import Stage
     from ertis_numba.simulation import load_scene
+    from ertis_numba.simulation.limits import exceeded
+    from ertis_numba.simulation.snapshot import snapshot
 
     changes = {"count": count, "seed": seed}
     scene = load_scene(path).replace(**{name: value for name, value in changes.items() if value is not None})
-    silent = scene.replace(
-        sensors=tuple(each.replace(emitter=each.emitter.replace(silent=True)) for each in scene.sensors)
-    )
+    for name in names:
+        for note in exceeded(snapshot(scene, scene.sensor(name), 0.0)):
+            options.say(f"note: {note}", quiet=quiet)
     with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
-        from ertis_numba.simulation.plan import make_plan
-        from ertis_numba.simulation.render import Simulator, compile_kernels
+        from ertis_numba.simulation.render import compile_kernels
 
         compile_kernels()
-    with options.note_when_slow("deciding which effects matter ...", quiet=quiet, after_s=3.0):
-        simulators = [
-            [Simulator(each, sensor=name, plan=plan) for name in names]
-            for each, plan in [(each, make_plan(each)) for each in (scene, silent)]
-        ]
-    shown = options.progress(
-        _words(simulators, scene), length=2 * scene.count * len(names), label="rendering", quiet=quiet
-    )
-    words: dict[str, tuple[list[Any], list[Any]]] = {name: ([], []) for name in names}
-    with shown as rendered:
-        for name, kind, rows in rendered:
-            words[name][kind].append(rows)
-    return words
+    return Stage(scene)
 
 
-def _words(
-    simulators: "Sequence[Sequence[Simulator]]", scene: "Scene"
-) -> "Iterator[tuple[str, int, NDArray[np.uint32]]]":
-    for kind, of_kind in enumerate(simulators):
-        for index in range(scene.count):
-            for simulator in of_kind:
-                yield simulator.sensor.name, kind, simulator.render(index).words
+def _render_all(stage: "Stage", names: "Sequence[str]", *, quiet: bool) -> None:
+    """Render what a first capture with the scene's call needs, so that no measurement comes late."""
+    options.say(f"rendering {options.counted(stage.count * len(names), 'measurement')} ...", quiet=quiet)
+    todo = ((name, index) for index in range(stage.count) for name in names)
+    with options.progress(todo, length=stage.count * len(names), label="rendering", quiet=quiet) as shown:
+        for name, index in shown:
+            stage.words(name, index, active=True)
+
+
+def _rendered(stage: "Stage", names: "Sequence[str]") -> "Given":
+    return {name: (stage.of(name, active=True), stage.of(name, active=False), stage.refusal) for name in names}
 
 
 def _replayed(path: Path, names: "Sequence[str]", stack: ExitStack) -> "Given":
+    from ertis_cli._emulation import Replayed
     from ertis_numba.storage import open_recording
 
-    return {name: (_Replay(stack.enter_context(open_recording(path, sensor=name))), None) for name in names}
+    words = {name: Replayed(stack.enter_context(open_recording(path, sensor=name))) for name in names}
+    return {name: (each, None, each.refusal) for name, each in words.items()}
 
 
-class _Replay:
-    """The words of a recording, read when they are wanted."""
+def _accepts(refusal: "Refusal", name: str, demand: "Demand") -> bool:
+    """Return False, and tell why, if there are no measurements for what a sensor was told."""
+    reason = refusal(name, demand)
+    if reason:
+        click.echo(f"ertis: warning: {reason}", err=True)
+    return not reason
 
-    def __init__(self, recording: "RecordingReader") -> None:
-        self._recording = recording
 
-    def __len__(self) -> int:
-        return len(self._recording)
-
-    def __getitem__(self, index: int) -> "NDArray[np.uint32]":
-        return self._recording[index].words
+def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
+    """Make the measurements of a pulse before it comes, also of devices that are about to be armed."""
+    registers = {device.name: device.registers for device in devices if device.error is None}
+    if not any(each.armed for each in registers.values()):
+        return
+    for name, each in registers.items():
+        words, passive, _ = given[name]
+        if each.armed or each.n_codes:
+            chosen = words if (each.active and each.amplifier) or passive is None else passive
+            chosen[pulse % len(chosen)]  # which keeps it
 
 
 def _tell(name: str, port: str, *, quiet: bool) -> None:
     options.say(f"{name} is back: {port}", quiet=quiet)
 
 
-def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, float]]") -> NoReturn:
+def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, float]]", ended: threading.Event) -> None:
     """Unplug devices when that is due, until one fails or the user has seen enough."""
     began_s = time.monotonic()
-    never = threading.Event()
-    while True:
+    while not ended.is_set():
         for device in devices:
             if device.error is not None:
                 raise device.error
@@ -243,4 +258,4 @@ def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, floa
                 device.unplug(for_s=absences[0][1])
             del absences[0]
         else:
-            never.wait(min(due_s, _LOOK_S))
+            ended.wait(min(due_s, _LOOK_S))

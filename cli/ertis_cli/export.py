@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _mountings, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     metavar="DB",
     help="Leave out points that are weaker, below the strongest; -20 by default.",
 )
+@_mountings.mounting
 @click.option("--ascii", "text", is_flag=True, help="PLY and PCD as text.")
 @options.force
 @options.quiet
@@ -84,6 +85,7 @@ def export(
     topics: tuple[str, ...],
     top: int | None,
     min_level_db: float | None,
+    mounting: Path | None,
     text: bool,
     force: bool,
     quiet: bool,
@@ -108,15 +110,24 @@ def export(
         fitting = interop.FORMATS[name].options
         given = {"topics": topics or None, "top": top, "min_level_db": min_level_db, "text": text}
         chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting or typed(key)}
+        known = _known(readers, mounting) if "mounting" in fitting else None
+        if known is None and mounting is not None:
+            raise click.UsageError(
+                f"--mounting is for formats with points, not for {name}; leave it out", click.get_current_context()
+            )
         items = _Items(readers, places, process=recorded and name != "acoular", quiet=quiet)
         written = interop.export(
             target,
             items,
             file_format=name,
-            mounting=_mounting(readers) if "mounting" in fitting else None,
+            mounting=known,
             overwrite=force,
             **chosen,
         )
+    if known is not None:
+        unknown = [reader.sensor for reader in readers if reader.sensor not in known]
+        remedy = "all is in the frame of the sensor; give --mounting FILE for that of the platform"
+        _mountings.note_unknown(unknown, remedy, quiet=quiet)
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
     options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
     if as_json:
@@ -131,9 +142,17 @@ def export(
         )
 
 
-def _mounting(readers: "Sequence[RecordingReader | EnergyscapeReader]") -> dict[str, tuple[Any, Any]]:
-    """Return where sensors are, of those of which their file says it, as energyscape files need not."""
-    return {each.sensor: (each.translation_m, each.rotation_xyzw) for each in readers if each.translation_m is not None}
+def _known(
+    readers: "Sequence[RecordingReader | EnergyscapeReader]", given: Path | None
+) -> "dict[str, _mountings.Mounting]":
+    """Return where sensors are: as a file says that was given, or else as their own file says."""
+    if given is not None:
+        return _mountings.mountings(given, [reader.sensor for reader in readers]) or {}
+    return {
+        each.sensor: (each.translation_m.tolist(), each.rotation_xyzw.tolist())
+        for each in readers
+        if each.translation_m is not None and each.rotation_xyzw is not None
+    }
 
 
 class _Items:

@@ -113,8 +113,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "last": stamps[-1].iso,
         "missing": sum(gap.last - gap.first + 1 for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
-        "translation_m": reader.translation_m.tolist(),
-        "rotation_xyzw": reader.rotation_xyzw.tolist(),
+        **_mounting(reader),
     }
 
 
@@ -124,8 +123,15 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "ranges": len(reader.range_m),
         "range_m": [round(float(reader.range_m[index]), 4) for index in (0, -1)],
         "method": reader.settings.processing.method,
+        **_mounting(reader),
         **_error(reader),
     }
+
+
+def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+    if reader.translation_m is None or reader.rotation_xyzw is None:
+        return {"mounting": "unknown"}
+    return {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:

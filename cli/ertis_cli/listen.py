@@ -91,6 +91,7 @@ def listen(
             item = subscriber.receive(_LOOK_S)
             if subscriber.connected:
                 heard.subscribed(address, sensors, products)
+                heard.silent(address, products, subscriber.counts.received)
             else:
                 heard.unanswered(address, time.monotonic() - begun_s)
             while notes:

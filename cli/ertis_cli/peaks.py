@@ -183,5 +183,6 @@ def _error(match: "Match") -> dict[str, float]:
 
 
 def _rounded(item: Any) -> dict[str, Any]:
-    """Return the fields of a peak or a reflector, their numbers rounded."""
-    return {name: round(value, _DIGITS[name]) if name in _DIGITS else value for name, value in asdict(item).items()}
+    """Return the fields of a peak or of a reflector of the sensor's own call, their numbers rounded."""
+    fields = {name: value for name, value in asdict(item).items() if name != "emitter"}
+    return {name: round(value, _DIGITS[name]) if name in _DIGITS else value for name, value in fields.items()}

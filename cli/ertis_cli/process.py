@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _plans, _process_many, options
+from ertis_cli import _mountings, _plans, _process_many, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
 
 __all__ = ["process"]
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 
 @click.command()
@@ -182,12 +184,29 @@ def process(
                 click.get_current_context(),
             )
     path = Path(paths[0])
+    if target is not None and Path(target).suffix.lower() in _PICTURES:
+        raise click.UsageError(
+            f"-o {target} is a picture, and process writes energyscapes; give a .h5 file, and draw it by 'ertis plot'",
+            click.get_current_context(),
+        )
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
+    _note_mountings(target_file, quiet=quiet)
     for line in _process_many.summary(Path(report["output"]), report["sensors"], report["device"]):
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _note_mountings(path: Path, *, quiet: bool) -> None:
+    from ertis_numba.storage import open_energyscapes, sensor_names
+
+    unknown = []
+    for name in sensor_names(path):
+        with open_energyscapes(path, sensor=name) as images:
+            if images.translation_m is None:
+                unknown.append(name)
+    _mountings.note_unknown(unknown, "images are in the frame of their sensor, and the file says so", quiet=quiet)
 
 
 def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as_json: bool) -> dict[str, Any]:

@@ -175,7 +175,9 @@ def _print(effects: list[dict[str, Any]]) -> None:
 
 def _summary(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> str:
     several = f" of {options.counted(len(truth), 'sensor')}" if len(truth) > 1 else ""
-    most = max(len(reflectors) for entry in truth.values() for reflectors in entry.reflectors)
+    most = max(
+        sum(not each.emitter for each in reflectors) for entry in truth.values() for reflectors in entry.reflectors
+    )
     return f"{target}: {options.counted(scene.count, 'measurement')}{several}, {options.counted(most, 'reflector')}"
 
 
@@ -193,4 +195,6 @@ def _report(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> dict[
 
 def _row(reflector: "Reflector") -> dict[str, Any]:
     row = {name: getattr(reflector, name) for name in reflector.__slots__}
+    if not reflector.emitter:  # the sensor's own call, as almost always
+        del row["emitter"]
     return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}

@@ -23,7 +23,6 @@ __all__ = ["Counts", "Session", "Sink"]
 
 _WAITING_BYTES = 40_000_000  # of blocks that wait for the disk; then sensors wait
 _RECENT_S = 3.0  # over which the rate is told
-_AT_ORIGIN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 _NO_ROOM = "there was no room for it"
 _GROUPS = 16  # that are still open: sensors deliver what they measured together at different times
 
@@ -37,8 +36,8 @@ class Sink(Protocol):
         settings: Settings,
         *,
         firmware: str = "",
-        translation_m: Sequence[float] = ...,
-        rotation_xyzw: Sequence[float] = ...,
+        translation_m: Sequence[float] | None = ...,
+        rotation_xyzw: Sequence[float] | None = ...,
     ) -> None:
         """Tell of a sensor before its first measurement."""
 
@@ -213,7 +212,7 @@ class Session:
 
     def _begin(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
         for sensor, sonar in self._sonars.items():
-            translation_m, rotation_xyzw = self._mounting.get(sensor, _AT_ORIGIN)
+            translation_m, rotation_xyzw = self._mounting.get(sensor, (None, None))
             sink.add_sensor(
                 sensor,
                 self._settings,

@@ -63,7 +63,7 @@ class PointTable:
             if len(frames) > 1:
                 raise ArgumentError(
                     f"where sensors {', '.join(numbers)} are on their platform is not known, wanted one frame for "
-                    "all points; choose one (--sensor), or export the recording"
+                    "all points; choose one (--sensor), or give their --mounting"
                 )
         frame = PLATFORM if numbers.keys() & mountings.keys() else next(iter(numbers), PLATFORM)
         return cls(np.concatenate(parts), tuple(numbers), frame)

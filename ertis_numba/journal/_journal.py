@@ -197,8 +197,8 @@ class Journal(Contents):
         settings: Settings,
         *,
         firmware: str = "",
-        translation_m: Sequence[float] = (0.0, 0.0, 0.0),
-        rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        translation_m: Sequence[float] | None = None,
+        rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
         """Say of what sensor measurements will come; at any time before its first one.
 
@@ -208,9 +208,9 @@ class Journal(Contents):
         settings : Settings
             Those of its measurements, whose air may differ. Layout files are written out.
         firmware : str
-        translation_m : sequence of 3 float
-            Where it is: x, y, z.
-        rotation_xyzw : sequence of 4 float
+        translation_m : sequence of 3 float, optional
+            Where it is: x, y, z. Its mounting is unknown if neither this nor ``rotation_xyzw`` is given.
+        rotation_xyzw : sequence of 4 float, optional
             The unit quaternion that turns the sensor frame into that of the surroundings.
 
         Raises

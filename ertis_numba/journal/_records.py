@@ -20,6 +20,7 @@ from ertis_numba.words import word_format
 __all__ = ["Entry", "Gap", "Key", "Sensor", "checked", "require_same"]
 
 _INT64 = (-(2**63), 2**63 - 1)
+_UNKNOWN = 7 * (0.0,)  # stands for an unknown mounting: translation, and a rotation that no mounting has
 _MOST_BYTES = 999_000_000  # of one measurement: SQLite's limit, less the rest of the row
 
 
@@ -76,9 +77,9 @@ class Sensor:
     settings : Settings
         They depend on no file.
     firmware : str
-    translation_m : (x, y, z)
-        Where it is.
-    rotation_xyzw : (x, y, z, w)
+    translation_m : (x, y, z), or None
+        Where it is; None if its mounting is unknown.
+    rotation_xyzw : (x, y, z, w), or None
         The unit quaternion that turns the sensor frame into that of the surroundings.
     shape : tuple of int
         Of the words of a measurement.
@@ -89,8 +90,8 @@ class Sensor:
     name: str
     settings: Settings
     firmware: str
-    translation_m: tuple[float, ...]
-    rotation_xyzw: tuple[float, ...]
+    translation_m: tuple[float, ...] | None
+    rotation_xyzw: tuple[float, ...] | None
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
@@ -101,8 +102,8 @@ class Sensor:
         settings: Settings,
         *,
         firmware: str = "",
-        translation_m: Sequence[float] = (0.0, 0.0, 0.0),
-        rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        translation_m: Sequence[float] | None = None,
+        rotation_xyzw: Sequence[float] | None = None,
     ) -> Self:
         """Return a sensor, or refuse what no recording could hold."""
         settings = storable(settings)
@@ -112,8 +113,8 @@ class Sensor:
             name=name,
             settings=settings,
             firmware=firmware,
-            translation_m=tuple(place["translation_m"].tolist()),
-            rotation_xyzw=tuple(place["rotation_xyzw"].tolist()),
+            translation_m=tuple(place["translation_m"].tolist()) if place else None,
+            rotation_xyzw=tuple(place["rotation_xyzw"].tolist()) if place else None,
             shape=words.shape,
             dtype=words.dtype,
         )
@@ -131,7 +132,8 @@ class Sensor:
 
     def row(self) -> tuple[Any, ...]:
         """Return what stands in the table."""
-        return (self.name, self.settings.to_toml(), self.firmware, *self.translation_m, *self.rotation_xyzw)
+        place = (*(self.translation_m or _UNKNOWN[:3]), *(self.rotation_xyzw or _UNKNOWN[3:]))
+        return (self.name, self.settings.to_toml(), self.firmware, *place)
 
     @classmethod
     def from_row(cls, path: Path, row: Sequence[Any]) -> Self:
@@ -141,6 +143,8 @@ class Sensor:
             settings = received_settings(text, f"{path}: settings of sensor {name}")
         except SettingsError as error:
             raise DataError(str(error)) from error
+        if tuple(place) == _UNKNOWN:
+            return cls.of(name, settings, firmware=firmware)
         return cls.of(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])
 
     def entry_row(self, entry: Entry, sensor_id: int) -> tuple[Any, ...]:

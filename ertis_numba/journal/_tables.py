@@ -69,7 +69,11 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         Column("x_m", "REAL", "where the sensor is", "m"),
         Column("y_m", "REAL", "the same", "m"),
         Column("z_m", "REAL", "the same", "m"),
-        Column("rotation_x", "REAL", "unit quaternion that turns the sensor frame into that of the surroundings"),
+        Column(
+            "rotation_x",
+            "REAL",
+            "unit quaternion that turns the sensor frame into that of the surroundings; 0 if unknown",
+        ),
         Column("rotation_y", "REAL", "the same"),
         Column("rotation_z", "REAL", "the same"),
         Column("rotation_w", "REAL", "the same"),

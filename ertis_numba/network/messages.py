@@ -88,7 +88,7 @@ class Hello(Message, frozen=True, kw_only=True):
         Of the payload.
     firmware : str
     translation_m, rotation_xyzw
-        Where the sensor is on its platform.
+        Where the sensor is on its platform; None if its mounting is unknown.
     """
 
     sensor: Name
@@ -96,8 +96,8 @@ class Hello(Message, frozen=True, kw_only=True):
     next_sequence: Number
     settings_crc32: Uint32
     firmware: Annotated[str, Meta(max_length=64)] = ""
-    translation_m: Position = (0.0, 0.0, 0.0)
-    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    translation_m: Position | None = None
+    rotation_xyzw: Quaternion | None = None
 
 
 class Welcome(Message, frozen=True, kw_only=True):

@@ -48,8 +48,8 @@ class Description(Message, frozen=True, kw_only=True):
 
     number: Count
     sensor: Name
-    translation_m: Position = (0.0, 0.0, 0.0)
-    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    translation_m: Position | None = None
+    rotation_xyzw: Quaternion | None = None
 
 
 class _Product(OfMeasurement, frozen=True, kw_only=True):

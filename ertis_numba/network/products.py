@@ -46,7 +46,7 @@ class Arrival:
     connection : int
         Numbers of products count from 0 in each.
     translation_m, rotation_xyzw
-        Where the sensor is on its platform, where there is one.
+        Where the sensor is on its platform; None if its mounting is unknown.
     """
 
     item: Item
@@ -54,8 +54,8 @@ class Arrival:
     arrived_ns: int
     arrived_utc_ns: int
     connection: int
-    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    translation_m: tuple[float, float, float] | None = None
+    rotation_xyzw: tuple[float, float, float, float] | None = None
 
     @property
     def age_s(self) -> float | None:

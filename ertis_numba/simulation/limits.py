@@ -6,12 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["near_discs", "require_clear"]
+__all__ = ["exceeded", "require_clear"]
 
 _MIN_DISTANCE_M = 1e-3
+
+
+def exceeded(shot: Snapshot) -> list[str]:
+    """Return a note for each target that is too near for its model."""
+    return [*_on_sensor(shot), *near_discs(shot)]
+
+
+def _on_sensor(shot: Snapshot) -> list[str]:
+    """Return a note for each point or sphere that touches the sensor, whose echo has no meaningful level."""
+    targets = shot.targets
+    apart_m = np.linalg.norm(targets.positions_m - shot.ear.centre_m, axis=1) - targets.radius_m
+    return [
+        f"{targets.names[k]} is {'on' if apart_m[k] >= 0 else 'around'} sensor {shot.sensor.name}, within "
+        f"{NEAREST_M:g} m; its echo hides all others. Move one of the two"
+        for k in np.flatnonzero(apart_m < NEAREST_M)
+    ]
 
 
 def near_discs(shot: Snapshot) -> list[str]:

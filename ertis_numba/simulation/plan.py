@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ertis_numba.simulation.limits import near_discs, require_clear
+from ertis_numba.simulation.limits import exceeded, require_clear
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
@@ -88,7 +88,7 @@ def make_plan(scene: Scene) -> Plan:
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     for _, shot in shots:
         require_clear(shot)
-    notes = tuple(dict.fromkeys(note for _, shot in shots for note in near_discs(shot)))
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in exceeded(shot)))
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
     rounds = [_active(verdicts)]

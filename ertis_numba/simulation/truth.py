@@ -17,45 +17,54 @@ _SILENT = 1e-9  # of the strongest
 
 
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
-    """Return the echoes of a sensor's own call as an image should show them, strongest first.
+    """Return the echoes of a sensor's own call as an image should show them, then those of other sensors' calls.
 
     A reflector stands at half of the way of its sound, in the direction from which the sound comes; by a wall, that
     is the place of its mirror image. Its level is that of the mean amplitude over the microphones and the
-    call's band, below the strongest; its velocity is relative to the sensor, and only along the line of sight where
-    walls are involved.
+    call's band, relative to the strongest echo of the own call, and the strongest come first. Its velocity is relative
+    to the sensor, and only along the line of sight where walls are involved. Calls of other sensors reach the image if
+    cross-emission is simulated.
     """
-    sight = Sight(shot, active - {"cross_emission"})
-    own = sight.heard
-    level = _levels(shot, sight)
+    sight = Sight(shot, active)
+    levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}
+    strongest = [float(np.max(level, initial=0.0)) for level in levels.values()]
+    reference = strongest[0] if shot.number in levels and strongest[0] else max(strongest, default=0.0)
+    return [found for number, level in levels.items() for found in _echoes(shot, sight, number, level, reference)]
+
+
+def _echoes(shot: Snapshot, sight: Sight, number: int, level: Floats, reference: float) -> list[Reflector]:
+    """Return the echoes of one emitter, strongest first."""
     if not len(level) or not level.max():
         return []
-    velocity_m_s = np.concatenate([_velocity_m_s(paths) for paths in sight.paths(shot.number, sight.active)])
+    seen = sight.of_emitter(number, sight.active)
+    velocity_m_s = np.concatenate([_velocity_m_s(paths) for paths in sight.paths(number, sight.active)])
     found = [
         Reflector(
-            name=own.names[k],
+            name=seen.names[k],
             azimuth_deg=float(np.degrees(np.arctan2(direction[1], direction[0]))),
             elevation_deg=float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
-            range_m=float(own.delay_s[k] * shot.speed_m_s / 2),
-            level_db=float(20 * np.log10(level[k] / level.max())),
+            range_m=float(seen.delay_s[k] * shot.speed_m_s / 2),
+            level_db=float(20 * np.log10(level[k] / reference)),
             velocity_m_s=(float(velocity_m_s[k, 0]), float(velocity_m_s[k, 1]), float(velocity_m_s[k, 2])),
+            emitter="" if number == shot.number else shot.scene.sensors[number].name,
         )
-        for k, direction in enumerate(unit(own.direction))
-        if level[k] > _SILENT * level.max()
+        for k, direction in enumerate(unit(seen.direction))
+        if level[k] > _SILENT * reference
     ]
     return sorted(found, key=lambda reflector: -reflector.level_db)
 
 
-def _levels(shot: Snapshot, sight: Sight) -> Floats:
-    """Return the mean amplitude of each path over microphones and band: (path,) float64."""
-    emitter, ways = shot.sensor.emitter, []
-    if not emitter.silent:
-        ways = echoes(shot, sight.active, shot.number, Stopwatch())
+def _levels(shot: Snapshot, sight: Sight, number: int) -> Floats:
+    """Return the mean amplitude of each path of an emitter's call over microphones and band: (path,) float64."""
+    other = shot.scene.sensors[number]
+    emitter, active = other.emitter, sight.active
+    loudness = 10 ** (emitter.level_db / 20) * sight.likeness(other.call)
     parts = [
-        responses(shot, sight.active, paths, emitter, sight.frequency_hz, Stopwatch())
-        * (emitted(sight.active, emitter, sight.frequency_hz) * sight.power)
-        for paths in ways
+        responses(shot, active, paths, emitter, sight.frequency_hz, Stopwatch())
+        * (emitted(active, emitter, sight.frequency_hz) * sight.power)
+        for paths in echoes(shot, active, number, Stopwatch())
     ]
-    return np.concatenate([np.zeros(0), *(np.abs(np.sum(part, axis=2)).mean(axis=1) for part in parts)])
+    return loudness * np.concatenate([np.zeros(0), *(np.abs(np.sum(part, axis=2)).mean(axis=1) for part in parts)])
 
 
 def _velocity_m_s(paths: Paths) -> Floats:

@@ -62,8 +62,8 @@ class Comparison:
     false : tuple of Peak
         Those that no reflector explains.
     explained : tuple of Peak
-        Those of reflectors that do not count, being too weak or outside of the image, or mirrored by a
-        plane array.
+        Those of reflectors that do not count, being too weak or outside of the image, of another sensor's call, or
+        mirrored by a plane array.
     """
 
     matched: tuple[Match, ...]
@@ -96,9 +96,9 @@ class Errors:
 def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db: float = -30.0) -> Comparison:
     """Return which reflectors an image shows, and which it does not.
 
-    A reflector counts if the image can show it: its range lies on the range axis, its direction within
-    half of the main lobe of the nearest direction, and its level is at least ``min_level_db`` below the
-    strongest that counts. Peaks are assigned to those one to one, such that as many as possible lie
+    A reflector counts if the image can show it: it returns the sensor's own call, its range lies on the range axis,
+    its direction within half of the main lobe of the nearest direction, and its level is at least ``min_level_db``
+    below the strongest that counts. Peaks are assigned to those one to one, such that as many as possible lie
     within 0.1 m and one and a half main lobes, at the least sum of squared distances (the
     assignment problem, solved by SciPy after D. F. Crouse, 2016). At most 100 peaks more than reflectors are
     looked for.
@@ -119,9 +119,10 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     lobe = _Lobe(image.settings)
     in_view = _in_view(image, reflectors, lobe)
     in_range = _in_range(image, reflectors)
+    is_shown = in_view & in_range & np.array([not reflector.emitter for reflector in reflectors], dtype=np.bool_)
     levels_db = np.array([reflector.level_db for reflector in reflectors])
-    strongest_db = float(np.max(levels_db, where=in_view & in_range, initial=_LEAST_DB))
-    counts = in_view & in_range & (levels_db >= strongest_db + min_level_db)
+    strongest_db = float(np.max(levels_db, where=is_shown, initial=_LEAST_DB))
+    counts = is_shown & (levels_db >= strongest_db + min_level_db)
     counted = [reflector for reflector, does in zip(reflectors, counts, strict=True) if does]
 
     # What does not count may still be the strongest in the image, or leak into it.

@@ -11,8 +11,8 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
-from ertis_numba.stages.fast import ahead_of, spectrum_of
 from ertis_numba.stages.fitting import DelayFit, one_thread
+from ertis_numba.stages.plan_elements import ahead_of, spectrum_of
 
 __all__ = ["Deviation", "deviation_of"]
 

@@ -17,6 +17,7 @@ from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import self_contained
+from ertis_numba.storage._mounting import describe_mounting, read_mounting
 from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer
@@ -79,6 +80,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._mounting = {
             reader.sensor: mounted(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
             for reader in readers
+            if reader.translation_m is not None and reader.rotation_xyzw is not None
         } | self._given
 
     def note_mounting(self, sensor: str, translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
@@ -129,7 +131,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             dtypes={"energy": self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},
         )
-        describe(group, self._mounting.get(first.stamp.sensor, {}))
+        describe_mounting(group, self._mounting.get(first.stamp.sensor, {}))
         describe(group, self._predicted.get(first.stamp.sensor, {}))
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
@@ -193,7 +195,7 @@ class EnergyscapeReader(Reader[Energyscape]):
     azimuth_rad, elevation_rad : (direction,) float64
     range_m : (range,) float64
     translation_m : (3,) float64, or None
-        Where the sensor is; None where the file does not say it, as older ones do not.
+        Where the sensor is; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
         The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
     predicted_error_db, max_error_db : float, or None
@@ -231,15 +233,7 @@ class EnergyscapeReader(Reader[Energyscape]):
         self.budget_applies_to, self.error_warning = (
             _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning")
         )
-        if "translation_m" not in said and "rotation_xyzw" not in said:
-            self.translation_m = self.rotation_xyzw = None
-            return
-        try:
-            self.translation_m, self.rotation_xyzw = mounted(
-                self.sensor, said["translation_m"], said["rotation_xyzw"]
-            ).values()
-        except ArgumentError as error:
-            raise DamagedError(f"{self.path}: {error}") from error
+        self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
     def _sizes(self) -> dict[str, int]:
         return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"])}

@@ -17,6 +17,7 @@ from ertis_numba.geometry import Layout, microphones, self_contained, storable
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._gaps import Missing
+from ertis_numba.storage._mounting import describe_mounting, read_mounting
 from ertis_numba.storage._reader import Reader, plain
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
@@ -73,8 +74,7 @@ class RecordingWriter(Writer[Measurement]):
         What each simulated sensor should show, by its name.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Where each sensor is and how it is turned, by its name: x, y, z in metres, and the unit
-        quaternion x, y, z, w that turns the sensor frame into that of the surroundings. At the origin,
-        not turned, by default.
+        quaternion x, y, z, w that turns the sensor frame into that of the surroundings. Unknown by default.
     firmware : mapping of str to str, optional
         Version of each sensor's firmware, by its name.
     """
@@ -133,7 +133,7 @@ class RecordingWriter(Writer[Measurement]):
             group,
             settings,
             firmware=self._firmware.get(sensor, ""),
-            mounting=self._mounting.get(sensor, mounted(sensor)),
+            mounting=self._mounting.get(sensor, {}),
         )
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
@@ -199,7 +199,7 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
         As `storable` returns them.
     firmware : str
     mounting : mapping of str to array
-        As `ertis_numba.geometry.mounting` returns it.
+        As `ertis_numba.geometry.mounting` returns it; empty if it is unknown.
 
     Raises
     ------
@@ -215,7 +215,8 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
         dtypes={data: words.dtype},
         texts={"settings": settings.to_toml()},
     )
-    describe(group, {**_identity(group.name.rpartition("/")[2], settings, firmware), **mounting})
+    describe(group, _identity(group.name.rpartition("/")[2], settings, firmware))
+    describe_mounting(group, mounting)
     bits = {"bit_order": "lsb_first"} if settings.recording.is_pdm else {}
     describe(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
     describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
@@ -260,18 +261,18 @@ class RecordingReader(Reader[Measurement]):
     gaps : tuple of Gap
     firmware : str
         Its version; empty where it is not known.
-    translation_m : (3,) float64
-        Where the sensor is.
-    rotation_xyzw : (4,) float64
-        The unit quaternion that turns the sensor frame into that of the surroundings.
+    translation_m : (3,) float64, or None
+        Where the sensor is; None if its mounting is unknown.
+    rotation_xyzw : (4,) float64, or None
+        The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
     """
 
     _kind: ClassVar[str] = "recording"
 
     gaps: tuple[Gap, ...]
     firmware: str
-    translation_m: NDArray[np.float64]
-    rotation_xyzw: NDArray[np.float64]
+    translation_m: NDArray[np.float64] | None
+    rotation_xyzw: NDArray[np.float64] | None
 
     def _look(self) -> None:
         self._data, self._table = _data_and_table(pdm="pcm" not in self._group)
@@ -285,9 +286,7 @@ class RecordingReader(Reader[Measurement]):
             for (first, last, reason), epoch in zip(zip(*columns, strict=True), epochs, strict=False)
         )
         self.firmware = str(plain(self._group.attrs["firmware"]))
-        self.translation_m, self.rotation_xyzw = (
-            np.asarray(self._group.attrs[name], dtype=np.float64) for name in ("translation_m", "rotation_xyzw")
-        )
+        self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
     def _item(self, index: int) -> Measurement:
         air = Air(**{field: self._rows.column(name, index) for name, field in _AIR.items()})

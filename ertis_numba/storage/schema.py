@@ -128,8 +128,11 @@ TRUTH: Final = (
     Variable("azimuth", ("measurement", "target"), "<f8", "azimuth of the reflectors", "radian"),
     Variable("elevation", ("measurement", "target"), "<f8", "elevation of the reflectors", "radian"),
     Variable("range", ("measurement", "target"), "<f8", "distance of the reflectors from the sensor's origin", "m"),
-    Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest", "dB"),
+    Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest of the own call", "dB"),
     Variable("velocity", ("measurement", "target", "axis"), "<f8", "x, y, z in the frame of the sensor", "m/s"),
+    Variable(
+        "emitter", ("measurement", "target"), "str", "sensor whose call it returns, if not its own", optional=True
+    ),
 )
 """In the group ``truth`` of a sensor."""
 

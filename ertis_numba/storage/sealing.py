@@ -197,7 +197,11 @@ def _write(
         journal.target,
         overwrite=overwrite,
         source=journal.source,
-        mounting={sensor.name: (sensor.translation_m, sensor.rotation_xyzw) for sensor in sensors},
+        mounting={
+            sensor.name: (sensor.translation_m, sensor.rotation_xyzw)
+            for sensor in sensors
+            if sensor.translation_m is not None and sensor.rotation_xyzw is not None
+        },
         firmware={sensor.name: sensor.firmware for sensor in sensors},
     ) as writer:
         n_written = 0
@@ -240,8 +244,9 @@ def _holds(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool
 
 def _same(sensor: Sensor, rows: JournalRows, recording: RecordingReader) -> bool:
     with recording:
-        known = (*recording.translation_m.tolist(), *recording.rotation_xyzw.tolist(), recording.firmware)
-        if known != (*sensor.translation_m, *sensor.rotation_xyzw, sensor.firmware) or recording.truth is not None:
+        place = (recording.translation_m, recording.rotation_xyzw)
+        known = (*(None if part is None else tuple(part.tolist()) for part in place), recording.firmware)
+        if known != (sensor.translation_m, sensor.rotation_xyzw, sensor.firmware) or recording.truth is not None:
             return False
         for entry, back in zip_longest(rows, recording):
             if entry is None or back is None or not _equal(entry.measurement, back):

@@ -21,6 +21,7 @@ _FIELDS = {
     "level": "level_db",
     "velocity": "velocity_m_s",
 }
+_TEXTS = ("name", "emitter")
 _ANGLES = ("azimuth", "elevation")  # radians in the file, as its other angles
 _MOST_SEED = 2**63 - 1  # what an attribute holds
 
@@ -62,14 +63,19 @@ def write_truth(group: h5py.Group, truth: Truth, n_measurements: int) -> None:
             f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(reflectors)} measurements, "
             f"the file holds {n_measurements}; give the reflectors of each"
         )
-    names = [reflector.name.encode() for row in reflectors for reflector in row]
-    kind = text_type(max(map(len, names), default=0))
+    flat = [reflector for row in reflectors for reflector in row]
+    texts = {field: [getattr(reflector, field).encode() for reflector in flat] for field in _TEXTS}
+    if not any(texts["emitter"]):  # files of a single sensor are the same as ever
+        del texts["emitter"]
+    kinds: dict[str, Any] = {field: text_type(max(map(len, column), default=0)) for field, column in texts.items()}
     sizes = {"measurement": n_measurements, "target": max(map(len, reflectors)), "axis": 3}
     made = group.create_group("truth", track_order=True)
-    lay_out(made, TRUTH, sizes=sizes, dtypes={"name": kind}, texts={"scene": truth.scene})
+    table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
+    lay_out(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
     describe(made, {"seed": truth.seed})
     given = _given(reflectors, sizes["target"])
-    _fill(made["name"], given, np.array(names, dtype=kind), b"")
+    for field, column in texts.items():
+        _fill(made[field], given, np.array(column, dtype=kinds[field]), b"")
     for name, values in _columns(reflectors).items():
         _fill(made[name], given, values, np.nan)
 
@@ -84,6 +90,7 @@ def read_truth(group: h5py.Group) -> Truth | None:
         values = group[name][:]
         columns[field] = (np.degrees(values) if name in _ANGLES else values).tolist()
     rows = []
+    emitters = group["emitter"][:].tolist() if "emitter" in group else None
     for index, names in enumerate(group["name"][:].tolist()):
         n_targets = int(np.count_nonzero(~np.isnan(columns["range_m"][index])))
         rows.append(
@@ -92,6 +99,7 @@ def read_truth(group: h5py.Group) -> Truth | None:
                     name=names[target].decode(),
                     **{field: column[index][target] for field, column in columns.items() if field != "velocity_m_s"},
                     velocity_m_s=tuple(columns["velocity_m_s"][index][target]),
+                    emitter="" if emitters is None else emitters[index][target].decode(),
                 )
                 for target in range(n_targets)
             )

@@ -136,7 +136,7 @@ class Live:
         return [
             Taken(
                 arrival.item,
-                Pose(arrival.translation_m, arrival.rotation_xyzw),
+                Pose.of(arrival.translation_m, arrival.rotation_xyzw),
                 arrival.arrived_ns / 1e9,
                 between_s[arrival.item.stamp.sensor],
             )

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,15 @@ class Pose:
 
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    @classmethod
+    def of(
+        cls,
+        translation_m: tuple[float, float, float] | None,
+        rotation_xyzw: tuple[float, float, float, float] | None,
+    ) -> Self | None:
+        """Return a pose, or None if the mounting is unknown."""
+        return None if translation_m is None or rotation_xyzw is None else cls(translation_m, rotation_xyzw)
 
     def placed(self, position_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return places of the sensor's frame in that of the platform: (point, axis) float32."""

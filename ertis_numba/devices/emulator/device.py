@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from ertis_numba.devices.emulator.faults import Faults, Stall, Unplug
-from ertis_numba.devices.emulator.mainboard import Mainboard, Quirks
+from ertis_numba.devices.emulator.mainboard import Accepts, Mainboard, Quirks
 from ertis_numba.devices.emulator.measurements import Measurements, Output, Pieces, Words
 from ertis_numba.devices.emulator.registers import Registers
 from ertis_numba.devices.emulator.terminal import Terminal
@@ -61,6 +61,10 @@ class Emulator:
         words of `Faults`) and time_ns since 1970. Those that may not have been read when the device is unplugged get
         another line, whose fault is "unplugged"; the last line about a measurement holds. Lines about the device itself
         have an event instead, "unplugged" or "plugged in".
+    accepts : callable, optional
+        Takes a `Demand`, the call and the record that the host asked for; returns False if there are no words for it.
+        Then the device tells a wrong hash of the call and does not measure. By default the words are sent whatever
+        was asked for.
     quirks : Quirks
         May be replaced at any time.
     on_port : callable, optional
@@ -90,13 +94,14 @@ class Emulator:
         faults: Faults | None = None,
         link: Path | None = None,
         log: TextIO | None = None,
+        accepts: Accepts | None = None,
         quirks: Quirks | None = None,
         on_port: Callable[[str], None] | None = None,
     ) -> None:
         require_terminals()
         self._measurements = Measurements(words, passive, name=name, faults=faults, log=log)
         self.name, self.link, self.quirks = name, link, quirks or Quirks()
-        self._on_port = on_port
+        self._on_port, self._accepts = on_port, accepts
         self._held = None if link is None else HeldLink(link)
         self.error: Exception | None = None
         self._refused = 0  # before it was unplugged
@@ -182,7 +187,7 @@ class Emulator:
                 os.write(self._waker, b"!")
 
     def _forget(self) -> None:
-        self._board = Mainboard(self._measurements)
+        self._board = Mainboard(self._measurements, self._accepts)
         self._sent = Output(deque())  # the latest measurement
         self._pause_ns = 0  # nothing is sent before
 

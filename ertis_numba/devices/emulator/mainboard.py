@@ -1,6 +1,7 @@
 """What an emulated device does, without a port, a thread or a clock of its own."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ertis_numba import checks
@@ -8,13 +9,17 @@ from ertis_numba.devices.blocks import COUNTERS
 from ertis_numba.devices.commands import Command, encode_answer
 from ertis_numba.devices.emulator.faults import Stall
 from ertis_numba.devices.emulator.measurements import Measurements, Output
-from ertis_numba.devices.emulator.registers import Registers
+from ertis_numba.devices.emulator.registers import Demand, Registers
 from ertis_numba.devices.emulator.terminal import CommandReader
 from ertis_numba.errors import DataError
 
-__all__ = ["Mainboard", "Quirks"]
+__all__ = ["Accepts", "Mainboard", "Quirks"]
+
+Accepts = Callable[[Demand], bool]
+"""Return True if there are measurements for what a device was told."""
 
 _LEFT_NS = 20_000_000  # an unfinished line that is a whole command is taken after so long
+_TOLD = frozenset("CDEFG")  # commands on which the words depend
 _BUFFERED = 2  # measurements that wait for a reader
 
 
@@ -65,6 +70,9 @@ class Mainboard:
     Parameters
     ----------
     measurements : Measurements
+    accepts : callable, optional
+        Asked after a call was loaded, and before a measurement, if anything has changed. If there are no measurements
+        for the call and the record, the device tells a wrong hash of the call and does not measure.
 
     Attributes
     ----------
@@ -75,11 +83,12 @@ class Mainboard:
         Commands that were none, and those whose numbers the device cannot use.
     """
 
-    def __init__(self, measurements: Measurements) -> None:
+    def __init__(self, measurements: Measurements, accepts: Accepts | None = None) -> None:
         self.registers = Registers()
         self.outputs: deque[Output] = deque()
         self.refused = 0
-        self._measurements = measurements
+        self._measurements, self._accepts = measurements, accepts
+        self._is_new = self._is_loaded = self._is_refused = False  # settings, a whole call, and both of them
         self._lines = CommandReader()
         self._left_ns: int | None = None  # when an unfinished line is taken
         self._recording: _Recording | None = None
@@ -104,14 +113,17 @@ class Mainboard:
         answer = None if command is None else self.registers.answer(command)
         self.refused += answer is None
         answer = answer or 0  # nothing better is known for what is refused
-        if command is not None and command.code == "L" and quirks.wrong_hash:
+        if command is not None and command.code in _TOLD:
+            self._is_new, self._is_loaded = True, command.code == "C"
+            self._is_refused = self._is_refused and not self._is_loaded
+        if command is not None and command.code == "L" and (quirks.wrong_hash or self._refuses(judge=self._is_loaded)):
             answer ^= 1
         if not quirks.silent:
             self.outputs.append(Output(deque([Stall(quirks.answer_delay_s), memoryview(encode_answer(answer))])))
 
     def begin(self, *, active: bool, at_ns: int, index: int | None = None) -> bool:
         """Start to record, unless that goes on already; return whether it was started."""
-        if self._recording is not None:
+        if self._recording is not None or self._refuses(judge=True):
             return False
         registers = self.registers
         counter = registers.counter
@@ -124,6 +136,13 @@ class Mainboard:
             n_samples=registers.n_samples,
         )
         return True
+
+    def _refuses(self, *, judge: bool) -> bool:
+        """Return True if there are no measurements for what the device was told; ask only if it is told all."""
+        if judge and self._is_new and self._accepts is not None:
+            self._is_new = False
+            self._is_refused = not self._accepts(self.registers.demand)
+        return self._is_refused
 
     def go_on(self, quirks: Quirks, now_ns: int) -> None:
         """Do what is due: a line that nobody will end, a measurement that is complete."""

@@ -1,6 +1,9 @@
 """What an emulated device remembers of what it was told, and what it answers."""
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba.devices.blocks import COUNTERS
 from ertis_numba.devices.commands import (
@@ -14,8 +17,10 @@ from ertis_numba.devices.commands import (
     PINS,
     Command,
 )
+from ertis_numba.devices.setup import call_codes
+from ertis_numba.settings import Call
 
-__all__ = ["FIRMWARE", "Registers"]
+__all__ = ["FIRMWARE", "Demand", "Registers"]
 
 FIRMWARE = 0x00_01_00_00
 """Version that emulated devices answer, 1.0.0: bytes 2, 1 and 0."""
@@ -31,6 +36,31 @@ _NUMBERS = {  # by command: which register takes the first number, and from wher
     "K": ("amplifier", 0, 1),
     "B": ("counter", 0, COUNTERS - 1),
 }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Demand:
+    """Call and record that a device was told to emit and to measure.
+
+    Attributes
+    ----------
+    codes : (sample,) uint16
+        Samples of the call; all 0 if none was loaded.
+    dac_rate_hz : int
+    n_samples : int
+    pdm_rate_hz : float
+    """
+
+    codes: NDArray[np.uint16]
+    dac_rate_hz: int
+    n_samples: int
+    pdm_rate_hz: float
+
+    def holds(self, call: Call) -> bool:
+        """Return True if this is the call that was loaded, or if none was."""
+        if not self.codes.any():
+            return True
+        return self.dac_rate_hz == call.sample_rate_hz and np.array_equal(self.codes, call_codes(call))
 
 
 class Registers:
@@ -77,6 +107,12 @@ class Registers:
     def duration_ns(self) -> int:
         """How long a measurement takes."""
         return self.n_samples * 1_000_000_000 // round(PDM_RATES_HZ[self.clock])
+
+    @property
+    def demand(self) -> Demand:
+        """Call and record as they stand."""
+        codes = self.codes[: self.n_codes].copy()
+        return Demand(codes, self.dac_rate_hz, self.n_samples, PDM_RATES_HZ[self.clock])
 
     @property
     def hash(self) -> int:

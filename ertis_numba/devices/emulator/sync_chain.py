@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -29,6 +29,9 @@ class SyncChain:
     devices : sequence of Emulator
         In the order of the chain.
     rate_hz : float
+    before : callable, optional
+        Called with the number of each pulse before it is given. If that takes longer than a period, pulses are left
+        out meanwhile.
 
     Attributes
     ----------
@@ -41,8 +44,10 @@ class SyncChain:
         The rate is not within 0.001 and 1000 Hz.
     """
 
-    def __init__(self, devices: Sequence[Emulator], rate_hz: float) -> None:
-        self._devices = tuple(devices)
+    def __init__(
+        self, devices: Sequence[Emulator], rate_hz: float, *, before: Callable[[int], None] = lambda _: None
+    ) -> None:
+        self._devices, self._before = tuple(devices), before
         self._period_ns = _SECOND_NS / checks.between("rate_hz", rate_hz, 1e-3, 1e3)
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
@@ -78,6 +83,11 @@ class SyncChain:
             due_ns = began_ns + round(number * self._period_ns)
             if self._stopped.wait(max(0.0, (due_ns - time.monotonic_ns()) / _SECOND_NS)):
                 return
+            self._before(self.pulses)
+            late_ns = time.monotonic_ns() - due_ns
+            if late_ns > self._period_ns:
+                number += int(late_ns // self._period_ns)
+                continue
             self._pulse(due_ns)
             late = int((time.monotonic_ns() - due_ns) // self._period_ns)
             number += 1 + late

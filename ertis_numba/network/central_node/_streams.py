@@ -40,9 +40,7 @@ def source_of(hello: Hello, text: bytes, *, most_bytes: int) -> Sensor:
     ArgumentError
         They cannot be used.
     """
-    return _source(
-        hello.sensor, text, hello.firmware, tuple(hello.translation_m), tuple(hello.rotation_xyzw), most_bytes
-    )
+    return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, most_bytes)
 
 
 @lru_cache(maxsize=64)
@@ -50,8 +48,8 @@ def _source(
     name: str,
     text: bytes,
     firmware: str,
-    translation_m: tuple[float, ...],
-    rotation_xyzw: tuple[float, ...],
+    translation_m: tuple[float, ...] | None,
+    rotation_xyzw: tuple[float, ...] | None,
     most_bytes: int,
 ) -> Sensor:
     if not firmware.isprintable():

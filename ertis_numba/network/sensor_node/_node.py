@@ -122,8 +122,8 @@ class SensorNode:
         settings: Settings,
         *,
         firmware: str = "",
-        translation_m: Sequence[float] = (0.0, 0.0, 0.0),
-        rotation_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        translation_m: Sequence[float] | None = None,
+        rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
         """Tell of a sensor before its first measurement; told again, it counts for epochs that follow.
 

@@ -2,11 +2,14 @@
 
 import zlib
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 from ertis_numba.journal import Entry
 from ertis_numba.network import messages
 from ertis_numba.network.sensor_node._runs import Item, Run
+
+if TYPE_CHECKING:
+    from ertis_numba.network.fields import Position, Quaternion
 
 __all__ = ["Frames", "Settled", "frames_of", "greeting"]
 
@@ -41,16 +44,14 @@ class Settled:
 def greeting(run: Run) -> Frames:
     """Return what introduces a run that has items."""
     settings = run.sensor.settings.to_toml().encode()
-    x_m, y_m, z_m = run.sensor.translation_m
-    x, y, z, w = run.sensor.rotation_xyzw
     hello = messages.Hello(
         sensor=run.sensor.name,
         epoch=run.epoch,
         next_sequence=run.items[0].first,
         settings_crc32=zlib.crc32(settings),
         firmware=run.sensor.firmware[:_FIRMWARE_CHARACTERS],
-        translation_m=(x_m, y_m, z_m),
-        rotation_xyzw=(x, y, z, w),
+        translation_m=cast("Position | None", run.sensor.translation_m),
+        rotation_xyzw=cast("Quaternion | None", run.sensor.rotation_xyzw),
     )
     return [messages.encode(hello), settings]
 

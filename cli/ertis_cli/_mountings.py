@@ -1,0 +1,74 @@
+"""Mountings of sensors: read from a file that was given, and reported if they are unknown."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_cli.options import Decorator
+
+__all__ = ["Mounting", "mounting", "mountings", "note_unknown"]
+
+Mounting = tuple[Sequence[float], Sequence[float]]
+
+mounting: "Decorator" = click.option(
+    "--mounting",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Where sensors are on their platform: a scene, its [[sensors]], or a recording that holds it.",
+)
+
+
+def mountings(path: Path | None, sensors: Iterable[str]) -> dict[str, Mounting] | None:
+    """Return where sensors are, which a scene says when it begins; None without a file.
+
+    Raises
+    ------
+    ArgumentError
+        The file does not hold the mounting of a sensor.
+    """
+    if path is None:
+        return None
+    from ertis_numba.errors import ArgumentError
+
+    known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
+    for name in sensors:
+        if name not in known:
+            raise ArgumentError(
+                f"{path} says nothing of sensor {name!r}; add it, or call it one of {', '.join(known)} by --name"
+                if known
+                else f"{path} does not hold the mounting of any sensor; give a scene, or its [[sensors]]"
+            )
+    return {name: known[name] for name in sensors}
+
+
+def note_unknown(sensors: Sequence[str], remedy: str, *, quiet: bool) -> None:
+    """Print a line if the mounting of sensors is unknown."""
+    if sensors:
+        noun = "sensor" if len(sensors) == 1 else "sensors"
+        options.say(f"note: the mounting of {noun} {', '.join(sensors)} is unknown; {remedy}", quiet=quiet)
+
+
+def _of_scene(path: Path) -> dict[str, Mounting]:
+    from ertis_numba.simulation.scene import load_scene
+
+    return {
+        sensor.name: (sensor.path().position_at(0.0).tolist(), sensor.quaternion().tolist())
+        for sensor in load_scene(path).sensors
+    }
+
+
+def _of_file(path: Path) -> dict[str, Mounting]:
+    from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
+
+    opened = open_energyscapes if file_kind(path) == "energyscape" else open_recording
+    found = {}
+    for name in sensor_names(path):
+        with opened(path, sensor=name) as reader:
+            if reader.translation_m is not None and reader.rotation_xyzw is not None:
+                found[name] = reader.translation_m.tolist(), reader.rotation_xyzw.tolist()
+    return found
