@@ -79,16 +79,6 @@ def test_defaults_of_a_settings_file_are_for_those_who_have_use_for_them(tmp_pat
     assert {host for host, *_ in listened} == {"127.0.0.1"}
 
 
-def test_without_viser_there_is_a_line_that_says_what_to_install(tmp_path, monkeypatch):
-    for name in ("_view", "_page", "_space"):
-        monkeypatch.delitem(sys.modules, f"ertis_numba.viewer.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    done = CliRunner().invoke(cli, ["view", str(path)])
-    assert done.exit_code == 1
-    assert done.stderr.splitlines() == ["ertis: error: viser is not installed; pip install 'ertis-numba[view]'"]
-
-
 def test_a_recording_as_a_page_of_its_own(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3))
     page = tmp_path / "page.html"

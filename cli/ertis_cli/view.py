@@ -120,12 +120,8 @@ def view(
 
         check_target(html, overwrite=force, sources=[] if live else [Path(what)])
         checks.choice("page format", html.suffix.lower(), _PAGES)
-    try:
-        from ertis_numba.viewer import Choices, View
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        raise click.ClickException("viser is not installed; pip install 'ertis-numba[view]'") from error
+    from ertis_numba.viewer import Choices, View
+
     choices = Choices(
         threshold_db=threshold, dynamic_range_db=dynamic_range, range_m=range_m, decay_s=decay, colours=colours
     )
