@@ -1,6 +1,6 @@
 """Arrays: where the microphones are, from settings, shipped layouts and files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -16,7 +16,7 @@ from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable"]
+__all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable", "written_out"]
 
 _SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are below it
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
@@ -185,13 +185,27 @@ def microphones(array: Array) -> Layout:
     Returns
     -------
     Layout
-        Positions from the centroid of the enabled microphones.
+        Positions from the centroid of the enabled microphones; those that ``array.disabled`` leaves out count in it.
 
     Raises
     ------
     ArgumentError
-        The named layout is unknown or cannot be used.
+        The named layout is unknown or cannot be used, ``array.disabled`` names a channel that it does not have, or no
+        microphone is left.
     """
+    fitted = _fitted(array)
+    if not array.disabled:
+        return fitted
+    enabled = fitted.enabled.copy()
+    for channel in array.disabled:
+        enabled[checks.whole("array.disabled", channel, 0, len(enabled) - 1)] = False
+    if not enabled.any():
+        raise ArgumentError(f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels")
+    return replace(fitted, enabled=enabled)
+
+
+def _fitted(array: Array) -> Layout:
+    """Return all microphones of an array, the disabled ones among them."""
     if array.positions_m is None:
         return load_layout(array.layout)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
@@ -211,11 +225,17 @@ def microphones(array: Array) -> Layout:
     )
 
 
+def written_out(array: Array) -> Array:
+    """Return an array whose microphones are written out, so that it depends on no layout file."""
+    if array.positions_m is not None:
+        return array
+    return _fitted(array).to_array().replace(disabled=array.disabled)
+
+
 def self_contained(settings: Settings) -> Settings:
     """Return settings whose microphones are written out, so that they depend on no layout file."""
-    if settings.array.positions_m is not None:
-        return settings
-    return settings.replace(array=microphones(settings.array).to_array())
+    array = written_out(settings.array)
+    return settings if array is settings.array else settings.replace(array=array)
 
 
 def storable(settings: Settings) -> Settings:

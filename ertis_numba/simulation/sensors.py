@@ -179,7 +179,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         ArgumentError
             There is such a channel.
         """
-        enabled = microphones(self.array).enabled
+        enabled = microphones(self.array.replace(disabled=None)).enabled
         for channel in self.electronics.faulty_channels:
             if channel >= len(enabled) or not enabled[channel]:
                 raise ArgumentError(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 __all__ = ["KINDS", "Kind", "kind_of"]
 
-_DISABLE = "put them under 'disabled' in a layout file for --settings"
+_DISABLE = "leave them out by 'ertis process --without', or by array.disabled in a settings file"
 _LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
 
 
