@@ -49,6 +49,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "import": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
     "info": ("--health", "{recording}"),
     "keys": ("new", "fresh", "--dir", "{out}/keys"),
+    "layout": ("eRTIS_v3D1",),
     "listen": ("tcp://127.0.0.1:1",),
     "peaks": ("{images}",),
     "plot": ("{recording}", "-o", "{out}/picture.png"),

@@ -89,12 +89,15 @@ def _origin(reader: "EnergyscapeReader") -> dict[str, Any]:
 
 
 def _sensor(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+    from ertis_numba.geometry import microphones
+
     settings = reader.settings
     return {
         "sensor": reader.sensor,
         "measurements": len(reader),
         "layout": settings.array.layout,
-        "microphones": sum(settings.array.enabled or ()) or len(settings.array.positions_m or ()),
+        "microphones": int(microphones(settings.array).enabled.sum()),
+        **({"disabled": list(settings.array.disabled)} if settings.array.disabled else {}),
         "call_khz": [settings.call.start_frequency_hz / 1e3, settings.call.stop_frequency_hz / 1e3],
         "temperature_c": settings.air.temperature_c,
         "simulated": reader.truth is not None,

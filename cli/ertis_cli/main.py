@@ -31,6 +31,7 @@ COMMANDS = {
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words, or PCM of other arrays, into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
     "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
+    "layout": ("ertis_cli.layout:layout", "List the shipped layouts, or print one as TOML."),
     "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes at ADDRESS."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),

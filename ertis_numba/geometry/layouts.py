@@ -16,7 +16,16 @@ from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable", "written_out"]
+__all__ = [
+    "Layout",
+    "layout_names",
+    "layout_text",
+    "load_layout",
+    "microphones",
+    "self_contained",
+    "storable",
+    "written_out",
+]
 
 _SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are below it
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
@@ -94,6 +103,18 @@ def _shipped() -> list[Traversable]:
     return list(resources.files("ertis_numba").joinpath("layouts").iterdir())
 
 
+def layout_text(name: str) -> str:
+    """Return the TOML of a shipped layout.
+
+    Raises
+    ------
+    ArgumentError
+        The name is unknown.
+    """
+    checks.choice("layout", name, layout_names())
+    return resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
+
+
 def load_layout(name: str | Path) -> Layout:
     """Return a shipped layout, or one from a ``.toml`` or ``.csv`` file.
 
@@ -115,9 +136,7 @@ def load_layout(name: str | Path) -> Layout:
     """
     path = Path(name)
     if path.suffix.lower() not in {".toml", ".csv"}:
-        checks.choice("layout", name, layout_names())
-        text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
-        return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+        return _placed(str(name), _LayoutFile.from_toml(layout_text(str(name)), f"layout {name}"))
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -200,7 +219,9 @@ def microphones(array: Array) -> Layout:
     for channel in array.disabled:
         enabled[checks.whole("array.disabled", channel, 0, len(enabled) - 1)] = False
     if not enabled.any():
-        raise ArgumentError(f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels")
+        raise ArgumentError(
+            f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels"
+        )
     return replace(fitted, enabled=enabled)
 
 
