@@ -57,6 +57,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
     "recover": ("{out}/crashed",),
     "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
+    "settings": ("scene",),
     "simulate": ("{scene}", "-o", "{out}/simulated.h5"),
     "status": ("tcp://127.0.0.1:1",),
     "verify": ("{recording}",),

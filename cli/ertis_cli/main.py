@@ -39,6 +39,7 @@ COMMANDS = {
     "record": ("ertis_cli.record:record", "Be the central node that stores what sensors send."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
     "serve": ("ertis_cli.serve:serve", "Be the central node that makes images of what sensors send."),
+    "settings": ("ertis_cli.settings:settings", "Print every key of a settings, scene, layout or mounting file."),
     "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
     "status": ("ertis_cli.status:status", "Show how the central node at ADDRESS is, live on a terminal."),
     "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),

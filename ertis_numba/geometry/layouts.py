@@ -31,8 +31,26 @@ _SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are b
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
 
 
-class _LayoutFile(Document, frozen=True, kw_only=True):
-    """What a layout file may hold; gains and delays are those of `settings.Array`."""
+class LayoutFile(Document, frozen=True, kw_only=True):
+    """Microphones of an array: the whole content of a layout file.
+
+    Attributes
+    ----------
+    positions_mm : list of (y, z) or (x, y, z)
+        Positions in the sensor frame, one per channel, in the order of the bits.
+    name : str
+        Name in recordings and pictures; the name of the file by default.
+    source : str
+        Origin of the figures, for readers of the file.
+    word_bits : {8, 16, 32, 64}
+        Size of one PDM word.
+    disabled : tuple of int
+        Channels without a microphone.
+    gain : tuple of float, optional
+        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
+    delay_s : tuple of float, optional
+        Calibrated lateness of each channel, 0 by default; it is taken out.
+    """
 
     positions_mm: list[list[float]]
     name: str = ""
@@ -136,7 +154,7 @@ def load_layout(name: str | Path) -> Layout:
     """
     path = Path(name)
     if path.suffix.lower() not in {".toml", ".csv"}:
-        return _placed(str(name), _LayoutFile.from_toml(layout_text(str(name)), f"layout {name}"))
+        return _placed(str(name), LayoutFile.from_toml(layout_text(str(name)), f"layout {name}"))
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -145,11 +163,11 @@ def load_layout(name: str | Path) -> Layout:
             f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
         ) from error
     if path.suffix.lower() == ".csv":
-        return _placed(str(name), _LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
-    return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+        return _placed(str(name), LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
+    return _placed(str(name), LayoutFile.from_toml(text, f"layout {name}"))
 
 
-def _placed(source: str, file: _LayoutFile) -> Layout:
+def _placed(source: str, file: LayoutFile) -> Layout:
     rows = file.positions_mm
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(

@@ -136,9 +136,11 @@ class Sensor(Settings, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
+        Name in recordings and of the port, different for each sensor.
     position_m : (x, y, z)
         Of its origin, in the world frame.
     velocity_m_s : (x, y, z)
+        Constant velocity in the world frame.
     waypoints : tuple of (time_s, x, y, z)
         Instead of position and velocity.
     yaw_deg, pitch_deg, roll_deg : float
