@@ -34,7 +34,7 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 @options.quiet
 @options.as_json
 def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, as_json: bool) -> None:
-    """List the shipped scenes, recordings and scripts, or copy some of them.
+    """List or copy shipped scenes, recordings and scripts.
 
     NAME is the name of a file, or that name without its suffix: 'reflectors' copies the scene reflectors.toml and its
     recording reflectors.h5. A different file of the same name is overwritten only with --force.

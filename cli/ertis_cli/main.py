@@ -26,7 +26,7 @@ COMMANDS = {
         "ertis_cli.emulate:emulate",
         "Be the sensors of a scene or of a recording, until interrupted.",
     ),
-    "example": ("ertis_cli.example:example", "List the shipped scenes, recordings and scripts, or copy some of them."),
+    "example": ("ertis_cli.example:example", "List or copy shipped scenes, recordings and scripts."),
     "export": ("ertis_cli.export:export", "Write a file for other programs."),
     "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words, or PCM of other arrays, into a recording."),
     "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),

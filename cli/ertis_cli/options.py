@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANNELS",
+    "COMPILING",
     "DIRECTION",
     "ERROR_BUDGET",
     "INTERVAL",
@@ -108,8 +109,10 @@ CHANNELS = _Channels()
 DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
-PREPARING = "preparing (a first run compiles kernels, which takes longer) ..."
-"""What is said of a start that is slow, for whichever reason: a machine may be busy, too."""
+PREPARING = "preparing ..."
+"""Note on a slow start."""
+COMPILING = "a first run compiles kernels, which takes longer ..."
+"""Note on a start that is slow because kernels are compiled."""
 _FILE = click.Path(path_type=Path)
 
 
@@ -290,11 +293,18 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 
 @contextmanager
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
-    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it."""
+    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it.
+
+    If kernels are compiled in the block, print that, too.
+    """
+    from ertis_numba.kernels import on_compiling
+
     timer = threading.Timer(after_s, say, args=(text,), kwargs={"quiet": quiet})
     timer.daemon = True
     timer.start()
+    withdraw = on_compiling(lambda: say(COMPILING, quiet=quiet))
     try:
         yield timer
     finally:
+        withdraw()
         timer.cancel()
