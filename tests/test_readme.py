@@ -34,7 +34,7 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "data").symlink_to(ROOT / "data")
     real = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     shutil.copy(str(real), tmp_path / "RAW.bin")
-    (tmp_path / "reflectors.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "reflectors.h5")
     (tmp_path / "RUNS").mkdir()
     write_recording(tmp_path / "RUNS" / "first.h5", noise(SMALL, 1))
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.toml", tmp_path / "SCENE.toml")

@@ -295,14 +295,22 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
     """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it.
 
-    If kernels are compiled in the block, print that, too.
+    If kernels are compiled in the block, print that once in a command.
     """
     from ertis_numba.kernels import on_compiling
 
     timer = threading.Timer(after_s, say, args=(text,), kwargs={"quiet": quiet})
     timer.daemon = True
     timer.start()
-    withdraw = on_compiling(lambda: say(COMPILING, quiet=quiet))
+    context = click.get_current_context(silent=True)
+    told: dict[str, Any] = {} if context is None else context.meta
+
+    def compiling() -> None:
+        if not told.get(COMPILING):
+            told[COMPILING] = True
+            say(COMPILING, quiet=quiet)
+
+    withdraw = on_compiling(compiling)
     try:
         yield timer
     finally:

@@ -18,6 +18,7 @@ from ertis_numba.settings import Array, Settings
 
 __all__ = [
     "Layout",
+    "LayoutFile",
     "layout_names",
     "layout_text",
     "load_layout",
