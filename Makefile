@@ -22,7 +22,7 @@ $(VENV)/ready-to-test: $(VENV)/ready  # what tests and checks need: CUDA's compi
 	touch $@
 
 demo: $(VENV)/ready
-	PATH="$(CURDIR)/$(BIN):$$PATH" examples/demo.sh
+	$(BIN)/ertis demo --force
 
 # Times are measured first, while nothing else runs. Then two legs run at a time; each says what it found when it ends.
 test: $(VENV)/ready-to-test

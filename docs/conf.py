@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,18 @@ autodoc_default_options = {"members": True}
 suppress_warnings = ["misc.highlighting_failure"]  # fragments of code in tables of formats
 
 MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # an address of a node is no link
+REFERENCE = re.compile(r"<!-- keys of (\w+) -->")
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./((?!docs/)[^)#\s]+)\)")
 
 
 def setup(app: Any) -> None:
     """Be told of each page before it is read."""
     app.connect("source-read", _name_what_is_outside)
+    app.connect("source-read", _write_reference)
+    if "sphinx-click-process-envars" not in app.events.events:  # as version 6 emits it, and does not register it
+        app.add_event("sphinx-click-process-envars")
+    for part in ("options", "arguments", "envars", "envvars"):
+        app.connect(f"sphinx-click-process-{part}", _write_plainly)
     for part in ("description", "options", "arguments"):
         app.connect(f"sphinx-click-process-{part}", _take_literally)
 
@@ -49,6 +56,35 @@ def _name_what_is_outside(_: Any, page: str, source: list[str]) -> None:
         return f"{match[1]} (`{match[2]}` in the source)" if path.is_dir() or path.suffix == ".md" else match[0]
 
     source[0] = OUTSIDE.sub(named, source[0])
+
+
+def _write_reference(_: Any, page: str, source: list[str]) -> None:
+    """Put the keys of each kind of TOML file where the page on settings names it."""
+    if page == "settings":
+        source[0] = REFERENCE.sub(lambda match: "\n".join(_tables(match[1])), source[0])
+
+
+def _tables(document: str) -> Iterator[str]:
+    from ertis_numba.reference import reference  # noqa: PLC0415  the paths are set above
+
+    for section in reference(document):
+        yield from (f"### {section.header or 'Before any table'}".replace("[", "\\["), "", section.about, "")
+        yield from ("| key | meaning | type | unit | default | example |", "| --- | --- | --- | --- | --- | --- |")
+        for key in section.keys:
+            code = (f"`{text}`" if text else "" for text in (key.default, key.example))
+            cells = (f"`{key.name}`", key.about, key.shape, key.unit, *code)
+            yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+        yield ""
+
+
+def _write_plainly(_: Any, __: Any, lines: list[str]) -> None:
+    """Write values as they are typed, not as Python shows them: paths, texts and lists of variables."""
+    for place, line in enumerate(lines):
+        plain = re.sub(r"PosixPath\('([^']*)'\)", r"\1", line)
+        if plain.lstrip().startswith((".. envvar::", ".. _", "``")):
+            plain = re.sub(r"\[('[^\]]*')\]", lambda match: match[1].replace("'", ""), plain)
+            plain = re.sub(r"^(\s*)``'(.*)'``$", r"\1``\2``", plain)
+        lines[place] = plain
 
 
 def _take_literally(_: Any, __: Any, lines: list[str]) -> None:

@@ -1,10 +1,10 @@
 """Imaging sonar in air: from the one-bit words of a microphone array to energyscapes and reflectors.
 
-::
+With the files that ``ertis example reflectors corridor`` copies::
 
     import ertis_numba as ertis
 
-    recording = ertis.open_recording("data/synthetic/reflectors.h5")
+    recording = ertis.open_recording("reflectors.h5")
     pipeline = ertis.Pipeline(recording.settings)
     image = pipeline.process(recording[0])
     peaks = ertis.find_peaks(image, top=5)
@@ -12,7 +12,7 @@
 
 Or from a scene, whose truth is known::
 
-    simulator = ertis.Simulator(ertis.load_scene("data/synthetic/scenes/corridor.toml"))
+    simulator = ertis.Simulator(ertis.load_scene("corridor.toml"))
     image = ertis.Pipeline(simulator.sensor.settings()).process(simulator.render(0))
     comparison = ertis.compare(image, simulator.reflectors(0))
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from ertis_numba.errors import DeviceError, NetworkError
+from ertis_numba.extras import extra
 
 __all__ = ["Client", "Future", "Line", "Lines", "Raised", "connect", "local", "require_workers", "silence", "worker"]
 
@@ -50,12 +51,8 @@ def connect(address: str, *, timeout_s: float) -> Client:
     NetworkError
         No scheduler answers.
     """
-    try:
+    with extra("cluster", "a scheduler needs dask.distributed", DeviceError):
         import distributed  # noqa: PLC0415  another package, and not always there
-    except ImportError as error:
-        raise DeviceError(
-            "a scheduler is given, and dask.distributed is not installed; run 'pip install ertis-numba[cluster]'"
-        ) from error
 
     class Client(distributed.Client):  # a scheduler shows this name
         """One that waits no longer than it may, even for a port that is no scheduler's and never answers."""
@@ -170,12 +167,8 @@ def local(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
     DeviceError
         dask.distributed is not installed.
     """
-    try:
+    with extra("cluster", "a cluster on this machine needs dask.distributed", DeviceError):
         from distributed import LocalCluster  # noqa: PLC0415  as above
-    except ImportError as error:
-        raise DeviceError(
-            "dask.distributed is not installed; run 'pip install ertis-numba[cluster]', or do without"
-        ) from error
     ports = {"dashboard_address": ":0", "worker_dashboard_address": ":0"}
     make: Any = LocalCluster
     with make(n_workers=n_workers, threads_per_worker=n_threads, silence_logs=50, **ports) as cluster:

@@ -27,7 +27,7 @@ def test_loop(tmp_path):
 def test_commands(place, ports, platform):
     """Nothing is near: the vehicle may go."""
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
-    assert [line.split()[1] for line in lines] == ["emulate", "serve", "capture", "examples/2_safety_stop.py"]
+    assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]
     *commands, example = lines
     with network.Shell(ports, platform) as shell:
         for command in commands:

@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from click.testing import CliRunner
 from ertis_cli import _signals, options
 from ertis_cli.main import COMMANDS, cli
 
+from ertis_numba import kernels
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import PRESETS, Air, Array
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
@@ -398,7 +400,32 @@ def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypa
     (tmp_path / "scene.toml").write_text("seed = 1\n")
     done = CliRunner().invoke(cli, command.format(ROOT / "data" / "synthetic" / "reflectors.h5").split())
     assert done.exit_code == 0, done.output
-    assert told[0] == "preparing (a first run compiles kernels, which takes longer) ..."
+    assert told[0] == "preparing ..."
+
+
+def test_compiling_is_said_where_kernels_are_compiled(capsys):
+    import numba  # noqa: PLC0415
+
+    kernels.load("cpu")
+    for compiles in (True, False):
+        with options.note_when_slow(options.PREPARING, quiet=False, after_s=60):
+            numba.njit(lambda value: value + 1)(1) if compiles else None
+        assert capsys.readouterr().err == (f"{options.COMPILING}\n" if compiles else "")
+
+
+def test_compiling_is_not_said_of_a_warm_run(recording, tmp_path):
+    done = run("process", recording, "-o", tmp_path / "a.h5", *FAST)
+    assert "compiles" not in done.stderr
+
+
+def test_info_tells_air_and_times_to_people(recording):
+    lines = run("info", recording).stdout.splitlines()
+    told = dict(re.split("  +", line, maxsplit=1) for line in lines)
+    assert (told["temperature"], told["humidity"]) == ("20.0 °C", "50.0 %")
+    assert told["sound speed"] == "343.87 m/s"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{3})? UTC", told["first"])
+    held = report("info", recording)
+    assert held["sound_speed_m_s"] == 343.87
 
 
 def test_one_microphone_tells_no_directions(tmp_path):

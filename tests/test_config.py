@@ -183,7 +183,7 @@ def test_the_page_says_how(tmp_path):
     """Its file and its commands, word by word."""
     page = (ROOT / "docs" / "command-line.md").read_text("utf-8")
     (tmp_path / "ertis.toml").write_text(page.split("```toml\n")[1].split("```")[0])
-    (tmp_path / "data").symlink_to(ROOT / "data")
+    (tmp_path / "reflectors.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
     counts = []
     for variables, line in re.findall(r"^\$ ((?:\w+=\S+ )?)ertis (--config.*)$", page, re.MULTILINE):
         given = dict(each.split("=") for each in variables.split())

@@ -30,6 +30,7 @@ RUN_BY = {
     ("devices", "$"): ["test_readme::test_page_on_devices"],
     ("export", "$"): ["test_export::test_page"],
     ("export", "python"): ["test_export::test_page"],
+    ("first-hour", "$"): ["test_first_hour::test_first_hour"],
     ("formats", "python"): ["test_guide::test_python_on_formats"],
     ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
     ("health", "$"): ["test_health_commands::test_page_shows_what_the_commands_print"],
@@ -123,8 +124,8 @@ def test_own_array(place):
 
 @pytest.mark.parametrize("name", ["accuracy", "beamformers"])
 def test_commands_of_a_page(place, name):
-    (command,) = commands_in(page(name))
-    run_here(place, command)
+    for command in commands_in(page(name)):
+        run_here(place, command)
     assert (place / "REC.energy.h5").exists()
 
 

@@ -48,7 +48,7 @@ def test_info_tells_the_health(sick, tmp_path):
     assert lines[9].split()[:4] == ["4", "stuck", "at", "0"]
     assert len({len(line) for line in lines[4:37]}) == 1
     assert lines[37].startswith("not observable ") or lines[37].startswith("fault ")
-    assert any(line.startswith("fault          channel 4: stuck at 0, 0 (limit 0.001); put them") for line in lines)
+    assert any(line.startswith("fault          channel 4: stuck at 0, 0 (limit 0.001); leave them") for line in lines)
     image = write_energyscapes(tmp_path / "img.h5", [files.image()])
     done = run("info", image, "--health", code=1)
     assert done.stderr == (
@@ -73,7 +73,7 @@ def test_process_warns_once(faulty, tmp_path):
     done = run("process", faulty, "-o", tmp_path / "img.h5", *FAST)
     assert done.stderr == (
         f"ertis: warning: {faulty}: sensor sensor has faulty microphones (stuck at 0: channel 4; stuck at 1: "
-        "channel 9); put them under 'disabled' in a layout file for --settings, or see 'ertis info --health'\n"
+        "channel 9); leave them out by --without 4,9, or see 'ertis info --health'\n"
     )
     assert (tmp_path / "img.h5").exists()
 

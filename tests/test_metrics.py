@@ -75,7 +75,7 @@ def test_an_address_in_use_is_told():
 
 def test_without_prometheus_client_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    with pytest.raises(ArgumentError, match=r"not installed; run \"pip install 'ertis-numba\[metrics\]'\""):
+    with pytest.raises(ArgumentError, match=r"need prometheus-client .*; run \"pip install 'ertis-numba\[metrics\]'\""):
         Metrics("127.0.0.1:0", lambda: BUSY)
 
 

@@ -160,7 +160,10 @@ def _serial(_folder: Path) -> Iterator[Finding]:
     ports = [port for port in find_ports() if port.may_be_sonar]
     if not ports:
         yield Finding(
-            "sensors", "note", "none is plugged in", "plug one in, or try 'ertis emulate examples/platform.toml'"
+            "sensors",
+            "note",
+            "none is plugged in",
+            "plug one in, or run 'ertis example platform' and 'ertis emulate platform.toml'",
         )
     for port in ports:
         if os.access(port.path, os.R_OK | os.W_OK):

@@ -1,5 +1,6 @@
 """``ertis info``: what a file holds."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["info"]
 
+_UNITS = {"_m_s": "m/s", "_percent": "%", "_khz": "kHz", "_hz": "Hz", "_ms": "ms", "_c": "°C", "_db": "dB", "_m": "m"}
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
 _LOOKED_AT = 8
 _WIDTH = 7  # at least
 _COLUMNS = {  # name: digits, of the report and of the table
@@ -63,12 +66,31 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
     if as_json:
         options.print_json({**flat[0], "sensors": sections})
         return
-    width = max(len(name) for section in flat for name in section)
+    width = max(len(_label(name)[0]) for section in flat for name in section)
     for index, section in enumerate(flat):
         if index:
             click.echo()
         for name, value in section.items():
-            click.echo(f"{name.replace('_', ' '):{width}}  {value}")
+            label, unit = _label(name)
+            click.echo(f"{label:{width}}  {_readable(value)}{unit}")
+
+
+def _label(name: str) -> tuple[str, str]:
+    """Return the name of a figure for people, and its unit after a space."""
+    suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
+    return name.removesuffix(suffix).replace("_", " "), f" {_UNITS[suffix]}" if suffix else ""
+
+
+def _readable(value: Any) -> str:
+    """Return a value for people: lists without brackets, and times in UTC without digits that nobody reads."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(map(_readable, value))
+    time = _TIME.fullmatch(value) if isinstance(value, str) else None
+    return f"{time[1]} {time[2]}{(time[3] or '')[:4]} UTC" if time else str(value)
 
 
 def _file(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
@@ -89,14 +111,20 @@ def _origin(reader: "EnergyscapeReader") -> dict[str, Any]:
 
 
 def _sensor(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+    from ertis_numba.air import sound_speed_m_s
+    from ertis_numba.geometry import microphones
+
     settings = reader.settings
     return {
         "sensor": reader.sensor,
         "measurements": len(reader),
         "layout": settings.array.layout,
-        "microphones": sum(settings.array.enabled or ()) or len(settings.array.positions_m or ()),
+        "microphones": int(microphones(settings.array).enabled.sum()),
+        **({"disabled": list(settings.array.disabled)} if settings.array.disabled else {}),
         "call_khz": [settings.call.start_frequency_hz / 1e3, settings.call.stop_frequency_hz / 1e3],
         "temperature_c": settings.air.temperature_c,
+        "humidity_percent": settings.air.humidity_percent,
+        "sound_speed_m_s": round(sound_speed_m_s(settings.air), 2),
         "simulated": reader.truth is not None,
     }
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ertis_numba.stages.compare import Comparison
 
 __all__ = [
+    "CHANNELS",
+    "COMPILING",
     "DIRECTION",
     "ERROR_BUDGET",
     "INTERVAL",
@@ -67,6 +69,15 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         return self.fail(f"{value!r} is no interval, give two numbers as in 0.5:5", param, ctx)
 
 
+class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
+    name = "N,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        with suppress(ValueError):
+            return tuple(int(channel) for channel in str(value).split(","))
+        return self.fail(f"{value!r} is no list of channels, give whole numbers as in 5,12", param, ctx)
+
+
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
     name = "AZ:EL"
 
@@ -94,11 +105,14 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
         return self.fail(f"{value!r} is no error, give dB as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx)
 
 
+CHANNELS = _Channels()
 DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
-PREPARING = "preparing (a first run compiles kernels, which takes longer) ..."
-"""What is said of a start that is slow, for whichever reason: a machine may be busy, too."""
+PREPARING = "preparing ..."
+"""Note on a slow start."""
+COMPILING = "a first run compiles kernels, which takes longer ..."
+"""Note on a start that is slow because kernels are compiled."""
 _FILE = click.Path(path_type=Path)
 
 
@@ -184,14 +198,23 @@ def place(index: int, count: int) -> int:
 
 
 def settings_with(
-    recorded: "Settings", *, settings_file: Path | None = None, max_error_db: float | None = None, **options: Any
+    recorded: "Settings",
+    *,
+    settings_file: Path | None = None,
+    max_error_db: float | None = None,
+    without: tuple[int, ...] | None = None,
+    **options: Any,
 ) -> "Settings":
     """Return the settings of a recording, changed by a settings file and then by options.
 
-    A settings file changes the keys that it holds; an array is replaced as a whole. Other options are named
-    like the fields of `Processing`; those that are None change nothing.
+    A settings file changes the keys that it holds; a layout or positions replace the array as a whole. ``without`` adds
+    channels to those that are left out. Other options are named like the fields of `Processing`; those that are None
+    change nothing.
     """
     settings = recorded if settings_file is None else recorded.changed_by(settings_file)
+    if without is not None:
+        disabled = tuple(sorted({*(settings.array.disabled or ()), *without}))
+        settings = settings.replace(array=settings.array.replace(disabled=disabled))
     given = {name: value for name, value in options.items() if value is not None}
     directions = given.get("directions", settings.processing.directions)
     kind = directions.partition(":")[0]
@@ -270,11 +293,26 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 
 @contextmanager
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
-    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it."""
+    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it.
+
+    If kernels are compiled in the block, print that once in a command.
+    """
+    from ertis_numba.kernels import on_compiling
+
     timer = threading.Timer(after_s, say, args=(text,), kwargs={"quiet": quiet})
     timer.daemon = True
     timer.start()
+    context = click.get_current_context(silent=True)
+    told: dict[str, Any] = {} if context is None else context.meta
+
+    def compiling() -> None:
+        if not told.get(COMPILING):
+            told[COMPILING] = True
+            say(COMPILING, quiet=quiet)
+
+    withdraw = on_compiling(compiling)
     try:
         yield timer
     finally:
+        withdraw()
         timer.cancel()

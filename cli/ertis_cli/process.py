@@ -33,6 +33,11 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     help="Energyscape file to write, REC.energy.h5 beside the recording by default; of several recordings a folder.",
 )
 @options.sensor("One sensor only; all of the recording by default.")
+@click.option(
+    "--without",
+    type=options.CHANNELS,
+    help="Channels to leave out, such as those of faulty microphones, counted from 0, as in 5,12.",
+)
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Limits of 2d:N and 3d:N in °.")
 @click.option("--elevation", type=options.INTERVAL, help="Limits of 3d:N in °.")
@@ -106,6 +111,7 @@ def process(
     paths: tuple[str, ...],
     target: str | None,
     sensor: str | None,
+    without: tuple[int, ...] | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
     elevation: tuple[float, float] | None,
@@ -146,6 +152,7 @@ def process(
         settings = options.settings_with(
             recorded,
             settings_file=settings_file,
+            without=without,
             directions=directions,
             azimuth_limits_deg=azimuth,
             elevation_limits_deg=elevation,

@@ -30,7 +30,7 @@ _LIVE, _FILM, _PAGE = "an address", "a file that is shown", "a file that --save-
 _HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
 _PAGES = (".html", ".htm")
 _TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
-_ENDING = "ending when the image at hand is made (a first run compiles kernels); Ctrl-C ends at once ..."
+_ENDING = "ending when the image at hand is made; Ctrl-C ends at once ..."
 _ONLY = {
     "host": (_LIVE, _FILM),
     "port": (_LIVE, _FILM),
@@ -120,12 +120,8 @@ def view(
 
         check_target(html, overwrite=force, sources=[] if live else [Path(what)])
         checks.choice("page format", html.suffix.lower(), _PAGES)
-    try:
-        from ertis_numba.viewer import Choices, View
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        raise click.ClickException("viser is not installed; pip install 'ertis-numba[view]'") from error
+    from ertis_numba.viewer import Choices, View
+
     choices = Choices(
         threshold_db=threshold, dynamic_range_db=dynamic_range, range_m=range_m, decay_s=decay, colours=colours
     )

@@ -12,7 +12,11 @@ import tempfile
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+
+try:
+    from playwright.sync_api import Page, sync_playwright
+except ImportError as error:
+    sys.exit(f"the picture of the live view needs playwright ({error}); run \"pip install 'ertis-numba[browser]'\"")
 
 HERE = Path(__file__).parent
 ERTIS = (sys.executable, "-m", "ertis_cli.main")

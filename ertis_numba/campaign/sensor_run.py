@@ -13,6 +13,7 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages.health import health
+from ertis_numba.stages.health.kinds import DISABLE
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ def faults_of(name: str, measurement: Measurement) -> str:
     every = all(channel.faults for channel in report.channels)
     remedies = dict.fromkeys(item.remedy for item in report.findings)
     remedy = "check its cable and supply" if every else next(iter(remedies))
+    if remedy == DISABLE:
+        channels = sorted({channel.channel for channel in report.channels if channel.faults})
+        remedy = f"leave them out by --without {','.join(map(str, channels))}"
     return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
 
 

@@ -7,7 +7,16 @@ taken from the centroid of the enabled microphones.
 from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad
 from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
 from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count
-from ertis_numba.geometry.layouts import Layout, layout_names, load_layout, microphones, self_contained, storable
+from ertis_numba.geometry.layouts import (
+    Layout,
+    layout_names,
+    layout_text,
+    load_layout,
+    microphones,
+    self_contained,
+    storable,
+    written_out,
+)
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.received import received_settings
@@ -25,6 +34,7 @@ __all__ = [
     "grid_count",
     "is_closed",
     "layout_names",
+    "layout_text",
     "load_layout",
     "microphones",
     "mounting",
@@ -36,4 +46,5 @@ __all__ = [
     "storable",
     "unit_vectors",
     "unrolled_rad",
+    "written_out",
 ]

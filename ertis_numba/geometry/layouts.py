@@ -1,6 +1,6 @@
 """Arrays: where the microphones are, from settings, shipped layouts and files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -16,14 +16,42 @@ from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["Layout", "layout_names", "load_layout", "microphones", "self_contained", "storable"]
+__all__ = [
+    "Layout",
+    "LayoutFile",
+    "layout_names",
+    "layout_text",
+    "load_layout",
+    "microphones",
+    "self_contained",
+    "storable",
+    "written_out",
+]
 
 _SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are below it
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
 
 
-class _LayoutFile(Document, frozen=True, kw_only=True):
-    """What a layout file may hold; gains and delays are those of `settings.Array`."""
+class LayoutFile(Document, frozen=True, kw_only=True):
+    """Microphones of an array: the whole content of a layout file.
+
+    Attributes
+    ----------
+    positions_mm : list of (y, z) or (x, y, z)
+        Positions in the sensor frame, one per channel, in the order of the bits.
+    name : str
+        Name in recordings and pictures; the name of the file by default.
+    source : str
+        Origin of the figures, for readers of the file.
+    word_bits : {8, 16, 32, 64}
+        Size of one PDM word.
+    disabled : tuple of int
+        Channels without a microphone.
+    gain : tuple of float, optional
+        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
+    delay_s : tuple of float, optional
+        Calibrated lateness of each channel, 0 by default; it is taken out.
+    """
 
     positions_mm: list[list[float]]
     name: str = ""
@@ -94,6 +122,18 @@ def _shipped() -> list[Traversable]:
     return list(resources.files("ertis_numba").joinpath("layouts").iterdir())
 
 
+def layout_text(name: str) -> str:
+    """Return the TOML of a shipped layout.
+
+    Raises
+    ------
+    ArgumentError
+        The name is unknown.
+    """
+    checks.choice("layout", name, layout_names())
+    return resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
+
+
 def load_layout(name: str | Path) -> Layout:
     """Return a shipped layout, or one from a ``.toml`` or ``.csv`` file.
 
@@ -115,9 +155,7 @@ def load_layout(name: str | Path) -> Layout:
     """
     path = Path(name)
     if path.suffix.lower() not in {".toml", ".csv"}:
-        checks.choice("layout", name, layout_names())
-        text = resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
-        return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+        return _placed(str(name), LayoutFile.from_toml(layout_text(str(name)), f"layout {name}"))
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -126,11 +164,11 @@ def load_layout(name: str | Path) -> Layout:
             f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
         ) from error
     if path.suffix.lower() == ".csv":
-        return _placed(str(name), _LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
-    return _placed(str(name), _LayoutFile.from_toml(text, f"layout {name}"))
+        return _placed(str(name), LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
+    return _placed(str(name), LayoutFile.from_toml(text, f"layout {name}"))
 
 
-def _placed(source: str, file: _LayoutFile) -> Layout:
+def _placed(source: str, file: LayoutFile) -> Layout:
     rows = file.positions_mm
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(
@@ -185,13 +223,29 @@ def microphones(array: Array) -> Layout:
     Returns
     -------
     Layout
-        Positions from the centroid of the enabled microphones.
+        Positions from the centroid of the enabled microphones; those that ``array.disabled`` leaves out count in it.
 
     Raises
     ------
     ArgumentError
-        The named layout is unknown or cannot be used.
+        The named layout is unknown or cannot be used, ``array.disabled`` names a channel that it does not have, or no
+        microphone is left.
     """
+    fitted = _fitted(array)
+    if not array.disabled:
+        return fitted
+    enabled = fitted.enabled.copy()
+    for channel in array.disabled:
+        enabled[checks.whole("array.disabled", channel, 0, len(enabled) - 1)] = False
+    if not enabled.any():
+        raise ArgumentError(
+            f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels"
+        )
+    return replace(fitted, enabled=enabled)
+
+
+def _fitted(array: Array) -> Layout:
+    """Return all microphones of an array, the disabled ones among them."""
     if array.positions_m is None:
         return load_layout(array.layout)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
@@ -211,11 +265,17 @@ def microphones(array: Array) -> Layout:
     )
 
 
+def written_out(array: Array) -> Array:
+    """Return an array whose microphones are written out, so that it depends on no layout file."""
+    if array.positions_m is not None:
+        return array
+    return _fitted(array).to_array().replace(disabled=array.disabled)
+
+
 def self_contained(settings: Settings) -> Settings:
     """Return settings whose microphones are written out, so that they depend on no layout file."""
-    if settings.array.positions_m is not None:
-        return settings
-    return settings.replace(array=microphones(settings.array).to_array())
+    array = written_out(settings.array)
+    return settings if array is settings.array else settings.replace(array=array)
 
 
 def storable(settings: Settings) -> Settings:

@@ -15,6 +15,7 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
+from ertis_numba.extras import extra
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import self_contained, unit_vectors
 from ertis_numba.interop._messages import encoder, schema
@@ -64,13 +65,9 @@ def write_mcap(
         What writes MCAP is not installed, two sensors have one topic, a sensor has a name that is none of a frame, or a
         time is beyond that of ROS 2.
     """
-    try:
+    with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
         from mcap.writer import Writer  # noqa: PLC0415  an extra
         from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  the same
-    except ImportError as error:
-        raise ArgumentError(
-            f"format 'mcap' needs mcap and mcap-ros2-support ({error}); run \"pip install 'ertis-numba[ros]'\""
-        ) from error
     with path.open("wb") as file:
         writer: Any = Writer(file)  # whose annotations are partial
         writer.start(profile="ros2", library="ertis-numba")

@@ -5,6 +5,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.extras import extra
 from ertis_numba.network import addresses
 from ertis_numba.network.status import Percentiles, Status
 
@@ -64,12 +65,8 @@ class Metrics:
     """
 
     def __init__(self, address: str, latest: Callable[[], Status]) -> None:
-        try:
+        with extra("metrics", "metrics need prometheus-client"):
             import prometheus_client  # noqa: F401, PLC0415  an extra
-        except ImportError as error:
-            raise ArgumentError(
-                "metrics need prometheus-client, which is not installed; run \"pip install 'ertis-numba[metrics]'\""
-            ) from error
         endpoint = addresses.endpoint(f"tcp://{address}")
         if not addresses.is_loopback(endpoint):
             raise ArgumentError(f"metrics address {address!r} can be reached from other machines; give 127.0.0.1:PORT")

@@ -28,6 +28,9 @@ class Array(Table, frozen=True, kw_only=True):
         Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
     delay_s : tuple of float, optional
         Calibrated lateness of each channel, 0 by default; it is taken out.
+    disabled : tuple of int, optional
+        Channels that are left out of every image although they carry a microphone, such as faulty ones; none by
+        default. The origin of images stays that of the whole array.
     word_bits : {8, 16, 32, 64}
         Size of one PDM word. An array with more channels uses several words per sample.
     """
@@ -37,12 +40,15 @@ class Array(Table, frozen=True, kw_only=True):
     enabled: tuple[bool, ...] | None = None
     gain: tuple[float, ...] | None = None
     delay_s: tuple[float, ...] | None = None
+    disabled: tuple[int, ...] | None = None
     word_bits: int = 32
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.whole("array.word_bits", self.word_bits, 1), WORD_BITS)
+        for channel in self.disabled or ():
+            checks.whole("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:
             for name in ("enabled", "gain", "delay_s"):
                 if getattr(self, name) is not None:

@@ -20,6 +20,7 @@ class Call(Table, frozen=True, kw_only=True):
     start_frequency_hz, stop_frequency_hz : float
         First and last instantaneous frequency; eRTIS sweeps downwards.
     duration_s : float
+        Length of the call, at least 16 samples and one period of its lowest frequency, at most 1 s.
     sample_rate_hz : float
         Rate of the converter that plays the call.
     ramp_fraction : float

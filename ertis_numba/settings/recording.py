@@ -29,6 +29,7 @@ class Recording(Table, frozen=True, kw_only=True):
     sample_rate_hz : float
         The PDM clock, or the rate of PCM.
     n_samples : int
+        Samples of each microphone in one measurement, in which a word of PDM counts as one.
     encoding : {"pdm", "int16", "float32"}
         ``pdm``: a bit per microphone, packed into words. ``int16`` and ``float32``: PCM, a number per microphone;
         full scale is 32768, or 1.
@@ -61,7 +62,17 @@ class Recording(Table, frozen=True, kw_only=True):
 
 
 class Air(Table, frozen=True, kw_only=True):
-    """The medium, which sets the speed of sound."""
+    """The medium, which sets the speed of sound.
+
+    Attributes
+    ----------
+    temperature_c : float
+        Temperature, -40 to 60.
+    humidity_percent : float
+        Relative humidity.
+    pressure_pa : float
+        Air pressure.
+    """
 
     temperature_c: float = STANDARD_TEMPERATURE_C
     humidity_percent: float = STANDARD_HUMIDITY_PERCENT

@@ -117,7 +117,9 @@ class Settings(Document, frozen=True, kw_only=True):
         return super().load(path).beside(Path(path).parent)
 
     def changed_by(self, path: str | Path) -> Self:
-        """Return settings changed by the keys that a file holds; an array is replaced as a whole.
+        """Return settings changed by the keys that a file holds.
+
+        An array is replaced as a whole if the file names a layout or positions.
 
         Files that it names are looked for beside it.
 
@@ -129,7 +131,10 @@ class Settings(Document, frozen=True, kw_only=True):
         held, tables = self._load(Path(path))
         held = held.beside(Path(path).parent)
         try:
-            changes: dict[str, Any] = {"array": held.array} if tables.pop("array", None) else {}
+            changes: dict[str, Any] = {}
+            if not tables.get("array", {}).keys().isdisjoint({"layout", "positions_m"}):
+                del tables["array"]
+                changes["array"] = held.array
             for name, table in tables.items():
                 given = {key: getattr(getattr(held, name), key) for key in table}
                 changes[name] = getattr(self, name).replace(**given)

@@ -29,6 +29,7 @@ class Placed(Table, frozen=True, kw_only=True):
     azimuth_deg, elevation_deg, range_m : float, optional
         The same seen from the origin; give either these or ``position_m``.
     velocity_m_s : (x, y, z)
+        Constant velocity in the world frame.
     waypoints : tuple of (time_s, x, y, z)
         Instead of all these: straight lines between points, rest before the first and after the last.
     """

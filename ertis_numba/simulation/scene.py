@@ -12,7 +12,7 @@ import msgspec
 from ertis_numba import checks
 from ertis_numba.documents import Document
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import load_layout
+from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.placed import Placed
@@ -133,7 +133,7 @@ class Scene(Document, frozen=True, kw_only=True):
 def _read(array: Array) -> Array:
     if array.positions_m is not None or Path(array.layout).suffix.lower() not in {".toml", ".csv"}:
         return array
-    return load_layout(array.layout).to_array()
+    return written_out(array)
 
 
 def load_scene(path: str | Path) -> Scene:

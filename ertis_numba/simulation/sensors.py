@@ -148,9 +148,11 @@ class Sensor(Settings, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
+        Name in recordings and of the port, different for each sensor.
     position_m : (x, y, z)
         Of its origin, in the world frame.
     velocity_m_s : (x, y, z)
+        Constant velocity in the world frame.
     waypoints : tuple of (time_s, x, y, z)
         Instead of position and velocity.
     yaw_deg, pitch_deg, roll_deg : float
@@ -191,7 +193,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         ArgumentError
             There is such a channel.
         """
-        enabled = microphones(self.array).enabled
+        enabled = microphones(self.array.replace(disabled=None)).enabled
         for channel in self.electronics.faulty_channels:
             if channel >= len(enabled) or not enabled[channel]:
                 raise ArgumentError(

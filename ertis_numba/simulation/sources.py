@@ -17,6 +17,7 @@ class Tone(Placed, frozen=True, kw_only=True):
     Attributes
     ----------
     frequency_hz : float
+        Frequency of the tone.
     level_db : float
         Amplitude 1 m from it.
     """
@@ -36,6 +37,7 @@ class Noise(Placed, frozen=True, kw_only=True):
     Attributes
     ----------
     band_hz : (low, high)
+        Band of the noise.
     level_db : float
         Root mean square in the band, 1 m from it.
     """
@@ -83,6 +85,7 @@ class Ambient(Table, frozen=True, kw_only=True):
     level_dbfs : float
         Root mean square in the band at each microphone.
     band_hz : (low, high)
+        Band of the noise.
     """
 
     level_dbfs: float = -80.0

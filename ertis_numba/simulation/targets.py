@@ -60,6 +60,7 @@ class Sphere(Placed, frozen=True, kw_only=True):
     Attributes
     ----------
     radius_m : float
+        Radius of the sphere.
     reflection_db : float
         Level of what it reflects below what reaches it.
     """
@@ -84,6 +85,7 @@ class Wall(Placed, frozen=True, kw_only=True):
         Around its position; without end by default. The width is horizontal; of a floor it lies across
         the azimuth that ``facing_deg`` names.
     reflection_db : float
+        Level of the reflected sound relative to the incident sound.
     """
 
     facing_deg: tuple[float, float]
@@ -112,9 +114,11 @@ class Box(Placed, frozen=True, kw_only=True):
     Attributes
     ----------
     size_m : (x, y, z)
+        Lengths of the edges before the turn.
     yaw_deg : float
         Turn about the vertical axis.
     reflection_db : float
+        Level of the reflected sound relative to the incident sound.
     """
 
     size_m: tuple[float, float, float]

@@ -95,7 +95,7 @@ RECORDING: Final = (
     _SETTINGS,
     Variable("microphone", ("microphone",), "<i4", "channel"),
     Variable("microphone_position", ("microphone", "axis"), "<f8", "x, y, z in the sensor frame", "m"),
-    Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone"),
+    Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone that is used"),
     Variable("calibration_gain", ("microphone",), "<f8", "sensitivity; signals are divided by it"),
     Variable("calibration_delay", ("microphone",), "<f8", "lateness; it is taken out", "s"),
     Variable("call", ("call_sample",), "<f4", "emitted sweep, full scale 1"),

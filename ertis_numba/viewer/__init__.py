@@ -7,6 +7,7 @@ to be drawn, without a browser. `View` hands that to the page and does what is c
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from ertis_numba.extras import extra
 from ertis_numba.viewer._choices import COLOURS, Choices
 from ertis_numba.viewer._polar import Polar
 from ertis_numba.viewer._scene import Scene
@@ -40,4 +41,5 @@ def __getattr__(name: str) -> Any:
     """Load what brings HDF5, ZeroMQ or viser when it is asked for (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    with extra("view", "the live view needs viser and websockets"):
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -12,9 +12,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import numba
+from numba.core import event
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
+from ertis_numba.kernels import _compiling
 from ertis_numba.kernels._cpu.dot16 import HAS_INT16_DOT, RANGES
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
@@ -25,6 +27,20 @@ if numba.config.DISABLE_JIT:
     raise DeviceError(
         "NUMBA_DISABLE_JIT is set, and device 'cpu' is what Numba compiles; unset it or use device 'numpy'"
     )
+
+
+class _Listener(event.Listener):  # type: ignore[misc]  # Numba is not looked into
+    """Listener to what Numba compiles; what it loads from its cache is no such event."""
+
+    def on_start(self, event: object) -> None:  # noqa: ARG002  as Numba calls it
+        """Report that a compilation has begun."""
+        _compiling.begun()
+
+    def on_end(self, event: object) -> None:
+        """Do nothing."""
+
+
+event.register("numba:compile", _Listener())
 
 _MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
 _ONE_AT_A_TIME = threading.RLock()

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
-__all__ = ["KINDS", "Kind", "kind_of"]
+__all__ = ["DISABLE", "KINDS", "Kind", "kind_of"]
 
-_DISABLE = "put them under 'disabled' in a layout file for --settings"
+DISABLE = "leave them out by 'ertis process --without', or by array.disabled in a settings file"
+"""Remedy for faults of single channels."""
+
 _LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
 
 
@@ -23,7 +25,7 @@ class Kind:
     """
 
     unit: str = ""
-    remedy: str = _DISABLE
+    remedy: str = DISABLE
     of_record: bool = False
 
 

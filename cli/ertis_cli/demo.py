@@ -1,0 +1,177 @@
+"""``ertis demo``: the whole system without hardware."""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from ertis_cli import _examples, options
+
+__all__ = ["demo"]
+
+_SCENE: Final = "platform.toml"
+_SENSORS: Final = ("front", "left", "back", "right")
+_WRITTEN: Final = (
+    _SCENE,
+    "sensors",
+    "recordings",
+    "emulate.jsonl",
+    "serve.jsonl",
+    "heard.jsonl",
+    "image.h5",
+    "image.png",
+)
+"""Names of all that a demo writes to its folder."""
+
+_NODE: Final = (sys.executable, "-m", "ertis_cli")
+_ANY_PORT: Final = "tcp://127.0.0.1:0"
+_LOOK_INTERVAL_S: Final = 0.1
+_STATUS_INTERVAL_S: Final = 0.5
+_STATUS_TIMEOUT_S: Final = 60.0
+_END_TIMEOUT_S: Final = 10.0
+_GAPS: Final = 3
+"""Exit code of ``ertis verify`` for a recording with gaps."""
+
+
+@click.command()
+@click.option(
+    "--output",
+    "-o",
+    "folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="demo",
+    show_default=True,
+    metavar="DIR",
+    help="Folder to write to.",
+)
+@click.option(
+    "-n", "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="SYNC pulses."
+)
+@click.option("--force", is_flag=True, help="Replace the files of an earlier demo.")
+@options.quiet
+def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
+    """Run four emulated sensors, a central node and an application.
+
+    A sensor node sends the measurements of four sensors on one SYNC chain to a central node, which stores them and
+    publishes images to an application. Then a recording becomes an image, a list of reflectors and a picture. The
+    commands are printed. All files go to one folder.
+    """
+    _make(folder, force=force)
+    scene = folder / _SCENE
+    (item,) = _examples.named(_SCENE).values()
+    scene.write_bytes(item.read_bytes())
+    sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # links to the emulated sensors
+    run = _Run(os.environ | sensors, quiet=quiet)
+    ports = [word for name in _SENSORS for word in ("--port", name)]
+    with ExitStack() as nodes:
+        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # which shows its progress
+        nodes.enter_context(run.node(*emulating, output=folder / "emulate.jsonl"))
+        serving = ("serve", "--listen", _ANY_PORT, "--publish", _ANY_PORT, "--record", folder / "recordings")
+        central = nodes.enter_context(run.node(*serving, "--json", "--quiet", output=folder / "serve.jsonl"))
+        options.say("waiting for the workers of the central node ...", quiet=quiet)
+        _await_worker(central["address"])
+        listening = ("listen", central["publish"], "--json", "--quiet")
+        nodes.enter_context(run.node(*listening, output=folder / "heard.jsonl"))
+        run("devices")
+        to = ("--trigger", "sync", "-n", str(count), "--to", central["address"], "--mounting", scene)
+        run("capture", *ports, *to)
+        run("status", central["address"], "--once")
+    image = folder / "image.h5"
+    recordings = sorted((folder / "recordings").glob("*.h5"))
+    run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may be too late for a pulse
+    run("process", recordings[0], "--sensor", _SENSORS[0], "--output", image, "--directions", "2d:181")
+    run("peaks", image, "--measurement", "0")
+    run("plot", image, "--output", folder / "image.png")
+
+
+def _make(folder: Path, *, force: bool) -> None:
+    """Make the folder, and remove what an earlier demo has left in it.
+
+    Raises
+    ------
+    ArgumentError
+        Files of an earlier demo are there, and may not be replaced.
+    """
+    from ertis_numba.errors import ArgumentError
+
+    there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
+    if there and not force:
+        raise ArgumentError(f"output {there[0]} exists; give another folder (-o), or ask to overwrite it (--force)")
+    for path in there:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _await_worker(address: str) -> None:
+    """Wait until the central node can process measurements."""
+    from ertis_numba.network.asking import Asking
+
+    with Asking(address) as node:
+        while True:
+            processing = node.ask(_STATUS_TIMEOUT_S).processing
+            if processing is not None and any(worker.state == "idle" for worker in processing.workers):
+                return
+            time.sleep(_STATUS_INTERVAL_S)
+
+
+class _Run:
+    """Runner of ``ertis`` commands, each in a process of its own."""
+
+    def __init__(self, environment: Mapping[str, str], *, quiet: bool) -> None:
+        self._environment, self._quiet = environment, quiet
+
+    def __call__(self, *words: object, allowed: Sequence[int] = ()) -> None:
+        """Run a command to its end.
+
+        Raises
+        ------
+        ClickException
+            It has failed.
+        """
+        typed = self._printed(words)
+        done = subprocess.run([*_NODE, *map(str, words)], env=self._environment, check=False)  # noqa: S603  our own
+        if done.returncode not in {0, *allowed}:
+            raise click.ClickException(f"'{typed}' ended with {done.returncode}; its error is above")
+
+    @contextmanager
+    def node(self, *words: object, output: Path) -> Iterator[dict[str, Any]]:
+        """Run a command until the block ends; yield the first object that it prints.
+
+        Raises
+        ------
+        ClickException
+            It has ended before it was ready.
+        """
+        typed = self._printed(words)
+        with output.open("wb") as file:
+            process = subprocess.Popen([*_NODE, *map(str, words)], env=self._environment, stdout=file)  # noqa: S603
+        try:
+            while not (text := output.read_text("utf-8")).endswith("\n"):
+                if process.poll() is not None:
+                    raise click.ClickException(f"'{typed}' ended with {process.returncode}; its error is above")
+                time.sleep(_LOOK_INTERVAL_S)
+            yield json.loads(text.partition("\n")[0])
+        finally:
+            process.terminate()
+            try:
+                process.wait(_END_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _printed(self, words: Sequence[object]) -> str:
+        typed = shlex.join(["ertis", *map(str, words)])
+        options.say(f"$ {typed}", quiet=self._quiet)
+        return typed

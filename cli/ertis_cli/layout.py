@@ -1,0 +1,35 @@
+"""``ertis layout``: the arrays that the package knows."""
+
+import click
+
+from ertis_cli import _tables, options
+
+__all__ = ["layout"]
+
+
+@click.command()
+@click.argument("name", required=False, shell_complete=options.complete_layouts)
+@options.as_json
+def layout(*, name: str | None, as_json: bool) -> None:
+    """List the shipped layouts, or print one as TOML.
+
+    Save what is printed to a file, edit it, and give that file as array.layout in settings or scenes, or as --layout.
+    """
+    from ertis_numba.geometry import layout_names, layout_text, load_layout
+
+    if name is not None:
+        text = layout_text(name)
+        if as_json:
+            options.print_json({"name": name, "toml": text})
+        else:
+            click.echo(text, nl=False)
+        return
+    rows = [
+        {"name": each, "microphones": int(load_layout(each).enabled.sum()), "word_bits": load_layout(each).word_bits}
+        for each in layout_names()
+    ]
+    if as_json:
+        options.print_json({"layouts": rows})
+        return
+    columns: dict[str, _tables.Side] = {"name": "left", "microphones": "right", "bits of a word": "right"}
+    _tables.Table(columns, [tuple(map(str, row.values())) for row in rows]).print()

@@ -1,0 +1,1 @@
+"""Scenes and the recordings simulated from them; ``ertis example`` copies them."""

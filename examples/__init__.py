@@ -1,0 +1,1 @@
+"""Scenes and scripts to start from; ``ertis example`` copies them."""

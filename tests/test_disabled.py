@@ -1,0 +1,198 @@
+"""Microphones that ``array.disabled`` leaves out: no path uses them, and the origin of images stays."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+from numpy.testing import assert_allclose, assert_array_equal
+
+from ertis_numba import export, figures
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import load_layout, microphones, received_settings, self_contained
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Array, Settings
+from ertis_numba.simulation import load_scene
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.stages.compare import compare
+from ertis_numba.stages.health import health
+from ertis_numba.storage import open_energyscapes, open_recording
+from ertis_numba.verification import measure
+from tests.files import SMALL, line, noise
+
+ROOT = Path(__file__).parents[1]
+FAULTY = (3, 8, 11, 12, 21, 26)
+SCENE = ROOT / "data" / "synthetic" / "scenes" / "faulty_array.toml"
+
+
+def run(*words, code=0):
+    done = CliRunner().invoke(cli, [str(word) for word in words])
+    assert done.exit_code == code, (done.output, done.exception)
+    return done
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("faulty") / "rec.h5"
+    run("simulate", SCENE, "-o", path, "--quiet")
+    return path
+
+
+def without(settings, *channels):
+    return settings.replace(array=settings.array.replace(disabled=channels))
+
+
+# ---- the array ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("array", [Array(), line(8, 8).array], ids=["named", "written out"])
+def test_positions_stay_when_a_microphone_is_disabled(array):
+    """A faulty microphone does not move the sensor."""
+    whole, fewer = microphones(array), microphones(array.replace(disabled=(1, 5)))
+    assert_array_equal(fewer.positions_m, whole.positions_m)
+    assert set(np.flatnonzero(whole.enabled)) - set(np.flatnonzero(fewer.enabled)) == {1, 5}
+
+
+def test_disabled_microphones_survive_what_stores_and_sends_settings():
+    settings = without(Settings(), 5, 12)
+    written = self_contained(settings)
+    for read in (written, Settings.from_toml(written.to_toml()), received_settings(written.to_toml(), "a sensor")):
+        assert read.array.disabled == (5, 12)
+        layout = microphones(read.array)
+        assert_array_equal(np.flatnonzero(~layout.enabled), [5, 12])
+        assert_array_equal(layout.positions_m, load_layout("eRTIS_v3D1").positions_m)
+
+
+def test_settings_without_disabled_microphones_are_written_as_before():
+    assert "disabled" not in Settings().to_toml()
+
+
+@pytest.mark.parametrize(
+    ("disabled", "message"),
+    [
+        ((32,), "array.disabled is 32; give a whole number from 0 to 31"),
+        ((-1,), "array.disabled is -1; give a whole number from 0"),
+        (tuple(range(32)), "array.disabled leaves none of 32 microphones; name fewer channels"),
+    ],
+)
+def test_disabled_channels_that_cannot_be_are_refused(disabled, message):
+    with pytest.raises(ArgumentError, match=message):
+        microphones(Array(disabled=disabled))
+
+
+def test_settings_file_that_only_disables_keeps_the_array(tmp_path):
+    (tmp_path / "s.toml").write_text("[array]\ndisabled = [2]\n")
+    known = line(8, 8)
+    changed = known.changed_by(tmp_path / "s.toml")
+    assert changed.array == known.array.replace(disabled=(2,))
+
+
+# ---- what is made of it --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "processing",
+    [
+        {},
+        {"method": "paper"},
+        {"wavefront": "spherical"},
+        {"beamformer": "coherence_factor"},
+        {"beamformer": "dmas"},
+        {"beamformer": "capon"},
+    ],
+    ids=lambda changes: "-".join(changes.values()) or "fast",
+)
+def test_disabled_microphones_change_no_image(processing):
+    """Whatever they hear."""
+    settings = without(SMALL.replace(processing=SMALL.processing.replace(**processing)), 4, 9)
+    (measurement,) = noise(settings, count=1)
+    other = dataclasses.replace(measurement, words=measurement.words ^ np.uint32(1 << 4 | 1 << 9))
+    with Pipeline(settings, device="numpy" if processing.get("method") == "paper" else "cpu") as pipeline:
+        assert_array_equal(pipeline.process(measurement).energy, pipeline.process(other).energy)
+
+
+def test_image_without_microphones_keeps_its_error_budget():
+    settings = without(SMALL, 4, 9)
+    (measurement,) = noise(settings, count=1)
+    with Pipeline(settings) as pipeline:
+        assert measure(pipeline.process(measurement), measurement).error_db < settings.accuracy.max_error_db
+
+
+def test_reflectors_stay_where_they_are_without_a_microphone():
+    scene = load_scene(ROOT / "data" / "synthetic" / "reflectors.toml")
+    with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
+        measurement = recording[0]
+    settings = without(measurement.settings, 0, 1, 2, 3)
+    image = Pipeline(settings).process(dataclasses.replace(measurement, settings=settings))
+    found = compare(image, Simulator(scene).reflectors(), min_level_db=-12.0)
+    assert len(found.matched) == 5
+    for match in found.matched:
+        assert abs(match.range_m) < 0.001
+
+
+def test_health_looks_at_no_disabled_microphone(recording):
+    with open_recording(recording) as given:
+        measurement = given[0]
+    report = health(dataclasses.replace(measurement, settings=without(measurement.settings, *FAULTY)))
+    assert not set(FAULTY) & {each.channel for each in report.channels}
+    assert not report.faults
+
+
+def test_exports_and_pictures_have_no_disabled_microphone(recording, tmp_path):
+    with open_recording(recording) as given:
+        measurement = dataclasses.replace(given[0], settings=without(given[0].settings, *FAULTY))
+    export(tmp_path / "signals.h5", [measurement])
+    xml = next(tmp_path.glob("*.xml")).read_text()
+    assert xml.count("<pos ") == 26
+    assert 'channel 8"' not in xml
+    for draw in (figures.signals, figures.matched_filter):
+        draw(measurement)
+        with pytest.raises(ArgumentError, match="microphone"):
+            draw(measurement, microphone=8)
+    figures.array(measurement.settings)
+
+
+# ---- the command line ----------------------------------------------------------------------------------
+
+
+def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
+    first = tmp_path / "first.h5"
+    (told,) = run("process", recording, "-o", first, "--quiet").stderr.splitlines()
+    advice = told.partition("leave them out by ")[2].partition(",  or")[0].partition(", or see")[0]
+    assert advice == "--without 3,8,11,12,21,26"
+    second = tmp_path / "second.h5"
+    assert run("process", recording, "-o", second, "--quiet", "--strict", *advice.split()).stderr == ""
+    with open_energyscapes(second) as images:
+        assert images.settings.array.disabled == FAULTY
+    (section,) = json.loads(run("info", second, "--json").stdout)["sensors"]
+    assert (section["microphones"], section["disabled"]) == (26, [*FAULTY])
+    (tmp_path / "s.toml").write_text(f"[array]\ndisabled = {[*FAULTY]}\n")
+    third = tmp_path / "third.h5"
+    assert run("process", recording, "-o", third, "--quiet", "--settings", tmp_path / "s.toml").stderr == ""
+    with open_energyscapes(second) as one, open_energyscapes(third) as other:
+        assert_allclose(one[0].energy, other[0].energy, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("channels", "message"),
+    [
+        ("x", "'x' is no list of channels, give whole numbers as in 5,12"),
+        ("40", "array.disabled is 40; give a whole number from 0 to 31"),
+    ],
+)
+def test_channels_that_are_not_there_are_refused(recording, tmp_path, channels, message):
+    done = run("process", recording, "-o", tmp_path / "a.h5", "--without", channels, code=2 if channels == "x" else 1)
+    assert message in done.stderr
+
+
+def test_layout_prints_what_a_settings_file_can_name(tmp_path):
+    listed = json.loads(run("layout", "--json").stdout)["layouts"]
+    assert {"name": "eRTIS_v3D1", "microphones": 32, "word_bits": 32} in listed
+    assert "eRTIS_v3D1" in run("layout").stdout
+    path = tmp_path / "mine.toml"
+    path.write_text(run("layout", "eRTIS_v2").stdout)
+    assert_array_equal(load_layout(path).positions_m, load_layout("eRTIS_v2").positions_m)
+    assert "layout 'eRTIS_v9' is unknown (did you mean 'eRTIS_v2'?)" in run("layout", "eRTIS_v9", code=1).stderr

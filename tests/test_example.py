@@ -1,0 +1,91 @@
+"""Files that `ertis example` copies and the demonstration that `ertis demo` runs."""
+
+import json
+from pathlib import Path, PurePath
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli import _examples
+from ertis_cli.main import cli
+
+from ertis_numba.simulation import load_scene
+from ertis_numba.storage import open_recording
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*words, code=0):
+    done = CliRunner().invoke(cli, [str(word) for word in words])
+    assert done.exit_code == code, (done.output, done.exception)
+    return done
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_example_lists_every_file_with_a_sentence():
+    listed = json.loads(run("example", "--json").stdout)["examples"]
+    assert [each["name"] for each in listed] == sorted(_examples.examples())
+    assert all(each["description"].endswith(".") and len(each["description"]) > 20 for each in listed)
+    assert "corridor.toml" in run("example").stdout
+
+
+def test_every_example_is_a_file_of_the_source():
+    sources = {path.name: path for path in (*(ROOT / "examples").iterdir(), *(ROOT / "data").rglob("*"))}
+    for name, item in _examples.examples().items():
+        assert item.read_bytes() == sources[name].read_bytes()
+
+
+def test_example_copies_a_scene_and_its_recording():
+    run("example", "reflectors")
+    assert len(open_recording("reflectors.h5")) == 1
+    assert len(load_scene("reflectors.toml").points) == 5
+    run("example", "platform.toml", "-o", ".")
+    assert {path.name for path in Path().iterdir()} == {"reflectors.h5", "reflectors.toml", "platform.toml"}
+
+
+def test_every_scene_can_be_loaded_where_it_is_copied_to():
+    scenes = [name for name in _examples.examples() if PurePath(name).suffix == ".toml"]
+    scenes = [name for name in scenes if name not in {"every_settings_key.toml", "every_layout_key.toml"}]
+    run("example", *scenes)
+    for name in scenes:
+        assert load_scene(name).sensors
+
+
+def test_example_overwrites_only_by_force():
+    Path("line.toml").write_text("mine")
+    assert (
+        "line.toml exists; give another name, or ask to overwrite it (--force)" in run("example", "line", code=1).stderr
+    )
+    assert Path("line.toml").read_text() == "mine"
+    assert not Path("line.h5").exists()
+    run("example", "line", "--force")
+    again = json.loads(run("example", "line", "--json").stdout)  # a copy is not in the way
+    assert again == {"files": ["line.h5", "line.toml"], "copied": []}
+
+
+def test_example_suggests_a_name():
+    assert "example 'coridor' does not exist; did you mean 'corridor'?" in run("example", "coridor", code=1).stderr
+
+
+def test_demo_keeps_files_of_an_earlier_one():
+    folder = Path("demo")
+    folder.mkdir()
+    (folder / "image.png").write_text("mine")
+    told = run("demo", code=1).stderr
+    assert "image.png exists; give another folder (-o), or ask to overwrite it (--force)" in told
+    assert (folder / "image.png").read_text() == "mine"
+
+
+def test_demo_makes_a_picture_of_what_four_sensors_send(tmp_path, monkeypatch):
+    """With one measurement of each sensor to render, where the shipped scene has thirty."""
+    scene = tmp_path / "small.toml"
+    scene.write_text(_examples.examples()["platform.toml"].read_text("utf-8").replace("count = 30", "count = 1"))
+    monkeypatch.setattr(_examples, "named", lambda name: {name: scene})
+    run("demo", "-n", "2", "--quiet")
+    (recording,) = Path("demo/recordings").glob("*.h5")
+    assert 1 <= len(open_recording(recording, sensor="front")) <= 2
+    assert Path("demo/image.png").stat().st_size > 10_000
+    assert "energyscape" in Path("demo/heard.jsonl").read_text("utf-8")

@@ -1,0 +1,144 @@
+"""Commands in an environment without an extra: one line names the extra, and all else works."""
+
+import re
+import subprocess
+import sys
+from configparser import ConfigParser
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+from tests.files import noise
+from tests.pages import environment
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = packages_distributions()
+FOR_AUTHORS = {"test", "docs", "check"}
+NEEDED_BY = {
+    "browser": ["{root}/docs/pictures/view.py"],
+    "cluster": [
+        "process a.h5 b.h5 -o out/ --scheduler tcp://127.0.0.1:1",
+        "serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --scheduler tcp://127.0.0.1:1",
+    ],
+    "cu12": ["process a.h5 -o a.energy.h5 --device cuda"],
+    "cu13": ["process a.h5 -o a.energy.h5 --device cuda"],
+    "metrics": ["serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --metrics 127.0.0.1:0"],
+    "ros": ["export a.h5 -o a.mcap"],
+    "view": ["view a.h5 --no-open --port 0", "view a.h5 --save-html a.html", "view tcp://127.0.0.1:1 --no-open"],
+}
+"""Commands that use what an extra brings; the script of an extra that no command uses."""
+
+WITHOUT = """
+import runpy, sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {blocked!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+RUN = (
+    WITHOUT
+    + """
+if {words!r}[0].endswith(".py"):
+    runpy.run_path({words!r}[0], run_name="__main__")
+else:
+    from ertis_cli.main import main
+    sys.argv[1:] = {words!r}
+    main()
+"""
+)
+HELP = (
+    WITHOUT
+    + """
+from click.testing import CliRunner
+from ertis_cli.main import COMMANDS, cli
+
+for name in COMMANDS:
+    done = CliRunner().invoke(cli, [name, "--help"])
+    assert done.exit_code == 0, (name, done.output)
+"""
+)
+
+
+def extras():
+    """Distributions of each extra that users install."""
+    parser = ConfigParser()
+    parser.read(ROOT / "setup.cfg")
+    return {
+        name: [re.split(r"[\[<>=;]", line)[0].strip() for line in lines.split("\n") if line]
+        for name, lines in parser["options.extras_require"].items()
+        if name not in FOR_AUTHORS
+    }
+
+
+def modules_of(distribution):
+    """Names that a distribution can be imported by; none if it is not installed."""
+    return [module for module, names in PACKAGES.items() if _plain(distribution) in map(_plain, names)]
+
+
+def _plain(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+def cases():
+    """Each package of each extra is missing once, and all packages of the extra together."""
+    for name, distributions in extras().items():
+        missing = [found for each in distributions if (found := modules_of(each))]
+        every = [module for each in missing for module in each]
+        lines = [(every, line) for line in NEEDED_BY[name]]
+        lines += [(each, NEEDED_BY[name][0]) for each in missing if len(missing) > 1]
+        for blocked, line in lines:
+            yield pytest.param(name, blocked, line, id=f"{name}-{'+'.join(blocked)}-{line.split()[0]}")
+
+
+def python(place, code):
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(
+        command, cwd=place, env=environment(place), capture_output=True, text=True, timeout=60, check=False
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def files(place):
+    """Files of the folder, except Matplotlib's list of fonts."""
+    return {path for path in place.rglob("*") if path.is_file() and not path.name.startswith("fontlist")}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    from ertis_numba.storage import write_recording  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("extras")
+    for name in ("a.h5", "b.h5"):
+        write_recording(folder / name, noise(count=1))
+    return folder
+
+
+def test_every_extra_has_a_command_that_needs_it():
+    assert set(NEEDED_BY) == set(extras())
+
+
+@pytest.mark.parametrize(("name", "blocked", "line"), [*cases()])
+def test_missing_extra_is_named_in_one_line(place, name, blocked, line):
+    before = files(place)
+    code, out, err = python(place, RUN.format(blocked=blocked, words=line.format(root=ROOT).split()))
+    assert code == 1, (out, err)
+    lines = err.splitlines()
+    assert len(lines) == 1, err
+    assert lines[0].startswith("ertis: error: ") or line.startswith("{root}")
+    other = "cu12" if name == "cu13" else name
+    assert f"ertis-numba[{other}]" in lines[0]
+    assert files(place) == before
+
+
+def test_commands_without_any_extra(place):
+    blocked = [module for names in extras().values() for each in names for module in modules_of(each)]
+    code, out, err = python(place, HELP.format(blocked=blocked))
+    assert code == 0, (out, err)
+    line = "process a.h5 -o {} --force --quiet --device cpu"
+    for words in (line.format("images.h5"), "export images.h5 -o cloud.ply", "plot images.h5 -o image.png"):
+        code, out, err = python(place, RUN.format(blocked=blocked, words=words.split()))
+        assert code == 0, (words, out, err)

@@ -1,0 +1,92 @@
+"""The page on the first hour, in a folder outside the source, and the commands of all pages."""
+
+import contextlib
+import json
+import re
+import shlex
+
+import click
+import numpy as np
+import pytest
+from ertis_cli.main import cli
+from scipy.io import wavfile
+
+from ertis_numba.simulation import load_scene
+from ertis_numba.simulation.render import Simulator
+from tests.pages import DOCS, ROOT, commands_in, in_background, page, run_here
+
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PCM = """
+recording.encoding = "int16"
+recording.sample_rate_hz = 192000.0
+recording.n_samples = 6144
+processing.range_decimation = 4
+"""
+
+
+def commands(text):
+    """Lines that begin with a prompt, without it, without variables and without what follows."""
+    for line in re.findall(r"^\w*\$ (?:[A-Z_]+=\S+ )*ertis (.*?)(?:\s+#.*)?$", text, re.MULTILINE):
+        yield line.partition(" | ")[0].partition(" > ")[0].removesuffix("&").strip()
+
+
+def found(words):
+    """The command that words name, and those that come after."""
+    command, rest = cli, words[2:] if words[0] == "--config" else list(words)
+    while isinstance(command, click.Group) and rest:
+        name = rest.pop(0)
+        following = command.get_command(click.Context(command), name)
+        assert following is not None, words
+        command = following
+    return command, rest
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_command_lines_of_pages_parse(path):
+    """Without running them."""
+    for line in commands(path.read_text("utf-8")):
+        command, rest = found(shlex.split(line))
+        command.make_context(line, rest)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_options_that_pages_name_exist(path):
+    """In the text, where commands are not complete."""
+    for text in re.findall(r"`ertis ([^`]+)`", path.read_text("utf-8")):
+        if not re.match(r"[a-z]", text):
+            continue  # as ertis --help, and ertis COMMAND --help
+        command, words = found(text.split())
+        known = {option for each in command.params for option in (*each.opts, *each.secondary_opts)} | {"--help"}
+        assert {word.partition("=")[0] for word in words if re.fullmatch(r"--?[a-z][\w-]*", word)} <= known, text
+
+
+def test_no_command_needs_a_file_of_the_source():
+    for path in PAGES:
+        for line in commands(path.read_text("utf-8")):
+            assert "data/synthetic" not in line, (path.name, line)
+            assert "examples/" not in line, (path.name, line)
+
+
+def test_first_hour(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
+    text = page("first-hour")
+    steps = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
+    assert all(len(step.splitlines()) <= 3 for step in steps)
+    for name, content in re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL):
+        (tmp_path / name).write_text(content)
+    scene = (tmp_path / "scene.toml").read_text().replace('name = "mine"\n', f'name = "mine"\n{PCM}')
+    (tmp_path / "pcm.toml").write_text(scene)
+    wavfile.write(
+        tmp_path / "echoes.wav", 192_000, np.array(Simulator(load_scene(tmp_path / "pcm.toml")).render().words)
+    )
+    with contextlib.ExitStack() as background:
+        for command in commands_in(text):
+            if command.endswith("&"):
+                background.enter_context(in_background(tmp_path, command))
+            elif command != "doctor":  # test_doctor
+                run_here(tmp_path, command)
+    for name in ("reflectors.png", "mine.png", "live.html", "points.csv"):
+        assert (tmp_path / name).stat().st_size > 1000, name
+    for name in ("mine", "posts"):
+        (peak, *_) = map(json.loads, run_here(tmp_path, f"peaks {name}.energy.h5 --top 1 --json").splitlines())
+        assert "14." in json.dumps(peak), peak  # the nearer post, 14 degrees to the left

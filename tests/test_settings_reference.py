@@ -1,0 +1,108 @@
+"""Reference of the keys of TOML files: each key is there, described, and its example is accepted."""
+
+import json
+import re
+import runpy
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import msgspec
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.documents import Table
+from ertis_numba.geometry import load_layout
+from ertis_numba.reference import DOCUMENTS, reference
+from ertis_numba.settings import Settings
+from ertis_numba.simulation import load_scene
+
+ROOT = Path(__file__).parents[1]
+READERS = {"settings": Settings.load, "scene": load_scene, "layout": load_layout, "mounting": load_scene}
+
+
+def structures(kind):
+    """Yield the structures of a document."""
+    yield kind
+    for field in msgspec.structs.fields(kind):
+        for part in (field.type, *getattr(field.type, "__args__", ())):
+            if isinstance(part, type) and issubclass(part, Table):
+                yield from structures(part)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_every_key_has_all_that_a_user_needs(document):
+    for section in reference(document):
+        assert section.about
+        for key in section.keys:
+            assert key.about, (section.header, key.name)
+            assert key.shape
+            assert key.default
+            assert tomllib.loads(key.example).keys() == {key.name}
+            assert key.unit or not re.search(r"_(hz|m|mm|s|deg|db|dbfs|c|pa|ppm|percent|m_s)$", key.name)
+
+
+def test_no_key_is_missing():
+    listed = {key.name for document in DOCUMENTS for section in reference(document) for key in section.keys}
+    tables = {section.header.strip("[]").rpartition(".")[2] for name in DOCUMENTS for section in reference(name)}
+    for kind in {each for document in DOCUMENTS.values() for each in structures(document)}:
+        for name in kind.__struct_fields__:
+            assert name in listed | tables | {"array", "call", "recording", "air", "processing", "accuracy"}, name
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_file_of_examples_is_accepted(document):
+    READERS[document](resources.files("ertis_examples") / f"every_{document}_key.toml")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_template_without_a_change_is_the_default(document):
+    """All of its lines are comments until somebody takes the marks away."""
+    text = CliRunner().invoke(cli, ["settings", document]).stdout
+    assert tomllib.loads(text) == {}
+    for section in reference(document):
+        assert not section.header or f"# {section.header}\n" in text
+        for key in section.keys:
+            assert f"# {key.example}\n" in text
+
+
+def test_settings_template_with_a_key_set(tmp_path):
+    text = CliRunner().invoke(cli, ["settings"]).stdout
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("# [air]", "[air]").replace("# temperature_c", "temperature_c"))
+    assert Settings.load(path).air.temperature_c == 24.5
+
+
+def test_reference_as_json():
+    told = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
+    (table,) = told["tables"]
+    (found,) = (key for key in table["keys"] if key["name"] == "positions_mm")
+    assert (found["unit"], found["default"]) == ("mm", "required")
+
+
+def test_page_has_every_key():
+    conf = runpy.run_path(str(ROOT / "docs" / "conf.py"))
+    source = [(ROOT / "docs" / "settings.md").read_text("utf-8")]
+    conf["_write_reference"](None, "settings", source)
+    assert "<!-- keys of" not in source[0]
+    for document in DOCUMENTS:
+        for section in reference(document):
+            for key in section.keys:
+                assert f"| `{key.name}` | {key.about}".replace("|", "") in source[0].replace("\\|", "").replace("|", "")
+
+
+@pytest.mark.parametrize(
+    ("line", "plain"),
+    [
+        ("   ``PosixPath('bench/results')``", "   ``bench/results``"),
+        ("   ``'3000'``", "   ``3000``"),
+        (".. envvar:: ['ERTIS_PROCESS_QUIET', 'ERTIS_QUIET']", ".. envvar:: ERTIS_PROCESS_QUIET, ERTIS_QUIET"),
+        ("   Provide a default for it", "   Provide a default for it"),
+    ],
+)
+def test_commands_page_shows_values_as_they_are_typed(line, plain):
+    conf = runpy.run_path(str(ROOT / "docs" / "conf.py"))
+    lines = [line]
+    conf["_write_plainly"](None, None, lines)
+    assert lines == [plain]
