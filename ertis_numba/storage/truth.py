@@ -1,7 +1,10 @@
 """What a simulated sensor should show."""
 
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -12,7 +15,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Reflector
 from ertis_numba.storage.schema import TRUTH, describe, lay_out, text_type
 
-__all__ = ["Truth", "read_truth", "write_truth"]
+__all__ = ["Truth", "TruthLog", "read_truth", "write_truth"]
 
 _FIELDS = {
     "azimuth": "azimuth_deg",
@@ -23,6 +26,11 @@ _FIELDS = {
 }
 _ANGLES = ("azimuth", "elevation")  # radians in the file, as its other angles
 _MOST_SEED = 2**63 - 1  # what an attribute holds
+_BLOCK_ROWS = 512  # measurements whose reflectors are in memory at a time
+_RECORD = np.dtype(
+    [("row", "<i8"), ("target", "<i4"), ("name", "<i4")]
+    + [(name, "<f8", 3 if name == "velocity" else ()) for name in _FIELDS]
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,11 +44,14 @@ class Truth:
     seed : int
     reflectors : tuple of tuple of Reflector
         Those of each measurement, the strongest first.
+    left_out : tuple of str
+        Effects on which the scene has something to act, but which were not simulated.
     """
 
     scene: str
     seed: int
     reflectors: tuple[tuple[Reflector, ...], ...]
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0, _MOST_SEED)
@@ -48,7 +59,91 @@ class Truth:
             checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
 
 
-def write_truth(group: h5py.Group, truth: Truth, n_measurements: int) -> None:
+class TruthLog:
+    """Truth that grows measurement by measurement, in a temporary file; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    scene : str
+        The scene as TOML.
+    seed : int
+    left_out : tuple of str
+        Effects on which the scene has something to act, but which were not simulated.
+    folder : Path, optional
+        Folder of the temporary file, which has no name and goes with the process; the system's own by default.
+    """
+
+    def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
+        self.scene = scene
+        self.seed = checks.whole("seed", seed, 0, _MOST_SEED)
+        self.left_out = left_out
+        self._names: dict[str, int] = {}
+        self._rows = 0
+        self._most_targets = 0
+        self._last: tuple[Sequence[Reflector], NDArray[Any]] = ((), np.zeros(0, _RECORD))
+        self._waiting: list[NDArray[Any]] = []
+        self._block_sizes: list[int] = []
+        self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  it lives as long as this
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return self._rows
+
+    @property
+    def n_targets(self) -> int:
+        """The largest number of reflectors of a measurement."""
+        return self._most_targets
+
+    @property
+    def names(self) -> list[bytes]:
+        """Names of the reflectors, by the number that records hold."""
+        return [name.encode() for name in self._names]
+
+    def append(self, reflectors: Sequence[Reflector]) -> None:
+        """Add the reflectors of the next measurement, the strongest first."""
+        if reflectors is not self._last[0]:  # a scene at rest gives the same again and again
+            self._last = reflectors, self._encoded(reflectors)
+        records = self._last[1].copy()
+        records["row"] = self._rows
+        self._waiting.append(records)
+        self._rows += 1
+        self._most_targets = max(self._most_targets, len(records))
+        if self._rows % _BLOCK_ROWS == 0:
+            self._flush()
+
+    def _encoded(self, reflectors: Sequence[Reflector]) -> NDArray[Any]:
+        columns = _columns((reflectors,))
+        records = np.zeros(len(reflectors), _RECORD)
+        records["target"] = np.arange(len(reflectors))
+        records["name"] = [self._names.setdefault(each.name, len(self._names)) for each in reflectors]
+        for name, values in columns.items():
+            checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
+            records[name] = values
+        return records
+
+    def _flush(self) -> None:
+        if self._waiting:
+            records = np.concatenate(self._waiting)
+            self._file.write(records.tobytes())
+            self._block_sizes.append(records.nbytes)
+            self._waiting.clear()
+
+    def blocks(self) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the rows of each block of measurements, and the records of their reflectors."""
+        self._flush()
+        self._file.seek(0)
+        for number, n_bytes in enumerate(self._block_sizes):
+            first = number * _BLOCK_ROWS
+            records = np.frombuffer(self._file.read(n_bytes), _RECORD)
+            yield slice(first, min(first + _BLOCK_ROWS, self._rows)), records
+
+
+def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int) -> None:
     """Write what a sensor should show into its group.
 
     Raises
@@ -56,22 +151,34 @@ def write_truth(group: h5py.Group, truth: Truth, n_measurements: int) -> None:
     ArgumentError
         The truth is about another number of measurements.
     """
-    reflectors = truth.reflectors
-    if len(reflectors) != n_measurements:
+    if isinstance(truth, Truth):
+        with TruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
+            for reflectors in truth.reflectors:
+                log.append(reflectors)
+            write_truth(group, log, n_measurements)
+        return
+    if len(truth) != n_measurements:
         raise ArgumentError(
-            f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(reflectors)} measurements, "
+            f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(truth)} measurements, "
             f"the file holds {n_measurements}; give the reflectors of each"
         )
-    names = [reflector.name.encode() for row in reflectors for reflector in row]
+    names = truth.names
     kind = text_type(max(map(len, names), default=0))
-    sizes = {"measurement": n_measurements, "target": max(map(len, reflectors)), "axis": 3}
+    sizes = {"measurement": n_measurements, "target": truth.n_targets, "axis": 3}
     made = group.create_group("truth", track_order=True)
     lay_out(made, TRUTH, sizes=sizes, dtypes={"name": kind}, texts={"scene": truth.scene})
-    describe(made, {"seed": truth.seed})
-    given = _given(reflectors, sizes["target"])
-    _fill(made["name"], given, np.array(names, dtype=kind), b"")
-    for name, values in _columns(reflectors).items():
-        _fill(made[name], given, values, np.nan)
+    describe(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
+    if not truth.n_targets:  # HDF5 has no room, and needs none, for nothing
+        return
+    texts = np.array(names, dtype=kind)
+    for rows, records in truth.blocks():
+        place = records["row"] - rows.start, records["target"]
+        for name in ("name", *_FIELDS):
+            dataset = made[name]
+            missing: object = b"" if name == "name" else np.nan
+            whole = np.full((rows.stop - rows.start, *dataset.shape[1:]), missing, dtype=dataset.dtype)
+            whole[place] = texts[records["name"]] if name == "name" else records[name]
+            dataset[rows] = whole
 
 
 def read_truth(group: h5py.Group) -> Truth | None:
@@ -96,10 +203,16 @@ def read_truth(group: h5py.Group) -> Truth | None:
                 for target in range(n_targets)
             )
         )
-    return Truth(scene=group["scene"][()].decode(), seed=int(group.attrs["seed"]), reflectors=tuple(rows))
+    left_out = group.attrs.get("effects_left_out", b"")  # of older files, unknown
+    return Truth(
+        scene=group["scene"][()].decode(),
+        seed=int(group.attrs["seed"]),
+        reflectors=tuple(rows),
+        left_out=tuple(bytes(left_out).decode().split()),
+    )
 
 
-def _columns(reflectors: tuple[tuple[Reflector, ...], ...]) -> dict[str, NDArray[np.float64]]:
+def _columns(reflectors: Sequence[Sequence[Reflector]]) -> dict[str, NDArray[np.float64]]:
     """Return the numbers of all reflectors, one measurement after the other: (reflector,) or (reflector, axis)."""
     flat = [reflector for row in reflectors for reflector in row]
     columns = {
@@ -108,16 +221,3 @@ def _columns(reflectors: tuple[tuple[Reflector, ...], ...]) -> dict[str, NDArray
     }
     columns["velocity"] = columns["velocity"].reshape(-1, 3)
     return columns | {name: np.radians(columns[name]) for name in _ANGLES}
-
-
-def _given(reflectors: tuple[tuple[Reflector, ...], ...], n_targets: int) -> NDArray[np.bool_]:
-    """Return where a measurement has a reflector: (measurement, target)."""
-    counts = np.array([len(row) for row in reflectors])
-    return np.asarray(np.arange(n_targets) < counts[:, None])
-
-
-def _fill(dataset: h5py.Dataset, given: NDArray[np.bool_], values: NDArray[Any], missing: object) -> None:
-    whole = np.full(dataset.shape, missing, dtype=dataset.dtype)
-    whole[given] = values
-    if whole.size:  # HDF5 has no room, and needs none, for nothing
-        dataset[...] = whole
