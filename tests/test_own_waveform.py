@@ -201,7 +201,7 @@ def test_settings_refuse_files(tmp_path, name, write, message):
 
 def test_wav_refuses_another_rate(tmp_path):
     wav(tmp_path / "own.wav")
-    with pytest.raises(SettingsError, match="sample_rate_hz is 96000, but .* has 192000 Hz; leave out"):
+    with pytest.raises(SettingsError, match=r"sample_rate_hz is 96000, but .* has 192000 Hz; leave out"):
         Call.from_file(tmp_path / "own.wav", sample_rate_hz=96_000)
 
 
