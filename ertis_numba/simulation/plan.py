@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ertis_numba.simulation.limits import near_discs
+from ertis_numba.simulation.limits import near_discs, near_targets
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.names import ASKED_FOR, EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
@@ -77,8 +77,8 @@ class Plan:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The effects that are off, although the scene has something on which they act."""
-        return tuple(verdict.name for verdict in self.verdicts if not verdict.on and verdict.estimate_db is not None)
+        """The effects that are off, although they change the image."""
+        return tuple(verdict.name for verdict in self.verdicts if not verdict.on and verdict.estimate_db)
 
 
 def make_plan(scene: Scene) -> Plan:
@@ -95,7 +95,7 @@ def make_plan(scene: Scene) -> Plan:
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
-    notes = tuple(dict.fromkeys(note for _, shot in shots for note in near_discs(shot)))
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in near_targets(shot) + near_discs(shot)))
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
     rounds = [_active(verdicts)]

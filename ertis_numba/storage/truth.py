@@ -45,7 +45,7 @@ class Truth:
     reflectors : tuple of tuple of Reflector
         Those of each measurement, the strongest first.
     left_out : tuple of str
-        Effects on which the scene has something to act, but which were not simulated.
+        Effects that were not simulated, although they change the image a little.
     """
 
     scene: str
@@ -68,7 +68,7 @@ class TruthLog:
         The scene as TOML.
     seed : int
     left_out : tuple of str
-        Effects on which the scene has something to act, but which were not simulated.
+        Effects that were not simulated, although they change the image a little.
     folder : Path, optional
         Folder of the temporary file, which has no name and goes with the process; the system's own by default.
     """
