@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from ertis_cli import simulate as command
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.geometry import layouts, load_layout
 from ertis_numba.simulation import Box, Point, Scene, Tone
@@ -107,6 +107,11 @@ def test_truth_log_of_several_blocks_reads_back(tmp_path, monkeypatch):
     assert truth.reflectors[2][1].range_m == 1.2
     assert truth.reflectors[2][1].velocity_m_s == (0.0, 1.0, 2.0)
     assert truth.left_out == ("doppler", "walls")
+
+
+def test_truth_log_names_the_folder_that_cannot_be_written(tmp_path):
+    with pytest.raises(DataError, match=r"gone: a temporary file cannot be written \(No such file or directory\); "):
+        TruthLog("", 5, folder=tmp_path / "gone")
 
 
 def test_shipped_layout_is_read_once(monkeypatch):

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.atomic import remedy
+from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.storage.schema import TRUTH, describe, lay_out, text_type
 
@@ -83,7 +85,9 @@ class TruthLog:
         self._last: tuple[Sequence[Reflector], NDArray[Any]] = ((), np.zeros(0, _RECORD))
         self._waiting: list[NDArray[Any]] = []
         self._block_sizes: list[int] = []
-        self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  it lives as long as this
+        self._folder = folder or Path(tempfile.gettempdir())
+        with self._naming_folder():
+            self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  closed on exit
 
     def __enter__(self) -> Self:
         return self
@@ -129,9 +133,20 @@ class TruthLog:
     def _flush(self) -> None:
         if self._waiting:
             records = np.concatenate(self._waiting)
-            self._file.write(records.tobytes())
+            with self._naming_folder():
+                self._file.write(records.tobytes())
+                self._file.flush()
             self._block_sizes.append(records.nbytes)
             self._waiting.clear()
+
+    @contextmanager
+    def _naming_folder(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DataError(
+                f"{self._folder}: a temporary file cannot be written ({error.strerror}); {remedy(error)}"
+            ) from error
 
     def blocks(self) -> Iterator[tuple[slice, NDArray[Any]]]:
         """Yield the rows of each block of measurements, and the records of their reflectors."""
