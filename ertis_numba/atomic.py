@@ -68,8 +68,10 @@ def remedy(error: Exception) -> str:
     return _REMEDIES.get(number or 0, "look at the disk, or write elsewhere")
 
 
-def require_room(folder: Path, n_bytes: int) -> None:
+def require_room(folder: Path, n_bytes: int, *, purpose: str = "what is next") -> None:
     """Refuse to write ``n_bytes`` into a folder that would then have no room to spare.
+
+    Errors name the ``purpose`` of the bytes.
 
     Raises
     ------
@@ -79,7 +81,7 @@ def require_room(folder: Path, n_bytes: int) -> None:
     free, wanted = shutil.disk_usage(folder).free, n_bytes + SPARE_BYTES
     if free < wanted:
         raise DataError(
-            f"{folder} has {free / 1e6:.1f} MB free, wanted {wanted / 1e6:.1f} MB for what is next, "
+            f"{folder} has {free / 1e6:.1f} MB free, wanted {wanted / 1e6:.1f} MB for {purpose}, "
             f"{SPARE_BYTES / 1e6:.0f} MB of it to spare; {_ELSEWHERE}"
         )
 

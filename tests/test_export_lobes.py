@@ -15,7 +15,6 @@ array.layout = "ring"
 array.word_bits = 8
 array.positions_m = {positions}
 processing.directions = "2d:181"
-electronics.noise_dbfs = -55.0
 
 [[points]]
 azimuth_deg = -38.0

@@ -48,8 +48,11 @@ def test_direct_sound_that_overloads_converters_is_simulated(kind):
     assert changed_db > 0.3
 
 
-def test_direct_sound_far_below_full_scale_is_left_out():
-    assert "direct_sound" not in make_plan(beside_an_emitter(-75.0, PDM)).active
+def test_direct_sound_far_below_full_scale_changes_no_image():
+    scene = beside_an_emitter(-75.0, PDM)
+    verdict = next(each for each in make_plan(scene).verdicts if each.name == "direct_sound")
+    assert verdict.estimate_db < scene.tolerance_db
+    assert verdict.on  # because the scene asks for it
 
 
 @pytest.mark.parametrize("noise_dbfs", [None, -30.0])
@@ -74,7 +77,9 @@ def test_verdicts_of_a_few_scenes_hold():
 
 def test_bench_fails_where_a_verdict_is_wrong(monkeypatch):
     monkeypatch.setattr(Trial, "total_change_db", lambda *_: 0.5)
-    monkeypatch.setattr(verdicts, "varied_scene", lambda seed: beside_an_emitter(-75.0 - seed, PCM))
+    slow = Point(range_m=0.5, strength_db=-26.0, velocity_m_s=(1e-5, 0.0, 0.0))
+    sensor = Sensor(array=OCTET, **PCM)
+    monkeypatch.setattr(verdicts, "varied_scene", lambda seed: Scene(seed=seed, sensors=(sensor,), points=(slow,)))
     done = CliRunner().invoke(cli, ["bench", "simulation", "--verdicts", "2", "--json", "--quiet"])
     report = json.loads(done.stdout)
     assert report["wrong"]

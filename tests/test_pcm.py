@@ -183,7 +183,7 @@ def test_a_sensor_of_bits_cannot_be_set_up_for_numbers():
 
 def test_faults_are_found_in_numbers():
     settings = PCM.replace(recording=PCM.recording.replace(n_samples=30_000))
-    words = heard(settings, electronics=Electronics(noise_dbfs=-60.0)).words.astype(np.float64)
+    words = heard(settings).words.astype(np.float64)
     time_s = np.arange(len(words)) / RATE_HZ
     words[:, 1] = 0
     words[:, 2] = -321

@@ -22,7 +22,7 @@ from ertis_numba.simulation import (
     Tone,
     Wall,
 )
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.names import ASKED_FOR, EFFECTS
 from ertis_numba.simulation.plan import Plan, make_plan
 from ertis_numba.simulation.rehearsal import image_change_db
 from ertis_numba.simulation.render import Simulator
@@ -85,7 +85,8 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     """
     scene = free_field()
     say("deciding")
-    plan = make_plan(scene)
+    # Keys ask for most of these effects, which keeps them on: here only the image is to decide.
+    plan = make_plan(scene.replace(effects=dict.fromkeys(ASKED_FOR, False)))
     everything = make_plan(scene.replace(effects=dict.fromkeys(_FORCED, True)))
     say("checking")
     change_db = _change_db(scene, plan, everything)

@@ -185,13 +185,14 @@ def _staged(path: Path, names: "Sequence[str]", *, count: int | None, seed: int 
     """Return the scene, ready to be rendered; the first run compiles kernels."""
     from ertis_cli._emulation import Stage
     from ertis_numba.simulation import load_scene
-    from ertis_numba.simulation.limits import exceeded
     from ertis_numba.simulation.snapshot import snapshot
 
     changes = {"count": count, "seed": seed}
     scene = load_scene(path).replace(**{name: value for name, value in changes.items() if value is not None})
     for name in names:
-        for note in exceeded(snapshot(scene, scene.sensor(name), 0.0)):
+        shot = snapshot(scene, scene.sensor(name), 0.0)
+        limits.require_clear(shot)
+        for note in limits.notes(shot):
             options.say(f"note: {note}", quiet=quiet)
     with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.simulation.render import compile_kernels

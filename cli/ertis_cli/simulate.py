@@ -1,5 +1,6 @@
 """``ertis simulate``: a scene to a recording."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,17 +10,19 @@ from ertis_cli import options
 from ertis_cli._signals import interrupt_later
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ertis_numba.frames import Measurement, Reflector
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.plan import Plan
     from ertis_numba.simulation.render import Simulator
-    from ertis_numba.storage import Truth
+    from ertis_numba.storage import TruthLog
 
 __all__ = ["simulate"]
 
 _FOLLOWED = 0.6  # of full scale, by the modulators
+_COLUMN_BYTES = 72  # of a measurement, beside its words: stamp, CRC-32 and air
+_REFLECTOR_BYTES = 200  # of a reflector, in the recording and in the temporary file
 _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
 
@@ -35,7 +38,8 @@ _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
     "--tolerance-db",
     type=float,
     metavar="DB",
-    help="Leave out effects that change no image by more; the scene's own, 0.1, by default.",
+    help="Leave out effects that the scene does not ask for and that change no image by more; 0 keeps all. The scene's "
+    "own, 0.1, by default.",
 )
 @click.option("--explain", is_flag=True, help="Print a table of effects: on or off, why, and what they cost.")
 @options.force
@@ -69,6 +73,7 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
+    _require_room(target, scene, names)
     with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
@@ -77,25 +82,37 @@ def simulate(
     with options.note_when_slow("deciding which effects matter ...", quiet=quiet, after_s=3.0):
         plan = make_plan(scene)
         simulators = [Simulator(scene, sensor=name, plan=plan) for name in names]
-        firsts = [simulator.render(0) for simulator in simulators]
         if explain:  # costs are those of calls that compile nothing
             for simulator in simulators:
+                simulator.render(0)
                 simulator.clock.cost_ms.clear()
-            firsts = [simulator.render(0) for simulator in simulators]
-    truth = {simulator.sensor.name: _truth(simulator) for simulator in simulators}
-    shown = options.progress(
-        _measurements(simulators, firsts), length=scene.count * len(names), label="simulating", quiet=quiet
-    )
-    with shown as measurements:
+    firsts = {simulator.sensor.name: simulator.reflectors(0) for simulator in simulators}
+    _require_room(target, scene, names, n_reflectors=sum(map(len, firsts.values())))
+    with ExitStack() as stack:
+        logs = {name: stack.enter_context(_log(scene, plan, target.parent)) for name in names}
+        shown = stack.enter_context(
+            options.progress(
+                _measurements(simulators, firsts, logs),
+                length=scene.count * len(names),
+                label="simulating",
+                quiet=quiet,
+            )
+        )
         write_recording(
             target,
-            measurements,
+            shown,
             overwrite=force,
             source=path.name,
-            truth=truth,
+            truth=logs,
             mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
         )
-    options.say(_summary(target, scene, truth), quiet=quiet)
+        n_reflectors = max(log.n_own_targets for log in logs.values())
+    options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
+    if plan.left_out:
+        options.say(
+            f"left out: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps all effects",
+            quiet=quiet,
+        )
     for simulator in simulators:
         followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
         if simulator.loudest > followed:
@@ -108,29 +125,42 @@ def simulate(
         options.say(f"note: {note}", quiet=quiet)
     effects = _effects(plan, simulators)
     if as_json:
-        options.print_json(_report(target, scene, truth) | ({"effects": effects} if explain else {}))
+        options.print_json(_report(target, scene, plan, firsts) | ({"effects": effects} if explain else {}))
     elif explain:
         _print(effects)
 
 
-def _measurements(simulators: "Sequence[Simulator]", firsts: "Sequence[Measurement]") -> "Iterator[Measurement]":
-    """Yield what sensors measure together, one sensor after the other."""
-    yield from firsts
-    for index in range(1, simulators[0].scene.count):
+def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflectors: int = 0) -> None:
+    """Refuse a recording that exceeds the room on the disk."""
+    from ertis_numba.atomic import require_room
+    from ertis_numba.words import word_format
+
+    n_bytes = sum(word_format(scene.sensor(name).settings()).n_bytes + _COLUMN_BYTES for name in names)
+    require_room(
+        target.parent,
+        scene.count * (n_bytes + n_reflectors * _REFLECTOR_BYTES),
+        purpose=f"{options.counted(scene.count, 'measurement')} of {options.counted(len(names), 'sensor')}",
+    )
+
+
+def _measurements(
+    simulators: "Sequence[Simulator]", firsts: "dict[str, list[Reflector]]", logs: "dict[str, TruthLog]"
+) -> "Iterator[Measurement]":
+    """Yield what sensors measure together, one sensor after the other, and log what an image should show."""
+    scene = simulators[0].scene
+    for index in range(scene.count):
         for simulator in simulators:
+            name = simulator.sensor.name
+            logs[name].append(simulator.reflectors(index) if index and scene.moves else firsts[name])
             yield simulator.render(index)
 
 
-def _truth(simulator: "Simulator") -> "Truth":
-    from ertis_numba.storage import Truth
+def _log(scene: "Scene", plan: "Plan", folder: Path) -> "TruthLog":
+    from ertis_numba.storage import TruthLog
 
-    scene = simulator.scene
     # With the verdicts written out, so that the words can be made again where a rehearsal would come out otherwise.
-    decided = scene.replace(effects={verdict.name: verdict.on for verdict in simulator.plan.verdicts})
-    reflectors = [tuple(simulator.reflectors(0))] * scene.count
-    if scene.moves:
-        reflectors[1:] = [tuple(simulator.reflectors(index)) for index in range(1, scene.count)]
-    return Truth(scene=decided.to_toml(), seed=scene.seed, reflectors=tuple(reflectors))
+    decided = scene.replace(effects={verdict.name: verdict.on for verdict in plan.verdicts})
+    return TruthLog(decided.to_toml(), scene.seed, left_out=plan.left_out, folder=folder)
 
 
 def _mounting(simulator: "Simulator") -> Any:
@@ -173,22 +203,21 @@ def _print(effects: list[dict[str, Any]]) -> None:
         click.echo("* as the scene says, whatever the estimate")
 
 
-def _summary(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> str:
-    several = f" of {options.counted(len(truth), 'sensor')}" if len(truth) > 1 else ""
-    most = max(
-        sum(not each.emitter for each in reflectors) for entry in truth.values() for reflectors in entry.reflectors
-    )
-    return f"{target}: {options.counted(scene.count, 'measurement')}{several}, {options.counted(most, 'reflector')}"
+def _summary(target: Path, scene: "Scene", *, n_sensors: int, n_reflectors: int) -> str:
+    several = f" of {options.counted(n_sensors, 'sensor')}" if n_sensors > 1 else ""
+    measurements = options.counted(scene.count, "measurement")
+    return f"{target}: {measurements}{several}, {options.counted(n_reflectors, 'reflector')}"
 
 
-def _report(target: Path, scene: "Scene", truth: "Mapping[str, Truth]") -> dict[str, Any]:
+def _report(target: Path, scene: "Scene", plan: "Plan", firsts: "dict[str, list[Reflector]]") -> dict[str, Any]:
     return {
         "output": str(target),
         "measurements": scene.count,
         "seed": scene.seed,
+        "left_out": list(plan.left_out),
         "sensors": [
-            {"sensor": name, "reflectors": [_row(reflector) for reflector in entry.reflectors[0]]}
-            for name, entry in truth.items()
+            {"sensor": name, "reflectors": [_row(reflector) for reflector in reflectors]}
+            for name, reflectors in firsts.items()
         ],
     }
 

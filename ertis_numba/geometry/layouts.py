@@ -1,5 +1,6 @@
 """Arrays: where the microphones are, from settings, shipped layouts and files."""
 
+import functools
 from dataclasses import dataclass, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -113,6 +114,7 @@ class Layout:
         )
 
 
+@functools.cache
 def layout_names() -> tuple[str, ...]:
     """Return the names of the shipped layouts."""
     return tuple(sorted(item.name.removesuffix(".toml") for item in _shipped() if item.name.endswith(".toml")))
@@ -155,7 +157,7 @@ def load_layout(name: str | Path) -> Layout:
     """
     path = Path(name)
     if path.suffix.lower() not in {".toml", ".csv"}:
-        return _placed(str(name), LayoutFile.from_toml(layout_text(str(name)), f"layout {name}"))
+        return microphones(_shipped_array(str(name)))
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -164,11 +166,20 @@ def load_layout(name: str | Path) -> Layout:
             f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
         ) from error
     if path.suffix.lower() == ".csv":
-        return _placed(str(name), LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text)))
-    return _placed(str(name), LayoutFile.from_toml(text, f"layout {name}"))
+        file = LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text))
+    else:
+        file = LayoutFile.from_toml(text, f"layout {name}")
+    return microphones(_placed(str(name), file))
 
 
-def _placed(source: str, file: LayoutFile) -> Layout:
+@functools.cache
+def _shipped_array(name: str) -> Array:
+    """Return a shipped layout, whose file is read once."""
+    return _placed(name, LayoutFile.from_toml(layout_text(name), f"layout {name}"))
+
+
+def _placed(source: str, file: LayoutFile) -> Array:
+    """Return the array of a layout file, checked."""
     rows = file.positions_mm
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(
@@ -198,7 +209,7 @@ def _placed(source: str, file: LayoutFile) -> Layout:
             "millimetres"
         )
     _require_apart(source, positions_m, np.flatnonzero(enabled))
-    return microphones(made)
+    return made
 
 
 def _require_apart(source: str, positions_m: NDArray[np.float64], channels: NDArray[np.intp]) -> None:

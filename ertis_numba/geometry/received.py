@@ -45,6 +45,10 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
             f"{source}: array.layout is {layout[:80]!r}, a file; send its positions instead, or name one of "
             f"{', '.join(layout_names())}"
         )
+    if isinstance(settings.call.waveform, str):
+        raise SettingsError(
+            f"{source}: call.waveform is {settings.call.waveform[:80]!r}, a file; send its samples instead"
+        )
     try:
         count = None if are_applied else grid_count(directions)
     except ArgumentError as error:

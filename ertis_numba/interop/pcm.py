@@ -14,8 +14,8 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop._acoular import read_acoular
-from ertis_numba.interop._wav import read_wav
 from ertis_numba.settings import Recording, Settings, suit_ranges
+from ertis_numba.wav import read_wav
 
 __all__ = ["PcmReader", "open_pcm"]
 

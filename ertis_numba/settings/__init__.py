@@ -12,12 +12,14 @@ from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import suit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import PRESETS, Settings
+from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 
 __all__ = [
     "ENCODINGS",
     "ERROR_PRESETS_DB",
     "INTERPOLATIONS",
     "MAX_CALL_SAMPLES",
+    "MAX_WAVEFORM_SAMPLES",
     "MOST_ZONES",
     "PRESETS",
     "Accuracy",

@@ -1,19 +1,24 @@
-"""The emitted sweep."""
+"""The emitted call: a sweep, or an own waveform."""
 
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import msgspec
 
 from ertis_numba import checks
 from ertis_numba.documents import Table
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.settings.waveform import band_hz, normalised, read_waveform
 
 __all__ = ["MAX_CALL_SAMPLES", "Call"]
 
 MAX_CALL_SAMPLES = 2**20
 """Limit on the samples of a call, about one second at 1 MHz: files store them, and filters make several copies."""
+_BAND_MISS_HZ = 200.0  # by which the band of a waveform may differ between processors
 
 
 class Call(Table, frozen=True, kw_only=True):
-    """The emitted sweep, with a Hann ramp at both ends.
+    """The emitted call: a sweep with a Hann ramp at both ends, or an own waveform.
 
     Attributes
     ----------
@@ -28,6 +33,11 @@ class Call(Table, frozen=True, kw_only=True):
     modulation : {"hyperbolic", "linear"}
         Whether its period or its frequency goes evenly from first to last. eRTIS is hyperbolic: motion only shifts such
         echoes, where it blurs those of a linear sweep.
+    waveform : str or tuple of float, optional
+        Own waveform instead of a sweep: samples at ``sample_rate_hz``, or the name of a file with them, which
+        `Settings.load` looks for beside the settings and reads. WAV files have a rate of their own. The samples are
+        scaled to a peak of 1. They replace the other keys: the two frequencies become the edges of their band, at -20
+        dB, and the duration becomes theirs.
     """
 
     start_frequency_hz: float = 50_000.0
@@ -36,10 +46,15 @@ class Call(Table, frozen=True, kw_only=True):
     sample_rate_hz: float = 450_000.0
     ramp_fraction: float = 0.1
     modulation: Literal["hyperbolic", "linear"] = "hyperbolic"
+    waveform: str | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.positive("call.sample_rate_hz", self.sample_rate_hz)
+        if isinstance(self.waveform, str):
+            return  # checked when it is read
+        if self.waveform is not None:
+            self._adopt(self.waveform)
         for name in ("start_frequency_hz", "stop_frequency_hz"):
             frequency_hz = checks.positive(f"call.{name}", getattr(self, name))
             if frequency_hz >= self.sample_rate_hz / 2:
@@ -66,12 +81,98 @@ class Call(Table, frozen=True, kw_only=True):
         checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
         checks.choice("call.modulation", self.modulation, ("hyperbolic", "linear"))
 
+    def _adopt(self, waveform: tuple[float, ...]) -> None:
+        """Derive the other fields from samples, and refuse values that contradict them."""
+        samples = normalised(waveform, self.sample_rate_hz)
+        start_hz, stop_hz = band_hz(samples, self.sample_rate_hz)
+        derived = {
+            "start_frequency_hz": (start_hz, _BAND_MISS_HZ),
+            "stop_frequency_hz": (stop_hz, _BAND_MISS_HZ),
+            "duration_s": ((len(samples) - 1) / self.sample_rate_hz, 1e-9),
+            "ramp_fraction": (0.0, 0.0),
+        }
+        msgspec.structs.force_setattr(self, "waveform", samples)
+        for name, (value, miss) in derived.items():
+            given = getattr(self, name)
+            if abs(given - value) <= miss:
+                continue  # of settings that were stored
+            if given != _default(name):
+                raise ArgumentError(
+                    f"call.waveform and call.{name} contradict each other ({value:g} and {given:g}); leave out "
+                    f"call.{name}"
+                )
+            msgspec.structs.force_setattr(self, name, value)
+        if self.modulation != _default("modulation"):
+            raise ArgumentError("call.waveform and call.modulation are both given; leave out call.modulation")
+
+    @classmethod
+    def from_file(cls, path: str | Path, *, sample_rate_hz: float | None = None) -> Self:
+        """Return the call whose waveform a file holds.
+
+        Parameters
+        ----------
+        path : str or Path
+            WAV of one channel, CSV with one number per line, or NPY with a one-dimensional array.
+        sample_rate_hz : float, optional
+            Rate of the samples; that of a WAV file by default, 450 kHz of others.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read, or its samples cannot be used.
+        """
+        given: dict[str, Any] = {} if sample_rate_hz is None else {"sample_rate_hz": sample_rate_hz}
+        return cls(waveform=str(path), **given).beside(Path())
+
+    def beside(self, folder: Path) -> Self:
+        """Return the call with the samples of the file that it names, which is looked for in a folder.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read, or its samples cannot be used.
+        """
+        if not isinstance(self.waveform, str):
+            return self
+        path = folder / self.waveform
+        samples, rate_hz = read_waveform(path)
+        given_hz = self.sample_rate_hz
+        if rate_hz is not None and given_hz not in {rate_hz, _default("sample_rate_hz")}:
+            raise SettingsError(
+                f"call.sample_rate_hz is {given_hz:g}, but {path} has {rate_hz:g} Hz; leave out call.sample_rate_hz"
+            )
+        try:
+            return self.replace(waveform=samples, sample_rate_hz=given_hz if rate_hz is None else rate_hz)
+        except ArgumentError as error:
+            raise SettingsError(f"{path}: {error}") from error
+
+    def require_samples(self) -> None:
+        """Refuse a waveform that is still the name of a file.
+
+        Raises
+        ------
+        ArgumentError
+            It is.
+        """
+        if isinstance(self.waveform, str):
+            raise ArgumentError(
+                f"call.waveform is the file {self.waveform!r}, which has not been read; give Call.from_file("
+                f"{self.waveform!r}), or read the settings by Settings.load"
+            )
+
     @property
     def low_frequency_hz(self) -> float:
         """Lower edge of the band."""
+        self.require_samples()
         return min(self.start_frequency_hz, self.stop_frequency_hz)
 
     @property
     def high_frequency_hz(self) -> float:
         """Upper edge of the band."""
+        self.require_samples()
         return max(self.start_frequency_hz, self.stop_frequency_hz)
+
+
+def _default(name: str) -> Any:
+    """Return the default of a field, which stands for one that is not given."""
+    return next(field.default for field in msgspec.structs.fields(Call) if field.name == name)

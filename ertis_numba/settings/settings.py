@@ -41,6 +41,8 @@ class Settings(Document, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.call.waveform, str):
+            return  # checked when it is read
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
@@ -107,7 +109,7 @@ class Settings(Document, frozen=True, kw_only=True):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file; files that it names, of a layout or of directions, are looked for beside it.
+        """Read a file; files that it names, of a layout, a call or directions, are looked for beside it.
 
         Raises
         ------
@@ -119,7 +121,8 @@ class Settings(Document, frozen=True, kw_only=True):
     def changed_by(self, path: str | Path) -> Self:
         """Return settings changed by the keys that a file holds.
 
-        An array is replaced as a whole if the file names a layout or positions.
+        An array is replaced as a whole if the file names a layout or positions, and a call if either has an own
+        waveform.
 
         Files that it names are looked for beside it.
 
@@ -135,6 +138,9 @@ class Settings(Document, frozen=True, kw_only=True):
             if not tables.get("array", {}).keys().isdisjoint({"layout", "positions_m"}):
                 del tables["array"]
                 changes["array"] = held.array
+            if "call" in tables and (held.call.waveform or self.call.waveform):
+                del tables["call"]
+                changes["call"] = held.call
             for name, table in tables.items():
                 given = {key: getattr(getattr(held, name), key) for key in table}
                 changes[name] = getattr(self, name).replace(**given)
@@ -143,13 +149,16 @@ class Settings(Document, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def beside(self, folder: Path) -> Self:
-        """Return settings whose files, of a layout and of directions, are looked for in a folder."""
+        """Return settings whose files are looked for in a folder: of a layout, of directions, and of a call.
+
+        The waveform of a call is read, because its band decides about much else.
+        """
         array, processing = self.array, self.processing
         if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
             array = array.replace(layout=str(folder / array.layout))
         if Path(processing.directions).suffix.lower() == ".csv":
             processing = processing.replace(directions=str(folder / processing.directions))
-        return self.replace(array=array, processing=processing)
+        return self.replace(array=array, processing=processing, call=self.call.beside(folder))
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:

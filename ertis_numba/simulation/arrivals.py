@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.settings import Call
+from ertis_numba.simulation.bounds import require_few_amplitudes, require_few_paths
 from ertis_numba.simulation.mirrors import images
 from ertis_numba.simulation.paths import Paths, by_targets, without_target
 from ertis_numba.simulation.sensors import Emitter
@@ -77,7 +78,7 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
         level = _linear(sensor.emitter.level_db)
         start_s = effect("sync_delay")(shot, number) if "sync_delay" in active else 0.0
         own = "propagation" if number == shot.number else "cross_emission"
-        for paths in echoes(shot, active, number, clock):
+        for paths in echoes(shot, active, number, clock, n_frequencies=len(frequency_hz)):
             amplitude = level * responses(shot, active, paths, sensor.emitter, frequency_hz, clock)
             with clock("doppler" if "doppler" in active else own):
                 delay_s, stretch = _times(shot, active, paths)
@@ -103,8 +104,18 @@ def mouth_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Mouth:
     return shot.mouths[number]
 
 
-def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch) -> list[Paths]:
-    """Return the paths of an emitter's call over targets and walls, and straight from another sensor's."""
+def echoes(
+    shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch, *, n_frequencies: int = 1
+) -> list[Paths]:
+    """Return the paths of an emitter's call over targets and walls, and straight from another sensor's.
+
+    ``n_frequencies`` are those at which their amplitudes are to be computed.
+
+    Raises
+    ------
+    ArgumentError
+        There are too many paths, or amplitudes.
+    """
     mouth = mouth_of(shot, active, number)
     if "walls" in active:
         key = "walls", number, "emitter_offset" in active
@@ -121,11 +132,14 @@ def echoes(shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwat
     over = by_targets
     if "target_size" in active and np.any(shot.targets.radius_m):
         over = effect("target_size", "over_surfaces")
-    found = []
+    found, n_paths = [], 0
     for first in firsts:
         for second in seconds:
             chosen = np.flatnonzero(first.exists & second.exists)
             if len(chosen) and len(first.mirrors) + len(second.mirrors) <= shot.scene.max_reflections:
+                n_paths += len(chosen)
+                require_few_paths(n_paths)
+                require_few_amplitudes(n_paths, len(shot.channels), n_frequencies)
                 found.append(over(first, second, shot.targets, chosen))
     here = np.arange(1)
     return found + [

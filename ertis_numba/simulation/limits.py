@@ -10,28 +10,37 @@ from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["exceeded", "require_clear"]
+__all__ = ["notes", "require_clear"]
 
 _MIN_DISTANCE_M = 1e-3
 
 
-def exceeded(shot: Snapshot) -> list[str]:
-    """Return a note for each target that is too near for its model."""
-    return [*_on_sensor(shot), *near_discs(shot)]
+def notes(shot: Snapshot) -> list[str]:
+    """Return a note for each target or source that is too near for its model."""
+    return [*_near_targets(shot), *_near_discs(shot)]
 
 
-def _on_sensor(shot: Snapshot) -> list[str]:
-    """Return a note for each point or sphere that touches the sensor, whose echo has no meaningful level."""
+def _near_targets(shot: Snapshot) -> list[str]:
+    """Return a note for each target or source so near an emitter or a microphone that amplitudes no longer grow."""
+    scene, sensor = shot.scene, shot.sensor
+    ends_m = np.concatenate([shot.ear.positions_m, shot.mouth.position_m[None]])
     targets = shot.targets
-    apart_m = np.linalg.norm(targets.positions_m - shot.ear.centre_m, axis=1) - targets.radius_m
-    return [
-        f"{targets.names[k]} is {'on' if apart_m[k] >= 0 else 'around'} sensor {shot.sensor.name}, within "
-        f"{NEAREST_M:g} m; its echo hides all others. Move one of the two"
-        for k in np.flatnonzero(apart_m < NEAREST_M)
-    ]
+    things = [(name, place) for name, place in zip(targets.names, targets.positions_m, strict=True)]
+    for kind in ("tones", "noises", "sonars"):
+        sources = enumerate(getattr(scene, kind))
+        things += [(f"{kind}[{number}]", source.position_at(shot.time_s)) for number, source in sources]
+    found = []
+    for name, place in things:
+        apart_m = float(np.min(np.linalg.norm(ends_m - place, axis=1)))
+        if apart_m < NEAREST_M:
+            found.append(
+                f"{name} is {1e3 * apart_m:.2g} mm from an emitter or a microphone of {sensor.name} at "
+                f"{shot.time_s:.3g} s; its level is that at {1e3 * NEAREST_M:g} mm. Move it away from the sensor"
+            )
+    return found
 
 
-def near_discs(shot: Snapshot) -> list[str]:
+def _near_discs(shot: Snapshot) -> list[str]:
     """Return a note for each disc too near for Fresnel's approximation.
 
     The next term, a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a, must not exceed an eighth of a turn.

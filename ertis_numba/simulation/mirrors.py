@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.bounds import require_few_mirrors
 from ertis_numba.simulation.snapshot import Ear, Mirror, Mouth
 
 __all__ = ["Seen", "blocked", "images", "reflected"]
@@ -62,8 +63,14 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
     places_m : (place, axis) float64
     mirrors : sequence of Mirror
     most : int
+
+    Raises
+    ------
+    ArgumentError
+        There are too many chains of walls.
     """
     n_places = len(places_m)
+    require_few_mirrors(len(mirrors), most, n_places)
     straight = np.stack([np.broadcast_to(_position(end), places_m.shape), places_m])
     found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
     chains: list[_Chain] = [((), (end,))]

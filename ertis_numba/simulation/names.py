@@ -2,7 +2,7 @@
 
 from typing import Final
 
-__all__ = ["EFFECTS", "INDISPENSABLE"]
+__all__ = ["ASKED_FOR", "EFFECTS", "INDISPENSABLE"]
 
 EFFECTS: Final = {
     "propagation": "sound takes its time, to any part of a sample",
@@ -34,3 +34,21 @@ INDISPENSABLE: Final = {
     "modulation": "a recording holds bits or numbers",
 }
 """Effects of every scene, and why."""
+
+ASKED_FOR: Final = frozenset(
+    {
+        "emitter_offset",
+        "clock_drift",
+        "emitter_response",
+        "emitter_directivity",
+        "microphone_directivity",
+        "direct_sound",
+        "interference",
+        "ambient_noise",
+        "microphone_noise",
+        "microphone_spread",
+        "microphone_faults",
+    }
+)
+"""Effects of which a scene has none unless a key asks for it, such as ``electronics.noise_dbfs``. They are simulated
+even where no image shows them, because recordings do."""

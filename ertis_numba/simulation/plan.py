@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ertis_numba.simulation.limits import exceeded, require_clear
+from ertis_numba.simulation import limits
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
-from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.names import ASKED_FOR, EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import Sight
@@ -39,7 +39,8 @@ class Verdict:
     estimate_db : float or None
         By how much it changes the image; None where it cannot be left out or finds nothing to act upon.
     forced : bool
-        The scene decides, whatever the estimate.
+        The scene decides, whatever the estimate: by ``effects``, by a key that asks for the effect, or by a tolerance
+        of 0.
     rehearsed : bool
         The estimate was too close to the tolerance, so two renderings were compared: their change stands for it.
     coupled : bool
@@ -74,12 +75,20 @@ class Plan:
         """The effects that are on."""
         return frozenset(verdict.name for verdict in self.verdicts if verdict.on)
 
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The effects that are off, although they change the image."""
+        return tuple(verdict.name for verdict in self.verdicts if not verdict.on and verdict.estimate_db)
+
 
 def make_plan(scene: Scene) -> Plan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    All sensors are asked, at the beginning, at the end, in between and at way points; the greatest change
-    counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
+    Effects that the scene asks for by a key of their own are on, see `names.ASKED_FOR`; with a tolerance of 0, so are
+    all on which the scene has something to act.
+
+    For the others, all sensors are asked, at the beginning, at the end, in between and at way points; the greatest
+    change counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
     what filters echoes, then what adds to them; and again in the light of all others, until nothing changes. Where
     an estimate is not certain enough, the measurements with the greatest estimates are rendered and processed with the
     effect and without. So is the loudest measurement, because estimates do not model converters.
@@ -87,8 +96,8 @@ def make_plan(scene: Scene) -> Plan:
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
     for _, shot in shots:
-        require_clear(shot)
-    notes = tuple(dict.fromkeys(note for _, shot in shots for note in exceeded(shot)))
+        limits.require_clear(shot)
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in limits.notes(shot)))
     verdicts: dict[str, Verdict] = {}
     rehearse = functools.cache(lambda: _rehearsals(scene))
     rounds = [_active(verdicts)]
@@ -139,10 +148,13 @@ def _decided(
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     forced = scene.effects.get(name)
+    if forced is None and (name in ASKED_FOR or not scene.tolerance_db):
+        forced = True
     estimates = _estimates(name, others, shots)
     if not estimates:
         reason = f"the scene has nothing for it: {EFFECTS[name]}"
-        return Verdict(name=name, on=bool(forced), reason=reason, forced=forced is not None)
+        given = scene.effects.get(name)
+        return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
     worst = estimates[0][0]
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)

@@ -8,7 +8,9 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.loudness import LOUD
@@ -23,6 +25,7 @@ __all__ = ["Rehearsal", "image_change_db"]
 Image = NDArray[np.float32]
 
 _KEPT = 24  # images: most verdicts are about the same effects with one more or less
+_KEPT_BYTES = 2**28  # of images, of which large grids have few
 
 
 class Rehearsal:
@@ -39,8 +42,9 @@ class Rehearsal:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._signals = functools.lru_cache(maxsize=2)(self._rendered)
-        self._image = functools.lru_cache(maxsize=_KEPT)(self._imaged)
-        self._images = functools.lru_cache(maxsize=_KEPT)(self._converted)
+        kept = min(_KEPT, max(2, _KEPT_BYTES // max(_image_bytes(sensor.settings()) for sensor in scene.sensors)))
+        self._image = functools.lru_cache(maxsize=kept)(self._imaged)
+        self._images = functools.lru_cache(maxsize=max(2, kept // 2))(self._converted)
         self._chain = functools.lru_cache(maxsize=8)(_chain)
         # All renderings have the same noise, which takes as long as the rest of one.
         self._noise = functools.lru_cache(maxsize=1)(_noise)
@@ -140,6 +144,13 @@ def _local(image: Image, spacing_m: float) -> Image:
     strongest = image.max(axis=0)
     near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(strongest))) + 1
     return np.asarray(scipy.ndimage.maximum_filter1d(strongest, near))
+
+
+def _image_bytes(settings: Settings) -> int:
+    """Return the size of an image, about."""
+    range_rate_m = 2 * settings.output_rate_hz / sound_speed_m_s(settings.air)
+    n_ranges = np.ptp(settings.processing.range_m) * range_rate_m + 1
+    return int(4 * len(direction_grid(settings.processing).azimuth_rad) * n_ranges)
 
 
 def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class Scene(Document, frozen=True, kw_only=True):
     sync_every : int
         Measurements from one SYNC to the next; between SYNCs, sample clocks are not synchronised.
     tolerance_db : float
-        Effects that change no image by more are left out.
+        Effects that change no image by more are left out, unless a key of the scene asks for them; 0 keeps all.
     max_reflections : int
         Walls that a sound may meet on its way.
     effects : dict of str to bool
@@ -77,7 +77,7 @@ class Scene(Document, frozen=True, kw_only=True):
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
         checks.whole("count", self.count, 1, 10**9)
         checks.whole("sync_every", self.sync_every, 1, 10**9)
-        checks.between("tolerance_db", self.tolerance_db, 1e-6, 60.0)
+        checks.between("tolerance_db", self.tolerance_db, 0.0, 60.0)
         checks.whole("max_reflections", self.max_reflections, 0, _MOST_REFLECTIONS)
         for name, wanted in self.effects.items():
             checks.choice("effect", name, EFFECTS)
@@ -125,9 +125,15 @@ class Scene(Document, frozen=True, kw_only=True):
         return self.sensors[0 if name is None else names.index(name)]
 
     def with_files_of(self, folder: Path) -> Self:
-        """Return a scene that depends on no layout file; those it names are looked for in ``folder``, as are grids."""
+        """Return a scene that depends on no file of a layout or a call; those it names are looked for in ``folder``.
+
+        So are files of directions.
+        """
         sensors = [sensor.beside(folder) for sensor in self.sensors]
-        return self.replace(sensors=tuple(sensor.replace(array=_read(sensor.array)) for sensor in sensors))
+        return self.replace(
+            sensors=tuple(sensor.replace(array=_read(sensor.array)) for sensor in sensors),
+            sonars=tuple(sonar.replace(call=sonar.call.beside(folder)) for sonar in self.sonars),
+        )
 
 
 def _read(array: Array) -> Array:

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -29,6 +29,7 @@ _SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among sid
 _ACROSS = 8192
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
+_TABLE_SIZE = 2**21  # numbers that a table of paths by paths has in memory at a time
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by their root mean square
 SAME_RANGE_M = 0.05
 """Echoes so close in range count as at the same range."""
@@ -191,10 +192,13 @@ class Sight:
         if after is not None:
             level = np.minimum(level, self.levels(after))
             floor = max(float(np.min(level[self.shown], initial=floor)), self.noise)
-        first_s, last_s = self._window_s()
-        apart_s = np.abs(np.clip(delay_s, first_s, last_s)[:, None] - self.heard.delay_s)
-        apart_s = np.maximum(apart_s - 2 * SAME_RANGE_M / self.shot.speed_m_s, 0.0)
-        return np.asarray(np.maximum(np.max(level * self._lobe(apart_s), axis=1, initial=0.0), floor))
+        inside_s = np.clip(delay_s, *self._window_s())
+        strongest = np.zeros(len(delay_s))
+        for part in _parts(len(delay_s), len(level)):
+            apart_s = np.abs(inside_s[part, None] - self.heard.delay_s)
+            apart_s = np.maximum(apart_s - 2 * SAME_RANGE_M / self.shot.speed_m_s, 0.0)
+            strongest[part] = np.max(level * self._lobe(apart_s), axis=1, initial=0.0)
+        return np.asarray(np.maximum(strongest, floor))
 
     @functools.cached_property
     def quietest(self) -> float:
@@ -214,8 +218,11 @@ class Sight:
         """Return how much of a wave from a direction the best beam takes: (path,) float64, at most 1."""
         wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
         beams = np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
-        waves = np.exp(1j * wave * (direction @ self._positions_m.T))
-        return np.asarray(np.max(np.abs(beams @ waves.T), axis=0, initial=0.0) / len(self._positions_m))
+        taken = np.zeros(len(direction))
+        for part in _parts(len(direction), max(beams.shape)):
+            waves = np.exp(1j * wave * (direction[part] @ self._positions_m.T))
+            taken[part] = np.max(np.abs(beams @ waves.T), axis=0, initial=0.0)
+        return taken / len(self._positions_m)
 
     def of_white_noise(
         self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
@@ -334,17 +341,25 @@ class Sight:
 
     def _met(self, seen: Echoes) -> Floats:
         """Return the strongest that paths and side lobes of others have in one place: (path,) float64."""
-        level, others = self.levels(seen)[:, None], self.levels(self.heard)
-        apart_s = np.abs(seen.delay_s[:, None] - self.heard.delay_s)
-        lobes = self._lobe(apart_s)
-        same = (apart_s == 0) & np.all(seen.direction[:, None] == self.heard.direction, axis=-1)
-        met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level, others) * lobes)
-        return np.asarray(np.max(met, axis=1, initial=0.0))
+        level, others = self.levels(seen), self.levels(self.heard)
+        strongest = np.zeros(len(level))
+        for part in _parts(len(level), 3 * len(others)):
+            apart_s = np.abs(seen.delay_s[part, None] - self.heard.delay_s)
+            same = (apart_s == 0) & np.all(seen.direction[part, None] == self.heard.direction, axis=-1)
+            met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level[part, None], others) * self._lobe(apart_s))
+            strongest[part] = np.max(met, axis=1, initial=0.0)
+        return strongest
 
 
 def change_db(part: Floats, beside: Floats) -> float:
     """Return by how many decibels amplitudes change others at the most, 0 where there are none."""
     return float(20 * np.log10(1 + np.max(part / beside, initial=0.0)))
+
+
+def _parts(n_rows: int, n_columns: int) -> Iterator[slice]:
+    """Yield the rows of a table in parts that fit into memory."""
+    rows = max(1, _TABLE_SIZE // max(1, n_columns))
+    return (slice(first, first + rows) for first in range(0, n_rows, rows))
 
 
 @functools.lru_cache(maxsize=16)

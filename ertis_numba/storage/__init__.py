@@ -15,7 +15,7 @@ from ertis_numba.storage.recording import (
     open_recording,
     write_recording,
 )
-from ertis_numba.storage.truth import Truth
+from ertis_numba.storage.truth import Truth, TruthLog
 
 __all__ = [
     "EnergyscapeReader",
@@ -24,6 +24,7 @@ __all__ = [
     "RecordingReader",
     "RecordingWriter",
     "Truth",
+    "TruthLog",
     "check_target",
     "file_kind",
     "open_energyscapes",

@@ -28,7 +28,7 @@ from ertis_numba.storage.schema import (
     sensor_path,
     software_versions,
 )
-from ertis_numba.storage.truth import Truth, write_truth
+from ertis_numba.storage.truth import Truth, TruthLog, write_truth
 
 __all__ = ["Writer"]
 
@@ -48,7 +48,12 @@ class Writer(ABC, Generic[Item]):
     _part_token: ClassVar[str | None] = None
 
     def __init__(
-        self, path: str | Path, *, overwrite: bool, attributes: Mapping[str, str], truth: Mapping[str, Truth] | None
+        self,
+        path: str | Path,
+        *,
+        overwrite: bool,
+        attributes: Mapping[str, str],
+        truth: Mapping[str, Truth | TruthLog] | None,
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
@@ -74,7 +79,7 @@ class Writer(ABC, Generic[Item]):
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write what is known at the end only."""
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | None:  # noqa: ARG002  what overrides it needs both
+    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  what overrides it needs both
         """Return what the rows of a sensor should show, where it is known."""
         return self._truth.get(sensor)
 

@@ -23,7 +23,7 @@ from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
-from ertis_numba.storage.truth import Truth
+from ertis_numba.storage.truth import Truth, TruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
@@ -151,7 +151,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         super()._finish(file)
         self._require_sensors("mounting", self._given)
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | None:
+    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:
         given = super()._truth_of(sensor, group)
         if given is not None or sensor not in self._recorded:
             return given

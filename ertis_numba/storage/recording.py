@@ -22,7 +22,7 @@ from ertis_numba.storage._reader import Reader, plain
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out
-from ertis_numba.storage.truth import Truth
+from ertis_numba.storage.truth import Truth, TruthLog
 from ertis_numba.waveform import call_samples
 from ertis_numba.words import WordFormat, word_format
 
@@ -70,8 +70,8 @@ class RecordingWriter(Writer[Measurement]):
         Replace a file of this name.
     source : str
         Where the measurements come from.
-    truth : mapping of str to Truth, optional
-        What each simulated sensor should show, by its name.
+    truth : mapping of str to Truth or TruthLog, optional
+        What each simulated sensor should show, by its name. A log may grow while measurements are written.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Where each sensor is and how it is turned, by its name: x, y, z in metres, and the unit
         quaternion x, y, z, w that turns the sensor frame into that of the surroundings. Unknown by default.
@@ -91,7 +91,7 @@ class RecordingWriter(Writer[Measurement]):
         settings: Settings | None = None,
         overwrite: bool = False,
         source: str = "",
-        truth: Mapping[str, Truth] | None = None,
+        truth: Mapping[str, Truth | TruthLog] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
         firmware: Mapping[str, str] | None = None,
     ) -> None:
@@ -343,7 +343,7 @@ def write_recording(
     settings: Settings | None = None,
     overwrite: bool = False,
     source: str = "",
-    truth: Mapping[str, Truth] | None = None,
+    truth: Mapping[str, Truth | TruthLog] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
 ) -> Path:
     """Write measurements as they come and return the path; the arguments are those of `RecordingWriter`.

@@ -46,6 +46,7 @@ CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
 _TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
 _COLUMN_TEXT_BYTES: Final = 64
 _MOST_CHUNK_BYTES: Final = 2**32 - 1
+_DIGEST_ITEMS: Final = 2**20
 _UNLIMITED: Final = ("time", "gap")
 
 
@@ -245,8 +246,14 @@ def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
 def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable]) -> None:
     for variable in table:
         if variable.dtype and (variable.name in group or not variable.optional):
-            values = np.asarray(group[variable.name][()])
-            digest.update(variable.name.encode() + values.tobytes())
+            dataset = group[variable.name]
+            digest.update(variable.name.encode())
+            # In parts: the truth of many measurements with many reflectors exceeds the memory.
+            rows = max(1, _DIGEST_ITEMS // max(1, math.prod(dataset.shape[1:])))
+            for first in range(0, dataset.shape[0], rows) if dataset.shape else ():
+                digest.update(np.asarray(dataset[first : first + rows]).tobytes())
+            if not dataset.shape:
+                digest.update(np.asarray(dataset[()]).tobytes())
 
 
 def content_uuid(contents: Mapping[str, str]) -> str:

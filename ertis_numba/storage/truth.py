@@ -1,18 +1,23 @@
 """What a simulated sensor should show."""
 
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.atomic import remedy
+from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.storage.schema import TRUTH, describe, lay_out, text_type
 
-__all__ = ["Truth", "read_truth", "write_truth"]
+__all__ = ["Truth", "TruthLog", "read_truth", "write_truth"]
 
 _FIELDS = {
     "azimuth": "azimuth_deg",
@@ -24,6 +29,11 @@ _FIELDS = {
 _TEXTS = ("name", "emitter")
 _ANGLES = ("azimuth", "elevation")  # radians in the file, as its other angles
 _MOST_SEED = 2**63 - 1  # what an attribute holds
+_BLOCK_ROWS = 512  # measurements whose reflectors are in memory at a time
+_RECORD = np.dtype(
+    [("row", "<i8"), ("target", "<i4"), *((name, "<i4") for name in _TEXTS)]
+    + [(name, "<f8", 3 if name == "velocity" else ()) for name in _FIELDS]
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,11 +47,14 @@ class Truth:
     seed : int
     reflectors : tuple of tuple of Reflector
         Those of each measurement, the strongest first.
+    left_out : tuple of str
+        Effects that were not simulated, although they change the image a little.
     """
 
     scene: str
     seed: int
     reflectors: tuple[tuple[Reflector, ...], ...]
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         checks.whole("seed", self.seed, 0, _MOST_SEED)
@@ -49,7 +62,112 @@ class Truth:
             checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
 
 
-def write_truth(group: h5py.Group, truth: Truth, n_measurements: int) -> None:
+class TruthLog:
+    """Truth that grows measurement by measurement, in a temporary file; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    scene : str
+        The scene as TOML.
+    seed : int
+    left_out : tuple of str
+        Effects that were not simulated, although they change the image a little.
+    folder : Path, optional
+        Folder of the temporary file, which has no name and goes with the process; the system's own by default.
+    """
+
+    def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
+        self.scene = scene
+        self.seed = checks.whole("seed", seed, 0, _MOST_SEED)
+        self.left_out = left_out
+        self._texts: dict[str, dict[str, int]] = {field: {} for field in _TEXTS}
+        self._rows = 0
+        self._most_targets = 0
+        self._most_own = 0
+        self._last: tuple[Sequence[Reflector], NDArray[Any]] = ((), np.zeros(0, _RECORD))
+        self._waiting: list[NDArray[Any]] = []
+        self._block_sizes: list[int] = []
+        self._folder = folder or Path(tempfile.gettempdir())
+        with self._naming_folder():
+            self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  closed on exit
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):  # of a full disk, which has been reported
+            self._file.close()
+
+    def __len__(self) -> int:
+        return self._rows
+
+    @property
+    def n_targets(self) -> int:
+        """The largest number of reflectors of a measurement."""
+        return self._most_targets
+
+    @property
+    def n_own_targets(self) -> int:
+        """The largest number of reflectors of a measurement that return the sensor's own call."""
+        return self._most_own
+
+    def texts(self, field: str) -> list[bytes]:
+        """Return the values of a text field of reflectors, by the number that records hold."""
+        return [text.encode() for text in self._texts[field]]
+
+    def append(self, reflectors: Sequence[Reflector]) -> None:
+        """Add the reflectors of the next measurement, the strongest first."""
+        if reflectors is not self._last[0]:  # a scene at rest gives the same again and again
+            self._last = reflectors, self._encoded(reflectors)
+        records = self._last[1].copy()
+        records["row"] = self._rows
+        self._waiting.append(records)
+        self._rows += 1
+        self._most_targets = max(self._most_targets, len(records))
+        self._most_own = max(self._most_own, sum(not each.emitter for each in reflectors))
+        if self._rows % _BLOCK_ROWS == 0:
+            self._flush()
+
+    def _encoded(self, reflectors: Sequence[Reflector]) -> NDArray[Any]:
+        columns = _columns((reflectors,))
+        records = np.zeros(len(reflectors), _RECORD)
+        records["target"] = np.arange(len(reflectors))
+        for field, numbers in self._texts.items():
+            records[field] = [numbers.setdefault(getattr(each, field), len(numbers)) for each in reflectors]
+        for name, values in columns.items():
+            checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
+            records[name] = values
+        return records
+
+    def _flush(self) -> None:
+        if self._waiting:
+            records = np.concatenate(self._waiting)
+            with self._naming_folder():
+                self._file.write(records.tobytes())
+                self._file.flush()
+            self._block_sizes.append(records.nbytes)
+            self._waiting.clear()
+
+    @contextmanager
+    def _naming_folder(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DataError(
+                f"{self._folder}: a temporary file cannot be written ({error.strerror}); {remedy(error)}"
+            ) from error
+
+    def blocks(self) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the rows of each block of measurements, and the records of their reflectors."""
+        self._flush()
+        self._file.seek(0)
+        for number, n_bytes in enumerate(self._block_sizes):
+            first = number * _BLOCK_ROWS
+            records = np.frombuffer(self._file.read(n_bytes), _RECORD)
+            yield slice(first, min(first + _BLOCK_ROWS, self._rows)), records
+
+
+def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int) -> None:
     """Write what a sensor should show into its group.
 
     Raises
@@ -57,27 +175,37 @@ def write_truth(group: h5py.Group, truth: Truth, n_measurements: int) -> None:
     ArgumentError
         The truth is about another number of measurements.
     """
-    reflectors = truth.reflectors
-    if len(reflectors) != n_measurements:
+    if isinstance(truth, Truth):
+        with TruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
+            for reflectors in truth.reflectors:
+                log.append(reflectors)
+            write_truth(group, log, n_measurements)
+        return
+    if len(truth) != n_measurements:
         raise ArgumentError(
-            f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(reflectors)} measurements, "
+            f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(truth)} measurements, "
             f"the file holds {n_measurements}; give the reflectors of each"
         )
-    flat = [reflector for row in reflectors for reflector in row]
-    texts = {field: [getattr(reflector, field).encode() for reflector in flat] for field in _TEXTS}
+    texts = {field: truth.texts(field) for field in _TEXTS}
     if not any(texts["emitter"]):  # files of a single sensor are the same as ever
         del texts["emitter"]
     kinds: dict[str, Any] = {field: text_type(max(map(len, column), default=0)) for field, column in texts.items()}
-    sizes = {"measurement": n_measurements, "target": max(map(len, reflectors)), "axis": 3}
+    sizes = {"measurement": n_measurements, "target": truth.n_targets, "axis": 3}
     made = group.create_group("truth", track_order=True)
     table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
     lay_out(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
-    describe(made, {"seed": truth.seed})
-    given = _given(reflectors, sizes["target"])
-    for field, column in texts.items():
-        _fill(made[field], given, np.array(column, dtype=kinds[field]), b"")
-    for name, values in _columns(reflectors).items():
-        _fill(made[name], given, values, np.nan)
+    describe(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
+    if not truth.n_targets:  # HDF5 has no room, and needs none, for nothing
+        return
+    columns = {field: np.array(column, dtype=kinds[field]) for field, column in texts.items()}
+    for rows, records in truth.blocks():
+        place = records["row"] - rows.start, records["target"]
+        for name in (*columns, *_FIELDS):
+            dataset = made[name]
+            missing: object = b"" if name in columns else np.nan
+            whole = np.full((rows.stop - rows.start, *dataset.shape[1:]), missing, dtype=dataset.dtype)
+            whole[place] = columns[name][records[name]] if name in columns else records[name]
+            dataset[rows] = whole
 
 
 def read_truth(group: h5py.Group) -> Truth | None:
@@ -104,10 +232,16 @@ def read_truth(group: h5py.Group) -> Truth | None:
                 for target in range(n_targets)
             )
         )
-    return Truth(scene=group["scene"][()].decode(), seed=int(group.attrs["seed"]), reflectors=tuple(rows))
+    left_out = group.attrs.get("effects_left_out", b"")  # of older files, unknown
+    return Truth(
+        scene=group["scene"][()].decode(),
+        seed=int(group.attrs["seed"]),
+        reflectors=tuple(rows),
+        left_out=tuple(bytes(left_out).decode().split()),
+    )
 
 
-def _columns(reflectors: tuple[tuple[Reflector, ...], ...]) -> dict[str, NDArray[np.float64]]:
+def _columns(reflectors: Sequence[Sequence[Reflector]]) -> dict[str, NDArray[np.float64]]:
     """Return the numbers of all reflectors, one measurement after the other: (reflector,) or (reflector, axis)."""
     flat = [reflector for row in reflectors for reflector in row]
     columns = {
@@ -116,16 +250,3 @@ def _columns(reflectors: tuple[tuple[Reflector, ...], ...]) -> dict[str, NDArray
     }
     columns["velocity"] = columns["velocity"].reshape(-1, 3)
     return columns | {name: np.radians(columns[name]) for name in _ANGLES}
-
-
-def _given(reflectors: tuple[tuple[Reflector, ...], ...], n_targets: int) -> NDArray[np.bool_]:
-    """Return where a measurement has a reflector: (measurement, target)."""
-    counts = np.array([len(row) for row in reflectors])
-    return np.asarray(np.arange(n_targets) < counts[:, None])
-
-
-def _fill(dataset: h5py.Dataset, given: NDArray[np.bool_], values: NDArray[Any], missing: object) -> None:
-    whole = np.full(dataset.shape, missing, dtype=dataset.dtype)
-    whole[given] = values
-    if whole.size:  # HDF5 has no room, and needs none, for nothing
-        dataset[...] = whole

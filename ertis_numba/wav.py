@@ -1,4 +1,4 @@
-"""WAV files of many channels: what they say of themselves, and their numbers."""
+"""WAV files: checks of their headers, and their numbers."""
 
 import struct
 import warnings

@@ -1,0 +1,129 @@
+"""Own waveforms of the call: samples, from settings or from files."""
+
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError, SettingsError
+from ertis_numba.wav import read_wav
+
+__all__ = ["MAX_WAVEFORM_SAMPLES", "WAVEFORM_FILES", "band_hz", "normalised", "read_waveform"]
+
+MAX_WAVEFORM_SAMPLES = 4096
+"""Limit on the samples of an own waveform, 9 ms at 450 kHz: settings that hold them and 1024 microphones stay within
+`Settings.max_bytes`."""
+WAVEFORM_FILES = {".wav", ".csv", ".npy"}
+_MAX_FILE_BYTES = 2**22
+_DIGITS = 7  # of a sample in settings: 20 dB below the rounding of a converter of 20 bits
+_IN_BAND = 0.1  # of the top of the spectrum
+_STEP_HZ = 100.0  # to which edges are rounded, so that they do not depend on the last digits of a transform
+
+
+def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
+    """Return the samples in a file, and their rate where the file holds it.
+
+    Parameters
+    ----------
+    path : Path
+        WAV of one channel, CSV with one number per line or cell, or NPY with a one-dimensional array.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read, or holds something else.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in WAVEFORM_FILES:
+        raise SettingsError(f"call.waveform is {str(path)!r}; give a .wav, .csv or .npy file, or a list of samples")
+    try:
+        if not path.is_file():
+            raise SettingsError(f"call.waveform {path}: no such file; give the name of a .wav, .csv or .npy file")
+        n_bytes = path.stat().st_size
+        if n_bytes > _MAX_FILE_BYTES:
+            raise SettingsError(f"call.waveform {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
+        rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _numbers(path, suffix))
+    except (OSError, ValueError, DataError) as error:
+        if isinstance(error, SettingsError):
+            raise
+        raise SettingsError(f"call.waveform {path} cannot be read ({error}); save it again") from error
+    if values.ndim > 1 and suffix == ".csv" and 1 in values.shape:
+        values = values.reshape(-1)
+    if values.ndim > 1 and values.shape[1] == 1:
+        values = values[:, 0]
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise SettingsError(
+            f"call.waveform {path} holds {values.dtype} of shape {values.shape}; give one channel of real numbers"
+        )
+    # Unsigned bytes are the only numbers of WAV whose silence is not 0.
+    middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0
+    return tuple((values.astype(np.float64) - middle).tolist()), rate_hz
+
+
+def _numbers(path: Path, suffix: str) -> NDArray[Any]:
+    if suffix == ".npy":
+        return np.asarray(np.load(path, allow_pickle=False))
+    lines = (line.split("#", 1)[0].strip() for line in path.read_text("utf-8-sig").splitlines())
+    return np.array([[float(cell) for cell in line.split(",")] for line in lines if line], dtype=np.float64)
+
+
+def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
+    """Return samples scaled to a peak of 1, with seven decimals.
+
+    Raises
+    ------
+    ArgumentError
+        There are too few or too many, one is not finite, or all are 0.
+    """
+    least = 16
+    if not least <= len(samples) <= MAX_WAVEFORM_SAMPLES:
+        raise ArgumentError(
+            f"call.waveform has {len(samples)} samples; give {least} to {MAX_WAVEFORM_SAMPLES}, at "
+            f"{rate_hz:g} Hz {1e3 * (MAX_WAVEFORM_SAMPLES - 1) / rate_hz:.3g} ms at most"
+        )
+    values = np.array(samples, dtype=np.float64)
+    checks.finite_array("call.waveform", values)
+    peak = float(np.abs(values).max())
+    if not peak:
+        raise ArgumentError("call.waveform is silent; give samples other than 0")
+    return tuple(np.round(values / peak, _DIGITS).tolist())
+
+
+@functools.lru_cache(maxsize=16)
+def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
+    """Return the edges of a waveform's band, in the order in which it sweeps over them.
+
+    The band is that in which the spectrum lies less than 20 dB below its top.
+
+    Raises
+    ------
+    ArgumentError
+        The band reaches 0 Hz or half of the sample rate.
+    """
+    n_fft = 2 ** math.ceil(math.log2(16 * len(samples)))
+    spectrum = np.abs(np.fft.rfft(samples, n_fft))
+    strong = np.flatnonzero(spectrum >= _IN_BAND * spectrum.max()) * (rate_hz / n_fft)
+    low_hz = math.floor(strong[0] / _STEP_HZ) * _STEP_HZ
+    high_hz = math.ceil(strong[-1] / _STEP_HZ) * _STEP_HZ
+    if low_hz <= 0:
+        raise ArgumentError(
+            "call.waveform has a band that reaches 0 Hz; subtract its mean, and remove what lies below the call"
+        )
+    if high_hz >= rate_hz / 2:
+        raise ArgumentError(
+            f"call.waveform has a band that reaches half of its sample rate of {rate_hz:g} Hz; sample it faster, or "
+            "correct call.sample_rate_hz"
+        )
+    half = len(samples) // 2
+    falls = _centroid(samples[:half], n_fft) >= _centroid(samples[half:], n_fft)
+    return (high_hz, low_hz) if falls else (low_hz, high_hz)
+
+
+def _centroid(samples: tuple[float, ...], n_fft: int) -> float:
+    """Return the mean frequency of samples in bins, weighted by power."""
+    power = np.abs(np.fft.rfft(samples, n_fft)) ** 2
+    return float(np.arange(len(power)) @ power / max(power.sum(), 1e-300))

@@ -1,0 +1,67 @@
+"""Bounds on the size of a scene."""
+
+from ertis_numba.errors import ArgumentError
+
+__all__ = [
+    "MAX_AMPLITUDES",
+    "MAX_MIRROR_POINTS",
+    "MAX_PATHS",
+    "require_few_amplitudes",
+    "require_few_mirrors",
+    "require_few_paths",
+]
+
+MAX_PATHS = 20_000
+"""Limit on the ways of the sound to one sensor in one measurement: times of estimates grow with the square."""
+MAX_MIRROR_POINTS = 2**21
+"""Limit on chains of walls, times the targets whose mirror points they have: 300 MB with four reflections."""
+MAX_AMPLITUDES = 2**26
+"""Limit on paths, times microphones, times frequencies: about 2 GB while they are computed."""
+
+
+def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
+    """Refuse a scene of which the mirror images would exceed the memory.
+
+    Raises
+    ------
+    ArgumentError
+        There are more chains of walls, times places, than `MAX_MIRROR_POINTS`.
+    """
+    n_chains = sum(n_walls * (n_walls - 1) ** k for k in range(order)) if n_walls else 0
+    if n_chains * n_places > MAX_MIRROR_POINTS:
+        raise ArgumentError(
+            f"scene has {n_chains * n_places} mirror points, of {n_walls} walls (6 of each box), {n_places} targets "
+            f"and max_reflections {order}; the limit is {MAX_MIRROR_POINTS}. Lower max_reflections, or give fewer "
+            "walls or targets"
+        )
+
+
+def require_few_paths(n_paths: int) -> None:
+    """Refuse a scene of which the estimates would take too long.
+
+    Raises
+    ------
+    ArgumentError
+        There are more paths than `MAX_PATHS`.
+    """
+    if n_paths > MAX_PATHS:
+        raise ArgumentError(
+            f"scene has more than {MAX_PATHS} ways of the sound to one sensor, which is the limit (got {n_paths} so "
+            "far). Lower max_reflections, or give fewer targets or walls"
+        )
+
+
+def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> None:
+    """Refuse a scene of which one measurement would exceed the memory.
+
+    Raises
+    ------
+    ArgumentError
+        There are more amplitudes than `MAX_AMPLITUDES`.
+    """
+    if n_paths * n_mics * n_frequencies > MAX_AMPLITUDES:
+        raise ArgumentError(
+            f"scene has {n_paths} ways of the sound to {n_mics} microphones at {n_frequencies} frequencies, "
+            f"{n_paths * n_mics * n_frequencies} amplitudes; the limit is {MAX_AMPLITUDES}. Lower max_reflections, or "
+            "give fewer targets, walls or microphones"
+        )
