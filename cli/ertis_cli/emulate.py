@@ -184,7 +184,7 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
 def _staged(path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool) -> "Stage":
     """Return the scene, ready to be rendered; the first run compiles kernels."""
     from ertis_cli._emulation import Stage
-    from ertis_numba.simulation import load_scene
+    from ertis_numba.simulation import limits, load_scene
     from ertis_numba.simulation.snapshot import snapshot
 
     changes = {"count": count, "seed": seed}
