@@ -75,6 +75,30 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "rec.h5.journal-wal.damaged"]
 
 
+def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
+    earlier = tmp_path / "rec.h5.journal-wal.damaged"
+    earlier.write_bytes(b"of another journal")
+    copies = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = crashed(folder, entries(COUNT, seed=number))
+        flip(log_of(path), log_of(path).stat().st_size // 2)
+        copies.append(log_of(path).read_bytes())
+        for _ in range(2):  # the same damage is kept once
+            for item in folder.iterdir():
+                shutil.copy(item, tmp_path)
+            Journal.open(tmp_path / path.name).close()
+            for end in ("", "-wal", TALLY):
+                (tmp_path / f"{path.name}{end}").unlink(missing_ok=True)
+    kept = {item.name: item.read_bytes() for item in tmp_path.glob("*.damaged")}
+    assert kept == {
+        earlier.name: b"of another journal",
+        "rec.h5.journal-wal.2.damaged": copies[0],
+        "rec.h5.journal-wal.3.damaged": copies[1],
+    }
+
+
 def test_damaged_last_commit_is_noticed_by_the_tally(tmp_path):
     """After a power cut, it could not be told from one that was torn."""
     given = entries(COUNT, settings=LARGE)

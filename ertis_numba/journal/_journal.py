@@ -1,8 +1,8 @@
 """Journals: measurements as they arrive, durable one commit at a time."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
@@ -12,19 +12,17 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import _room
 from ertis_numba.journal._contents import SUFFIX, Contents
 from ertis_numba.journal._database import LOG_BYTES, Database
+from ertis_numba.journal._files import LOGS, beside, disk_errors, free_name, rename_orphans, unlink_all
 from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
 from ertis_numba.journal._log import read_log
 from ertis_numba.journal._log_choice import choose_log
 from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
 from ertis_numba.journal._rescue import rescue
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
-from ertis_numba.journal._tally import TALLY, Tally
+from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings
 
 __all__ = ["SUFFIX", "Journal"]
-
-_LOGS: Final = ("-wal", "-journal")  # what SQLite may leave when it is killed, and what may be all that is left
-_NOTES: Final = ("-shm", TALLY, LIMIT)  # which mean nothing without the journal
 
 
 class Journal(Contents):
@@ -87,7 +85,7 @@ class Journal(Contents):
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a place that can be written") from error
         try:
-            remark = _clear(path)
+            remark = rename_orphans(path)
             made = cls(path, Database(path, empty=True))
             made.remark = remark
             try:
@@ -96,7 +94,7 @@ class Journal(Contents):
                 made.close()
                 raise
         except BaseException:
-            _unlink(path)
+            unlink_all(path)
             raise
         return made
 
@@ -128,7 +126,7 @@ class Journal(Contents):
             opened.tally.read(opened._identity, any_journal=is_new)
             acked = limit_of(path)
             if acked is not None:
-                with _disk_errors(path):
+                with disk_errors(path):
                     opened.tally.limit(acked)  # what is above is no loss
             damage = rescue(opened, opened._database, log)
             if damage:
@@ -163,7 +161,7 @@ class Journal(Contents):
         if acked:
             note_limit(path, acked)
             return
-        _unlink(path)
+        unlink_all(path)
         sync(path.parent)
 
     def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
@@ -180,8 +178,8 @@ class Journal(Contents):
         self._last.clear()
         self._n_entries = self._held_bytes = 0
         self._load()
-        with _disk_errors(self.path):
-            _beside(self.path, LIMIT).unlink(missing_ok=True)
+        with disk_errors(self.path):
+            beside(self.path, LIMIT).unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -351,7 +349,7 @@ class Journal(Contents):
             # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
-            with _disk_errors(self.tally.path):
+            with disk_errors(self.tally.path):
                 self.tally.discard(sensor, epoch, up_to)
             with self._database.transaction():
                 if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
@@ -428,7 +426,9 @@ class Journal(Contents):
                 with suppress(DataError):
                     self._release()
                 self.tally.close()
-                _unlink(self.path)  # the log is there where the disk was too full to take it in, and means nothing then
+                unlink_all(
+                    self.path
+                )  # the log is there where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
             sync(self.path.parent)
@@ -449,10 +449,7 @@ class Journal(Contents):
         with self._turn:
             try:
                 self._release()
-                number, aside = 1, self.path.with_name(f"{self.path.name}.{end}")
-                while aside.exists():
-                    number += 1
-                    aside = self.path.with_name(f"{self.path.name}.{number}.{end}")
+                aside = free_name(self.path, end)
                 self.tally.remove()
                 self.path.rename(aside)
             finally:
@@ -466,7 +463,7 @@ class Journal(Contents):
             is_ours = self._database.has_name
             super().close()
             # Without a log, all is in the main file, which tells itself what is damaged.
-            if is_ours and not self.damage and not any(_beside(self.path, end).exists() for end in _LOGS):
+            if is_ours and not self.damage and not any(beside(self.path, end).exists() for end in LOGS):
                 with suppress(OSError):
                     self.tally.remove()
             self.tally.close()
@@ -477,40 +474,6 @@ class Journal(Contents):
             self.close()
         else:
             self._database.leave_log()
-
-
-@contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
-    """Raise errors of the system as a `DataError` about a file."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; check the disk") from error
-
-
-def _unlink(path: Path) -> None:
-    """Remove a closed journal and the files beside it."""
-    for end in ("", *_LOGS, *_NOTES):
-        _beside(path, end).unlink(missing_ok=True)
-
-
-def _beside(path: Path, end: str) -> Path:
-    return path.with_name(f"{path.name}{end}")
-
-
-def _clear(path: Path) -> str:
-    """Rename logs of an earlier journal with this name, and return their names as one line."""
-    for end in _NOTES:
-        _beside(path, end).unlink(missing_ok=True)
-    moved = []
-    for log in (_beside(path, end) for end in _LOGS):
-        if log.exists():
-            number = 1
-            while (aside := _beside(log, f".{number}.orphaned")).exists():
-                number += 1
-            log.rename(aside)
-            moved.append(f"{log.name} had no journal and is kept as {aside.name}")
-    return "; ".join(moved)
 
 
 _INSERTION: Final = insertion("measurements")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
+from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import Log
 from ertis_numba.journal._records import Entry, Gap, Sensor, checked
 from ertis_numba.journal._tables import selection
@@ -62,11 +63,10 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
         return ""
     if not n_commits and not missing:
         return ""
-    found = None
-    aside = journal.path.with_name(f"{journal.path.name}-wal.damaged")
+    found = kept = None
     if log is not None:
         with suppress(OSError):
-            aside.write_bytes(log.content)
+            kept = keep_damaged_log(journal.path, log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
     untold = [] if found is None else _add(journal, found)
@@ -77,8 +77,8 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
             journal.note_gaps(list(_holes(journal, gap)))
         else:
             untold.append(f"{gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
-    if not (untold or missing or found is None or found.entries or found.gaps or found.lost):
-        aside.unlink(missing_ok=True)  # only rows that were deleted meanwhile
+    if kept and not (untold or missing or found is None or found.entries or found.gaps or found.lost):
+        kept.unlink(missing_ok=True)  # only rows that were deleted meanwhile
     return "; ".join(untold)
 
 
