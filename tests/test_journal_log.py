@@ -258,6 +258,31 @@ def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, pla
     assert report.measurements - len(report.damaged) >= COUNT - 1
 
 
+@pytest.mark.parametrize("place", [0.2, 0.4, 0.6])
+def test_damaged_log_does_not_ruin_a_main_file_that_has_later_pages(tmp_path, place):
+    """The log begins after a checkpoint, so its first part lacks pages that only a later commit of it changes.
+
+    Ten rows fill one page and begin the next; the last rows begin a third page, and change the root for it.
+    """
+    given = entries(18)
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    with create(tmp_path, given[:10]) as journal:
+        journal.free_log()
+        for entry in given[10:]:
+            journal.append([entry])
+        vars(journal)["_database"].execute("PRAGMA wal_checkpoint(FULL)")
+        for item in tmp_path.glob("rec*"):
+            shutil.copy(item, killed)
+    path = killed / "rec.h5.journal"
+    flip(log_of(path), int(place * log_of(path).stat().st_size))
+    with Journal.open(path) as journal:
+        assert len(journal) == len(given)
+    (report,) = verify(path)
+    assert report.measurements == len(given)
+    assert len(report.damaged) <= 1
+
+
 def test_log_without_its_journal_is_set_aside(tmp_path):
     path = crashed(tmp_path, entries(COUNT))
     log = log_of(path).read_bytes()
