@@ -58,6 +58,65 @@ def test_signal_is_not_sent_again_while_a_command_clears_up():
     assert (done.returncode, done.stdout, done.stderr) == (143, "cleared up\n", "")
 
 
+def run_command(module, number, program=""):
+    """Run the command line, which gets a signal when it imports a module."""
+    text = f"""
+import atexit, os, signal, sys, time
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.{number})
+
+sys.meta_path.insert(0, Finder())
+from ertis_cli.__main__ import main
+sys.argv = ["ertis", "devices"]
+{textwrap.dedent(program)}
+main()
+"""
+    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_signal_before_the_handlers_are_there_prints_nothing(number):
+    done = run_command("ertis_cli._signals", number)
+    assert (done.returncode, done.stderr) == (-getattr(signal, number), "")
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize("module", ["ertis_cli.main", "ertis_cli.devices"])
+def test_signal_is_not_sent_again_once_the_command_has_ended(module, number, code):
+    done = run_command(
+        module,
+        number,
+        """
+        def clear_up():
+            time.sleep(0.3)  # longer than a few intervals after which the signal would come again
+            os.write(1, b"cleared up")
+
+        atexit.register(clear_up)
+        """,
+    )
+    assert (done.returncode, done.stdout) == (code, "cleared up")
+    assert done.stderr.strip() in ("", "ertis: error: interrupted")
+
+
+def test_interrupted_command_does_not_finalise_what_it_has_interrupted():
+    done = run_command(
+        "ertis_cli.devices",
+        "SIGTERM",
+        """
+        class Interrupted:
+            def __del__(self, abort=os.abort):
+                abort()  # as a library that was interrupted in its import
+
+        sys.interrupted = Interrupted()
+        """,
+    )
+    assert (done.returncode, done.stderr) == (143, "")
+
+
 def test_signal_that_is_ignored_from_the_start_stays_ignored():
     """As `nohup` has it."""
     program = """
