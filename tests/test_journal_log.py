@@ -68,11 +68,36 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == 3, done.stderr
-    assert "11 measurements, 1 missing, 1 of them stored, then lost in the journal's damaged log" in done.stderr
+    assert "11 measurements, 1 missing, up to 1 of them stored, then lost in the journal's damaged log" in done.stderr
     checked = CliRunner().invoke(cli, ["verify", str(tmp_path / "rec.h5")])
     assert checked.exit_code == 3
     assert f"left: 11 measurements, 1 missing (14: {LOST})" in checked.stdout
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "rec.h5.journal-wal.damaged"]
+
+
+@pytest.mark.parametrize(
+    ("damaged", "code", "told"),
+    [
+        ("checksum", 0, "4 measurements, 999987 missing"),  # all rows are rescued
+        ("words", 3, "3 measurements, 1 missing, up to 1 of them stored, then lost"),
+        ("end", 3, "3 measurements, 999988 missing, up to 999988 of them stored, then lost"),
+    ],
+)
+def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damaged, code, told):
+    given = [*entries(3, settings=LARGE), *entries(1, first=1_000_000, settings=LARGE)]
+    path = crashed(tmp_path, given, settings=LARGE)
+    n_bytes = log_of(path).stat().st_size
+    if damaged == "end":
+        with log_of(path).open("r+b") as file:
+            file.truncate(n_bytes - 100)
+    elif damaged == "words":
+        flip(log_of(path), log_of(path).read_bytes().rindex(given[-1].measurement.words.tobytes()[-64:]))
+    else:
+        flip(log_of(path), n_bytes - FRAME_BYTES + 20)
+    done = CliRunner().invoke(cli, ["recover", str(path)])
+    assert done.exit_code == code
+    ending = " in the journal's damaged log" if code else ""
+    assert f"rec.h5: {told}{ending}\n" in done.stderr
 
 
 def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
