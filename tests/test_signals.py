@@ -1,5 +1,6 @@
 """Signals to commands: the short form of what `ertis bench reliability --long` tries."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import pytest
 from ertis_bench import signals
 from ertis_bench.reliability import ONE_SENSOR
 from ertis_cli.main import COMMANDS
+
+from tests.journals import ENVIRONMENT
 
 SEED = 1
 
@@ -115,6 +118,27 @@ def test_interrupted_command_does_not_finalise_what_it_has_interrupted():
         """,
     )
     assert (done.returncode, done.stderr) == (143, "")
+
+
+def test_ctrl_c_in_code_that_is_made_of_text_exits_with_its_code(tmp_path):
+    """Python would end itself by SIGINT, as such code makes it believe that nobody handles the exception."""
+    (tmp_path / "sitecustomize.py").write_text(
+        """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "ertis_cli.devices":
+            sys.meta_path.remove(self)
+            exec("signal.raise_signal(signal.SIGINT)")  # as dataclasses are made
+
+sys.meta_path.insert(0, Finder())
+"""
+    )
+    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
+    command = [sys.executable, "-m", "ertis_cli", "devices"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=30)
+    assert (done.returncode, done.stderr) == (130, "\nertis: error: interrupted\n")
 
 
 def test_signal_that_is_ignored_from_the_start_stays_ignored():
