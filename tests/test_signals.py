@@ -147,11 +147,14 @@ def test_signal_that_is_ignored_from_the_start_stays_ignored():
         signal.raise_signal(signal.SIGHUP)
         with _signals.stopped_by_signals() as asked:
             signal.raise_signal(signal.SIGHUP)
-        print(asked.came)
+        print(asked.came, _signals.interruption.asked)
+        with _signals.stopped_by_signals() as asked:
+            signal.raise_signal(signal.SIGTERM)
+        print(asked.came == [signal.SIGTERM], _signals.interruption.asked)
         """
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         done = run(program)
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert (done.returncode, done.stdout) == (0, "[]\n")
+    assert (done.returncode, done.stdout) == (0, "[] False\nTrue True\n")

@@ -24,8 +24,8 @@ def main() -> None:
         code = error.code
     finally:
         interruption.end()
-    if interruption.code is not None and isinstance(code, int):
-        leave(code)
+    if interruption.asked and isinstance(code, int | None):
+        leave(code or 0)
     sys.exit(code)
 
 

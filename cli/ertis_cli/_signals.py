@@ -35,9 +35,15 @@ class Interruption:
     Python raises the exception in whatever code runs when a signal arrives. A library's callback, a finaliser, or a
     bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
     and sends the signal again otherwise.
+
+    Attributes
+    ----------
+    asked : bool
+        A signal has asked the command to end, whichever handler it had.
     """
 
     def __init__(self) -> None:
+        self.asked = False
         self._errors: list[BaseException] = []
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -45,6 +51,7 @@ class Interruption:
     def __call__(self, number: int, _: object) -> None:
         if self._over.is_set():
             return
+        self.asked = True
         error = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(_ENDED + number)
         self._errors.append(error)
         thread = threading.Thread(target=self._insist, args=(error, number), name="ertis-signal", daemon=True)
@@ -151,6 +158,7 @@ class Signals:
 
     def __call__(self, number: int, _: object) -> None:
         self.came.append(number)
+        interruption.asked = True
         now_s = time.monotonic()
         if self._stop is None:
             return
