@@ -48,7 +48,7 @@ class Pipeline:
     predict : bool
         Predict the error of the first image, and of each image that is 10 dB fainter than all predicted before. Issue
         an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
-        another image. The paper's method has no budget and no prediction.
+        another image. Records whose prediction takes more than 256 MB have none, and nor has the paper's method.
 
     Attributes
     ----------

@@ -16,7 +16,16 @@ from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
 from ertis_numba.verification import sampled_error_db
 
-__all__ = ["BudgetMonitor", "BudgetScope", "Noted", "Prediction", "memory_bytes", "planner_of", "predict"]
+__all__ = [
+    "MAX_MEMORY_BYTES",
+    "BudgetMonitor",
+    "BudgetScope",
+    "Noted",
+    "Prediction",
+    "memory_bytes",
+    "planner_of",
+    "predict",
+]
 
 BudgetScope = Literal["image", "beams"]
 
@@ -28,7 +37,11 @@ ADAPTIVE_UNCERTAINTY_DB: Final = 2.0
 From 32 directions, it was too low by up to 1.6 dB over 156 random settings of `ertis bench budgets`.
 """
 
+MAX_MEMORY_BYTES: Final = 2**28
+"""Memory for a prediction, beyond which real-time images are not predicted."""
+
 _MAX_DIRECTIONS: Final = 64
+_BYTES_PER_SAMPLE: Final = 32  # signals of a few microphones, as noise is estimated over the whole record
 _FAINTER: Final = 0.1
 _ROWS: Final = 16
 
@@ -133,12 +146,12 @@ def predict(planner: Planner) -> Prediction:
 
 
 def memory_bytes(image: Energyscape) -> int:
-    """Return an estimate of the memory for a prediction: tables of a rough image, that image and its squares."""
+    """Return an estimate of the memory for a prediction: signals, a rough image, its squares and its tables."""
     settings = image.settings
     n_mics = int(microphones(settings.array).enabled.sum())
     n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
     table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
-    return table + 20 * image.energy.size
+    return table + 20 * image.energy.size + _BYTES_PER_SAMPLE * settings.recording.n_samples
 
 
 class BudgetMonitor:
@@ -167,7 +180,7 @@ class BudgetMonitor:
         """Return a new prediction if the image needs one."""
         rows = image.energy[:: max(1, len(image.energy) // _ROWS)]
         level = float(np.vdot(rows, rows)) / rows.size
-        if not 0 < level < _FAINTER * self._faintest:
+        if not 0 < level < _FAINTER * self._faintest or memory_bytes(image) > MAX_MEMORY_BYTES:
             return None
         with self._lock:
             if not level < _FAINTER * self._faintest:

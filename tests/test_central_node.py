@@ -283,6 +283,32 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
     assert [event["event"] for event in central.events].count("internal") == 1
 
 
+@pytest.mark.parametrize("step", ["read", "require_role", "Door.who"])
+def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path, monkeypatch):
+    given = entries(2)
+    with running(tmp_path) as central, Node(central.address) as node:
+        node.hello()
+        with monkeypatch.context() as patch:
+            patch.setattr(f"ertis_numba.network.central_node._node.{step}", lambda *_: 1 / 0)
+            node.measure(*given)
+            refused = [node.hear(Refused) for _ in given]
+        node.measure(*given)  # the sender has kept them
+        node.hear_settled(11)
+    assert all("a mistake (ZeroDivisionError: division by zero)" in each.reason for each in refused)
+    assert {each.sensor for each in refused} == ({"left"} if step == "require_role" else {""})
+    assert central.latest.refused["internal"] == 2
+    assert [event["event"] for event in central.events].count("internal") == 1
+
+
+def test_a_fault_that_names_a_path_without_utf8_is_sent(tmp_path, monkeypatch):
+    with running(tmp_path) as central, Node(central.address) as node:
+        monkeypatch.setattr(Archive, "stuck", "cannot write /disk/\udcff")
+        node.send(Ping())
+        assert node.hear((Pong, Refused)).text == "cannot write /disk/?"
+        node.send(messages.AskStatus())
+        node.hear(Report)
+
+
 def test_a_status_is_made_once_for_all_who_ask_at_once(tmp_path, monkeypatch):
     made, status = [], Condition.status
     with running(tmp_path) as central, Node(central.address) as node:

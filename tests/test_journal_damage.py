@@ -278,7 +278,7 @@ def test_a_journal_that_was_removed_takes_no_more(tmp_path):
 def test_settings_of_a_journal_that_cannot_be_used(tmp_path):
     """As a newer version might write them that forgot to count itself up."""
     create(tmp_path).close()
-    row = ("left", "[air]\nwind_m_s = 3.0\n", "", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    row = ("left", "[air]\nwind_m_s = 3.0\n", "", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # its mounting is unknown
     spoil(
         tmp_path / "rec.h5.journal",
         f"UPDATE sensors SET settings = '{row[1]}', firmware = '', row_crc32 = {row_crc32(row)}",

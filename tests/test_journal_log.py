@@ -68,11 +68,60 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == 3, done.stderr
-    assert "11 measurements, 1 missing, 1 of them stored, then lost in the journal's damaged log" in done.stderr
+    assert "11 measurements, 1 missing, up to 1 of them stored, then lost in the journal's damaged log" in done.stderr
     checked = CliRunner().invoke(cli, ["verify", str(tmp_path / "rec.h5")])
     assert checked.exit_code == 3
     assert f"left: 11 measurements, 1 missing (14: {LOST})" in checked.stdout
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "rec.h5.journal-wal.damaged"]
+
+
+@pytest.mark.parametrize(
+    ("damaged", "code", "told"),
+    [
+        ("checksum", 0, "4 measurements, 999987 missing"),  # all rows are rescued
+        ("words", 3, "3 measurements, 1 missing, up to 1 of them stored, then lost"),
+        ("end", 3, "3 measurements, 999988 missing, up to 999988 of them stored, then lost"),
+    ],
+)
+def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damaged, code, told):
+    given = [*entries(3, settings=LARGE), *entries(1, first=1_000_000, settings=LARGE)]
+    path = crashed(tmp_path, given, settings=LARGE)
+    n_bytes = log_of(path).stat().st_size
+    if damaged == "end":
+        with log_of(path).open("r+b") as file:
+            file.truncate(n_bytes - 100)
+    elif damaged == "words":
+        flip(log_of(path), log_of(path).read_bytes().rindex(given[-1].measurement.words.tobytes()[-64:]))
+    else:
+        flip(log_of(path), n_bytes - FRAME_BYTES + 20)
+    done = CliRunner().invoke(cli, ["recover", str(path)])
+    assert done.exit_code == code
+    ending = " in the journal's damaged log" if code else ""
+    assert f"rec.h5: {told}{ending}\n" in done.stderr
+
+
+def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
+    earlier = tmp_path / "rec.h5.journal-wal.damaged"
+    earlier.write_bytes(b"of another journal")
+    copies = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = crashed(folder, entries(COUNT, seed=number))
+        flip(log_of(path), log_of(path).stat().st_size // 2)
+        copies.append(log_of(path).read_bytes())
+        for _ in range(2):  # the same damage is kept once
+            for item in folder.iterdir():
+                shutil.copy(item, tmp_path)
+            Journal.open(tmp_path / path.name).close()
+            for end in ("", "-wal", TALLY):
+                (tmp_path / f"{path.name}{end}").unlink(missing_ok=True)
+    kept = {item.name: item.read_bytes() for item in tmp_path.glob("*.damaged")}
+    assert kept == {
+        earlier.name: b"of another journal",
+        "rec.h5.journal-wal.2.damaged": copies[0],
+        "rec.h5.journal-wal.3.damaged": copies[1],
+    }
 
 
 def test_damaged_last_commit_is_noticed_by_the_tally(tmp_path):
@@ -232,6 +281,31 @@ def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, pla
     (report,) = verify(path)  # the first one has not ruined it
     assert report.measurements + sum(gap.last - gap.first + 1 for gap in report.gaps) >= COUNT
     assert report.measurements - len(report.damaged) >= COUNT - 1
+
+
+@pytest.mark.parametrize("place", [0.2, 0.4, 0.6])
+def test_damaged_log_does_not_ruin_a_main_file_that_has_later_pages(tmp_path, place):
+    """The log begins after a checkpoint, so its first part lacks pages that only a later commit of it changes.
+
+    Ten rows fill one page and begin the next; the last rows begin a third page, and change the root for it.
+    """
+    given = entries(18)
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    with create(tmp_path, given[:10]) as journal:
+        journal.free_log()
+        for entry in given[10:]:
+            journal.append([entry])
+        vars(journal)["_database"].execute("PRAGMA wal_checkpoint(FULL)")
+        for item in tmp_path.glob("rec*"):
+            shutil.copy(item, killed)
+    path = killed / "rec.h5.journal"
+    flip(log_of(path), int(place * log_of(path).stat().st_size))
+    with Journal.open(path) as journal:
+        assert len(journal) == len(given)
+    (report,) = verify(path)
+    assert report.measurements == len(given)
+    assert len(report.damaged) <= 1
 
 
 def test_log_without_its_journal_is_set_aside(tmp_path):

@@ -130,4 +130,4 @@ def test_blocks_that_emulate_can_be_pasted_as_they_are(name):
 def test_network_blocks_give_the_mounting_of_their_sensors():
     for page in ("README.md", "docs/network.md", "docs/applications.md"):
         (captured,) = re.findall(r"^\$ ertis capture .*--to .*$", (ROOT / page).read_text(), re.MULTILINE)
-        assert "--mounting examples/platform.toml" in captured
+        assert "--mounting platform.toml" in captured

@@ -32,10 +32,10 @@ REPORTED = {
 class Recording:
     """A process that records; its events are read one after the other."""
 
-    def __init__(self, folder, *options):
+    def __init__(self, folder, *options, environment=ENVIRONMENT, stderr=None):
         command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(folder)]
         self.process = subprocess.Popen(
-            [*command, "--json", "-q", *options], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+            [*command, "--json", "-q", *options], stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment
         )
         self.started = self.event("listening")
         self.address = self.started["address"]

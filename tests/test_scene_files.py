@@ -330,7 +330,6 @@ def test_an_error_in_a_long_scene_is_found_soon():
             "[[sensors]]\nemitter.silent = true\n[[spheres]]\nposition_m = [0.1, 0, 0]\nradius_m = 0.1",
             r"spheres\[0\] is 0\.1\d* m from microphone \d+ of sensor and has",
         ),
-        ("[[points]]\nposition_m = [0, 0, 0]", r"points\[0\] is 0 m from emitter of sensor; leave"),
         (
             "count = 3\nrate_hz = 1\n[[spheres]]\nposition_m = [2, 0, 0]\nvelocity_m_s = [-1, 0, 0]\nradius_m = 0.5",
             r"spheres\[0\] is 0 m from emitter of sensor at 2 s and",

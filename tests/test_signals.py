@@ -1,5 +1,6 @@
 """Signals to commands: the short form of what `ertis bench reliability --long` tries."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import pytest
 from ertis_bench import signals
 from ertis_bench.reliability import ONE_SENSOR
 from ertis_cli.main import COMMANDS
+
+from tests.journals import ENVIRONMENT
 
 SEED = 1
 
@@ -58,17 +61,100 @@ def test_signal_is_not_sent_again_while_a_command_clears_up():
     assert (done.returncode, done.stdout, done.stderr) == (143, "cleared up\n", "")
 
 
+def run_command(module, number, program=""):
+    """Run the command line, which gets a signal when it imports a module."""
+    text = f"""
+import atexit, os, signal, sys, time
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.{number})
+
+sys.meta_path.insert(0, Finder())
+from ertis_cli.__main__ import main
+sys.argv = ["ertis", "devices"]
+{textwrap.dedent(program)}
+main()
+"""
+    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_signal_before_the_handlers_are_there_prints_nothing(number):
+    done = run_command("ertis_cli._signals", number)
+    assert (done.returncode, done.stderr) == (-getattr(signal, number), "")
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize("module", ["ertis_cli.main", "ertis_cli.devices"])
+def test_signal_is_not_sent_again_once_the_command_has_ended(module, number, code):
+    done = run_command(
+        module,
+        number,
+        """
+        def clear_up():
+            time.sleep(0.3)  # longer than a few intervals after which the signal would come again
+            os.write(1, b"cleared up")
+
+        atexit.register(clear_up)
+        """,
+    )
+    assert (done.returncode, done.stdout) == (code, "cleared up")
+    assert done.stderr.strip() in ("", "ertis: error: interrupted")
+
+
+def test_interrupted_command_does_not_finalise_what_it_has_interrupted():
+    done = run_command(
+        "ertis_cli.devices",
+        "SIGTERM",
+        """
+        class Interrupted:
+            def __del__(self, abort=os.abort):
+                abort()  # as a library that was interrupted in its import
+
+        sys.interrupted = Interrupted()
+        """,
+    )
+    assert (done.returncode, done.stderr) == (143, "")
+
+
+def test_ctrl_c_in_code_that_is_made_of_text_exits_with_its_code(tmp_path):
+    """Python would end itself by SIGINT, as such code makes it believe that nobody handles the exception."""
+    (tmp_path / "sitecustomize.py").write_text(
+        """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "ertis_cli.devices":
+            sys.meta_path.remove(self)
+            exec("signal.raise_signal(signal.SIGINT)")  # as dataclasses are made
+
+sys.meta_path.insert(0, Finder())
+"""
+    )
+    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
+    command = [sys.executable, "-m", "ertis_cli", "devices"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=30)
+    assert (done.returncode, done.stderr) == (130, "\nertis: error: interrupted\n")
+
+
 def test_signal_that_is_ignored_from_the_start_stays_ignored():
     """As `nohup` has it."""
     program = """
         signal.raise_signal(signal.SIGHUP)
         with _signals.stopped_by_signals() as asked:
             signal.raise_signal(signal.SIGHUP)
-        print(asked.came)
+        print(asked.came, _signals.interruption.asked)
+        with _signals.stopped_by_signals() as asked:
+            signal.raise_signal(signal.SIGTERM)
+        print(asked.came == [signal.SIGTERM], _signals.interruption.asked)
         """
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         done = run(program)
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert (done.returncode, done.stdout) == (0, "[]\n")
+    assert (done.returncode, done.stdout) == (0, "[] False\nTrue True\n")

@@ -318,4 +318,4 @@ def test_damaged_log_of_a_spool_is_reported_and_becomes_a_gap(tmp_path):
         (15, LOST),
     ]
     spool.close()
-    assert [note.partition(" was damaged")[2] for note in notes] == ["; stored numbers lost: 1"]
+    assert [note.partition(" was damaged")[2] for note in notes] == ["; up to 1 stored measurements are lost"]

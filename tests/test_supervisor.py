@@ -18,7 +18,13 @@ from tests.test_serve import LOOPBACK, TIMEOUT_S, is_gone, serving
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="central nodes are supervised on Linux")
 
-ABORTS_AT_START = "import os, sys\nif 'record' in sys.argv:\n    os.register_at_fork(after_in_child=os.abort)\n"
+AT_START = "import os, sys\nif 'record' in sys.argv:\n    os.register_at_fork(after_in_child=lambda: {})\n"
+
+
+def environment_with(folder, action):
+    """Variables with which each process of a central node does something when it starts."""
+    (folder / "sitecustomize.py").write_text(AT_START.format(action))
+    return ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(folder), ENVIRONMENT["PYTHONPATH"]])}
 
 
 def until(condition):
@@ -79,12 +85,33 @@ def test_a_duration_goes_on_after_a_restart_and_all_lines_are_one_stream(tmp_pat
 
 
 def test_a_node_that_is_ended_before_it_listens_is_not_started_again(tmp_path):
-    (tmp_path / "sitecustomize.py").write_text(ABORTS_AT_START)
-    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
+    environment = environment_with(tmp_path, "os.abort()")
     command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "a")]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, env=environment)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("ertis: error: SIGABRT ended the central node's process before it listened; all ack")
+
+
+@pytest.mark.parametrize(("end", "reason"), [("os.abort()", "SIGABRT"), ("os._exit(3)", "exit code 3")])
+def test_supervisor_fails_after_ten_restarts_in_vain_and_keeps_measurements(end, reason, tmp_path):
+    given, broken = entries(3, first=0), tmp_path / "broken"
+    environment = environment_with(tmp_path, f"os.path.exists({str(broken)!r}) and {end}")
+    with (
+        Recording(tmp_path / "a", environment=environment, stderr=subprocess.PIPE) as central,
+        central.process.stderr as stderr,
+    ):
+        with Node(central.address) as node:
+            node.hello(first=0)
+            node.measure(*given)
+            node.hear_settled(2)
+            broken.touch()
+            os.kill(central.started["pid"], signal.SIGKILL)
+            assert central.process.wait(TIMEOUT_S) == 1
+        told = stderr.read()
+        assert "restarted" not in central.process.stdout.read()
+    failed = f"ertis: error: the central node's process failed to start 10 times in a row ({reason}); all acknowledged"
+    assert told.startswith(failed)
+    assert stored(tmp_path / "a")[0] == wanted(given)
 
 
 def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):

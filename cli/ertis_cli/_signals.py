@@ -1,12 +1,14 @@
 """Signals that ask a command to end: SIGINT (Ctrl-C), SIGTERM and SIGHUP."""
 
+import atexit
 import math
+import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final, NoReturn
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "interrupt_later",
     "interruption",
     "is_detached",
+    "leave",
     "obey_signals",
     "stopped_by_signals",
 ]
@@ -32,16 +35,28 @@ class Interruption:
     Python raises the exception in whatever code runs when a signal arrives. A library's callback, a finaliser, or a
     bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
     and sends the signal again otherwise.
+
+    Attributes
+    ----------
+    asked : bool
+        A signal has asked the command to end, whichever handler it had.
     """
 
     def __init__(self) -> None:
+        self.asked = False
         self._errors: list[BaseException] = []
         self._over = threading.Event()
+        self._threads: list[threading.Thread] = []
 
-    def __call__(self, number: int, _: object) -> NoReturn:
+    def __call__(self, number: int, _: object) -> None:
+        if self._over.is_set():
+            return
+        self.asked = True
         error = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(_ENDED + number)
         self._errors.append(error)
-        threading.Thread(target=self._insist, args=(error, number), name="ertis-signal", daemon=True).start()
+        thread = threading.Thread(target=self._insist, args=(error, number), name="ertis-signal", daemon=True)
+        self._threads.append(thread)
+        thread.start()
         raise error
 
     @property
@@ -53,8 +68,17 @@ class Interruption:
         return int(str(error.code)) if isinstance(error, SystemExit) else _ENDED + signal.SIGINT
 
     def end(self) -> None:
-        """Stop repeating signals, because the command has ended."""
+        """Stop repeating signals, because the command has ended; a later signal ends the process at once.
+
+        No handler and no thread of this object remains, so that none runs while the interpreter is finalised.
+        """
         self._over.set()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        for number in _SIGNALS:
+            if signal.getsignal(number) is self:
+                signal.signal(number, signal.SIG_DFL)
 
     def caused(self, error: BaseException | None) -> bool:
         """Return True if a signal caused an exception: the handler raised it, or its unwinding led to it."""
@@ -105,6 +129,21 @@ def obey_signals() -> None:
     sys.unraisablehook = interruption.hide_swallowed
 
 
+def leave(code: int) -> NoReturn:
+    """End the process like `sys.exit`, but without finalising the interpreter, as processes of multiprocessing do.
+
+    Libraries that a signal has interrupted, in an import for example, may crash when they are finalised.
+    """
+    try:
+        threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001
+        atexit._run_exitfuncs()  # noqa: SLF001
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+    finally:
+        os._exit(code)
+
+
 class Signals:
     """Signals that have arrived, and the function that stops the program.
 
@@ -119,6 +158,7 @@ class Signals:
 
     def __call__(self, number: int, _: object) -> None:
         self.came.append(number)
+        interruption.asked = True
         now_s = time.monotonic()
         if self._stop is None:
             return

@@ -27,6 +27,27 @@ def _count(default: int) -> Callable[..., Any]:
     )
 
 
+def _random_settings(default: int) -> Callable[..., Any]:
+    """Return the options of a campaign over random settings."""
+    count = click.option(
+        "--count",
+        type=click.IntRange(min=1),
+        default=default,
+        show_default=True,
+        metavar="N",
+        help="Random settings to try.",
+    )
+    seed = click.option(
+        "--seed",
+        type=click.IntRange(min=0),
+        default=0,
+        show_default=True,
+        metavar="S",
+        help="Seed of the first setting.",
+    )
+    return lambda command: count(seed(command))
+
+
 _update = click.option(
     "--update",
     "targets",
@@ -79,12 +100,7 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=1), default=200, show_default=True, metavar="N", help="Random settings to try."
-)
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Seed of the first setting."
-)
+@_random_settings(200)
 @_update
 @options.quiet
 @options.as_json
@@ -96,12 +112,7 @@ def verification(**given: Any) -> None:
 
 
 @bench.command()
-@click.option(
-    "--count", type=click.IntRange(min=1), default=300, show_default=True, metavar="N", help="Random settings to try."
-)
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Seed of the first setting."
-)
+@_random_settings(300)
 @_update
 @options.quiet
 @options.as_json

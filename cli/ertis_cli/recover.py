@@ -105,7 +105,7 @@ def _told(report: dict[str, Any]) -> str:
     if report["damaged"]:
         told.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
     if report["lost"] or report["damage"]:
-        told.append(f"{report['lost']} of them stored, then lost in the journal's damaged log")
+        told.append(f"up to {report['lost']} of them stored, then lost in the journal's damaged log")
     if report["damage"]:
         told.append(f"also lost: {report['damage']}")
     return f"{report['recording']}: {', '.join(told)}"

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from ertis_numba.atomic import sync
 from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
+from ertis_numba.journal._files import beside
 from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
@@ -117,7 +118,7 @@ class Database:
         That process may have ended before its sync, or its sync may have failed. The system then marks the failed pages
         as written and never writes them, although readers see their content. Rewriting makes the pages dirty again.
         """
-        for log in (_beside(self._path, "-wal"), _beside(self._path, "-journal")):
+        for log in (beside(self._path, "-wal"), beside(self._path, "-journal")):
             if log.exists() and log.stat().st_size:
                 with log.open("r+b", buffering=0) as file:
                     while chunk := file.read(_CHUNK_BYTES):
@@ -286,7 +287,7 @@ class Database:
         for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # rolls back what a disk that failed has left
             self.execute(statement)
         self._roll_back_by("PERSIST")
-        _beside(self._path, "-journal").unlink(missing_ok=True)
+        beside(self._path, "-journal").unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file; closing twice does no harm."""
@@ -319,16 +320,12 @@ class Database:
             raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
 
 
-def _beside(path: Path, end: str) -> Path:
-    return path.with_name(f"{path.name}{end}")
-
-
 def _least(path: Path) -> Iterator[tuple[Path, int]]:
     """Yield the logs beside a file, and how long the file has to be for each."""
-    log = _beside(path, "-wal")
+    log = beside(path, "-wal")
     if log.exists() and log.stat().st_size:
         yield log, PAGE_BYTES
-    log = _beside(path, "-journal")
+    log = beside(path, "-journal")
     if log.exists():
         with log.open("rb") as file:
             header = file.read(_HEADER.size)

@@ -1,33 +1,28 @@
 """Journals: measurements as they arrive, durable one commit at a time."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from ertis_numba.atomic import sync
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.journal import _room
-from ertis_numba.journal._contents import SUFFIX, Contents
-from ertis_numba.journal._database import LOG_BYTES, Database
+from ertis_numba.journal._contents import SUFFIX
+from ertis_numba.journal._database import Database
+from ertis_numba.journal._files import LOGS, beside, disk_errors, free_name, rename_orphans, unlink_all
 from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
 from ertis_numba.journal._log import read_log
 from ertis_numba.journal._log_choice import choose_log
-from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
 from ertis_numba.journal._rescue import rescue
-from ertis_numba.journal._tables import VERSION, insertion, row_crc32
-from ertis_numba.journal._tally import TALLY, Tally
-from ertis_numba.settings import Settings
+from ertis_numba.journal._rows import Rows
+from ertis_numba.journal._tables import VERSION, row_crc32
 
 __all__ = ["SUFFIX", "Journal"]
 
-_LOGS: Final = ("-wal", "-journal")  # what SQLite may leave when it is killed, and what may be all that is left
-_NOTES: Final = ("-shm", TALLY, LIMIT)  # which mean nothing without the journal
 
-
-class Journal(Contents):
+class Journal(Rows):
     """Measurements that are durable, until they are sealed into a recording.
 
     Make it by `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
@@ -48,8 +43,6 @@ class Journal(Contents):
 
     def __init__(self, path: Path, database: Database) -> None:
         super().__init__(path, database)
-        self._accepted: dict[str, Settings] = {}
-        self.tally = Tally(path)
         self.remark = ""
 
     @property
@@ -87,7 +80,7 @@ class Journal(Contents):
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a place that can be written") from error
         try:
-            remark = _clear(path)
+            remark = rename_orphans(path)
             made = cls(path, Database(path, empty=True))
             made.remark = remark
             try:
@@ -96,7 +89,7 @@ class Journal(Contents):
                 made.close()
                 raise
         except BaseException:
-            _unlink(path)
+            unlink_all(path)
             raise
         return made
 
@@ -128,7 +121,7 @@ class Journal(Contents):
             opened.tally.read(opened._identity, any_journal=is_new)
             acked = limit_of(path)
             if acked is not None:
-                with _disk_errors(path):
+                with disk_errors(path):
                     opened.tally.limit(acked)  # what is above is no loss
             damage = rescue(opened, opened._database, log)
             if damage:
@@ -163,7 +156,7 @@ class Journal(Contents):
         if acked:
             note_limit(path, acked)
             return
-        _unlink(path)
+        unlink_all(path)
         sync(path.parent)
 
     def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
@@ -180,8 +173,8 @@ class Journal(Contents):
         self._last.clear()
         self._n_entries = self._held_bytes = 0
         self._load()
-        with _disk_errors(self.path):
-            _beside(self.path, LIMIT).unlink(missing_ok=True)
+        with disk_errors(self.path):
+            beside(self.path, LIMIT).unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -190,183 +183,6 @@ class Journal(Contents):
             self._insert("journal", (os.fsencode(target), source, now))
         self._load()
         self.tally.begin(self._identity)
-
-    def add_sensor(
-        self,
-        name: str,
-        settings: Settings,
-        *,
-        firmware: str = "",
-        translation_m: Sequence[float] | None = None,
-        rotation_xyzw: Sequence[float] | None = None,
-    ) -> None:
-        """Say of what sensor measurements will come; at any time before its first one.
-
-        Parameters
-        ----------
-        name : str
-        settings : Settings
-            Those of its measurements, whose air may differ. Layout files are written out.
-        firmware : str
-        translation_m : sequence of 3 float, optional
-            Where it is: x, y, z. Its mounting is unknown if neither this nor ``rotation_xyzw`` is given.
-        rotation_xyzw : sequence of 4 float, optional
-            The unit quaternion that turns the sensor frame into that of the surroundings.
-
-        Raises
-        ------
-        ArgumentError
-            The journal has it, or no recording could hold this.
-        DataError
-            The journal cannot be written.
-        """
-        made = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
-        with self._turn:
-            if name in self._sensors:
-                raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor a name of its own")
-            with self._database.transaction():
-                self._insert("sensors", made.row())
-            self._know(len(self._ids) + len(self._unusable) + 1, made)
-
-    def append(self, entries: Sequence[Entry]) -> None:
-        """Make measurements durable: when this returns they are, all of them; when it raises, none is there.
-
-        Parameters
-        ----------
-        entries : sequence of Entry
-            Of any sensors in any order. The sequence numbers of a sensor rise within an epoch. Their
-            ``crc32`` is filled in where it is None.
-
-        Raises
-        ------
-        ArgumentError
-            A measurement does not fit to its sensor, or its number does not rise.
-        NoRoomError
-            The disk is full, or nearly so, and nothing was written. More can be appended once there is room.
-        DataError
-            The disk is full or fails. What was appended before is still there.
-        InUseError
-            Somebody has removed the journal, or put another in its place.
-        """
-        with self._turn:
-            last = dict(self._last)
-            rows = [self._row(entry, last) for entry in entries]
-            sizes_bytes = [row[-1].nbytes for row in rows]
-            seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
-            _room.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
-            self._database.require_name()
-            if sum(sizes_bytes) > LOG_BYTES:
-                with suppress(DataError):
-                    self._database.write_once()
-            with self._database.transaction():
-                for row in rows:
-                    self._database.execute(_INSERTION, row)
-            self._last = last
-            self._n_entries += len(rows)
-            self._held_bytes += sum(sizes_bytes)
-            first: dict[tuple[str, int], int] = {}
-            for stamp in (entry.measurement.stamp for entry in entries):
-                first.setdefault((stamp.sensor, stamp.epoch), stamp.sequence)
-            for run, number in first.items():
-                self.tally.grow(*run, number, last[run])
-
-    def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
-        """Return the row of a measurement, whose number is to be above the one in ``last``."""
-        stamp, settings = entry.measurement.stamp, entry.measurement.settings
-        sensor = self._sensor(stamp.sensor)
-        if settings is not self._accepted.get(sensor.name):
-            require_same(sensor, settings)
-            self._accepted[sensor.name] = settings
-        row = sensor.entry_row(entry, self._ids[sensor.name])
-        key = (sensor.name, stamp.epoch)
-        if stamp.sequence <= last.get(key, -1):
-            raise ArgumentError(
-                f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in order, or "
-                "with another epoch"
-            )
-        last[key] = stamp.sequence
-        return row
-
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
-        """Say durably why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
-
-        Raises
-        ------
-        ArgumentError
-            There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
-            bytes.
-        DataError
-            The journal cannot be written.
-        """
-        self.note_gaps([Gap(sensor, first, last, reason, epoch)])
-
-    def note_gaps(self, gaps: Sequence[Gap]) -> None:
-        """Say durably what is missing, all of it or nothing.
-
-        Raises
-        ------
-        ArgumentError
-            There is no such sensor.
-        DataError
-            The journal cannot be written.
-        """
-        with self._turn:
-            rows = [
-                (self._ids[self._sensor(gap.sensor).name], gap.epoch, gap.first, gap.last, gap.reason) for gap in gaps
-            ]
-            with self._database.transaction():
-                for row in rows:
-                    self._insert("gaps", row)
-            for gap in gaps:
-                self.tally.grow(gap.sensor, gap.epoch, gap.first, gap.last)
-
-    def discard(self, sensor: str, epoch: int, up_to: int) -> int:
-        """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
-
-        From the first time on, the numbers of rows have holes, as those of several sensors lie between each other; so
-        whoever opens the journal counts rows instead, and a package that cannot refuses it (format version 2).
-
-        Parameters
-        ----------
-        sensor : str
-        epoch : int
-        up_to : int
-            The last sequence number to be deleted. Of a gap that goes on beyond it, everything stays.
-
-        Returns
-        -------
-        int
-            Measurements that were deleted.
-
-        Raises
-        ------
-        ArgumentError
-            There is no such sensor.
-        DataError
-            The journal cannot be written.
-        """
-        known = self._sensor(sensor)
-        which = self._ids[known.name], epoch, up_to
-        with self._turn:
-            # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
-            self._database.execute("PRAGMA secure_delete = OFF")
-            self._database.require_name()
-            with _disk_errors(self.tally.path):
-                self.tally.discard(sensor, epoch, up_to)
-            with self._database.transaction():
-                if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
-                    self._database.execute(f"PRAGMA user_version = {VERSION}")
-                ((n_deleted,),) = self._database.execute(
-                    "SELECT count(*) FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence <= ?",
-                    which,
-                )
-                self._database.execute(
-                    "DELETE FROM measurements WHERE sensor = ? AND epoch = ? AND sequence <= ?", which
-                )
-                self._database.execute("DELETE FROM gaps WHERE sensor = ? AND epoch = ? AND last <= ?", which)
-            self._n_entries -= n_deleted
-            self._held_bytes -= n_deleted * known.n_bytes
-        return int(n_deleted)
 
     def adopt(self, header: Sequence[Any]) -> None:
         """Restore the header of the journal from before its log was damaged.
@@ -390,26 +206,6 @@ class Journal(Contents):
                 self.source, self._identity = header[1], identity
                 self.tally.begin(identity)
 
-    def _insert(self, table: str, values: tuple[Any, ...]) -> None:
-        self._database.execute(insertion(table), (*values, row_crc32(values)))
-
-    def room(self) -> int:
-        """Return how many more bytes of words can be appended such that all can still be sealed, about.
-
-        Raises
-        ------
-        DataError
-            The folder of the recording is not there.
-        """
-        with self._turn:
-            return _room.left(self.path, self.target, seals_bytes=self._seals_bytes())
-
-    def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
-        """Return about how long the recording will be, with some measurements more."""
-        return _room.recording_bytes(
-            self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
-        )
-
     def free_log(self) -> None:
         """Move the content of the log to the main file and cut the log, which gives its room back to the disk.
 
@@ -428,7 +224,7 @@ class Journal(Contents):
                 with suppress(DataError):
                     self._release()
                 self.tally.close()
-                _unlink(self.path)  # the log is there where the disk was too full to take it in, and means nothing then
+                unlink_all(self.path)  # the log stays where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
             sync(self.path.parent)
@@ -449,10 +245,7 @@ class Journal(Contents):
         with self._turn:
             try:
                 self._release()
-                number, aside = 1, self.path.with_name(f"{self.path.name}.{end}")
-                while aside.exists():
-                    number += 1
-                    aside = self.path.with_name(f"{self.path.name}.{number}.{end}")
+                aside = free_name(self.path, end)
                 self.tally.remove()
                 self.path.rename(aside)
             finally:
@@ -466,7 +259,7 @@ class Journal(Contents):
             is_ours = self._database.has_name
             super().close()
             # Without a log, all is in the main file, which tells itself what is damaged.
-            if is_ours and not self.damage and not any(_beside(self.path, end).exists() for end in _LOGS):
+            if is_ours and not self.damage and not any(beside(self.path, end).exists() for end in LOGS):
                 with suppress(OSError):
                     self.tally.remove()
             self.tally.close()
@@ -477,40 +270,3 @@ class Journal(Contents):
             self.close()
         else:
             self._database.leave_log()
-
-
-@contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
-    """Raise errors of the system as a `DataError` about a file."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; check the disk") from error
-
-
-def _unlink(path: Path) -> None:
-    """Remove a closed journal and the files beside it."""
-    for end in ("", *_LOGS, *_NOTES):
-        _beside(path, end).unlink(missing_ok=True)
-
-
-def _beside(path: Path, end: str) -> Path:
-    return path.with_name(f"{path.name}{end}")
-
-
-def _clear(path: Path) -> str:
-    """Rename logs of an earlier journal with this name, and return their names as one line."""
-    for end in _NOTES:
-        _beside(path, end).unlink(missing_ok=True)
-    moved = []
-    for log in (_beside(path, end) for end in _LOGS):
-        if log.exists():
-            number = 1
-            while (aside := _beside(log, f".{number}.orphaned")).exists():
-                number += 1
-            log.rename(aside)
-            moved.append(f"{log.name} had no journal and is kept as {aside.name}")
-    return "; ".join(moved)
-
-
-_INSERTION: Final = insertion("measurements")

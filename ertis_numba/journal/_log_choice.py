@@ -15,6 +15,7 @@ from typing import Final
 
 from ertis_numba.atomic import sync
 from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.journal._files import beside, keep_damaged_log
 from ertis_numba.journal._log import Log
 
 try:
@@ -64,7 +65,7 @@ def _sound(path: Path, log: Log) -> bytes:
         copy = Path(folder) / path.name
         for content in (log.content, log.repaired, b""):
             shutil.copyfile(path, copy)
-            _log_of(copy).write_bytes(content)
+            beside(copy, "-wal").write_bytes(content)
             with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as connection:
                 if connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]:
                     return content
@@ -74,22 +75,15 @@ def _sound(path: Path, log: Log) -> bytes:
 
 
 def _install(path: Path, damaged: bytes, chosen: bytes) -> None:
-    number, aside = 1, path.with_name(f"{path.name}-wal.damaged")
-    while aside.exists():
-        number += 1
-        aside = path.with_name(f"{path.name}-wal.{number}.damaged")
-    made = path.with_name(f"{path.name}-wal.new")
-    for file, content in ((aside, damaged), (made, chosen)):
-        file.write_bytes(content)
-        with file.open("rb") as written:
-            os.fsync(written.fileno())
-    made.replace(_log_of(path))
-    path.with_name(f"{path.name}-shm").unlink(missing_ok=True)
+    keep_damaged_log(path, damaged)
+    made = beside(path, "-wal.new")
+    with made.open("wb") as file:
+        file.write(chosen)
+        file.flush()
+        os.fsync(file.fileno())
+    made.replace(beside(path, "-wal"))
+    beside(path, "-shm").unlink(missing_ok=True)
     sync(path.parent)
-
-
-def _log_of(path: Path) -> Path:
-    return path.with_name(f"{path.name}-wal")
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
+from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import Log
 from ertis_numba.journal._records import Entry, Gap, Sensor, checked
 from ertis_numba.journal._tables import selection
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["LOST", "rescue"]
 
 LOST: Final = "lost in a damaged journal"
-"""Reason of a gap whose measurements were stored."""
+"""Reason of a gap for numbers that the journal had noted before its log was damaged.
+
+The journal held the last of these numbers. The others may be of stored measurements, of gaps, or skipped by the sensor.
+"""
 
 
 @dataclass(slots=True)
@@ -28,6 +32,7 @@ class _Found:
     """Rows of a repaired copy that the journal does not have.
 
     ``lost`` has the measurements with a sound record and damaged words. ``n_unreadable`` counts all other damaged ones.
+    ``is_complete`` means that the numbers of all rows can be read, and that the order of arrival has no holes.
     """
 
     header: list[Any] = field(default_factory=list)
@@ -36,6 +41,7 @@ class _Found:
     gaps: list[Gap] = field(default_factory=list)
     lost: list[Gap] = field(default_factory=list)
     n_unreadable: int = 0
+    is_complete: bool = False
 
 
 def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
@@ -62,24 +68,33 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
         return ""
     if not n_commits and not missing:
         return ""
-    found = None
-    aside = journal.path.with_name(f"{journal.path.name}-wal.damaged")
+    found = kept = None
     if log is not None:
         with suppress(OSError):
-            aside.write_bytes(log.content)
+            kept = keep_damaged_log(journal.path, log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
     untold = [] if found is None else _add(journal, found)
     if n_commits and found is None and not missing:
         untold.append(f"{n_commits} commits of unknown content")
-    for gap in (*missing, *(found.lost if found is not None else ())):
+    if found is not None:
+        untold += _note(journal, found.lost)
+    is_complete = found is not None and found.is_complete
+    untold += _note(journal, _missing(journal) if is_complete else missing)  # or what the sensor skipped would be lost
+    if kept and not (untold or missing or found is None or found.entries or found.gaps or found.lost):
+        kept.unlink(missing_ok=True)  # only rows that were deleted meanwhile
+    return "; ".join(untold)
+
+
+def _note(journal: "Journal", gaps: Iterable[Gap]) -> list[str]:
+    """Note lost numbers as gaps, and return the losses of sensors that the journal does not have."""
+    untold = []
+    for gap in list(gaps):
         if gap.sensor in journal.sensors:
             journal.note_gaps(list(_holes(journal, gap)))
         else:
-            untold.append(f"{gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
-    if not (untold or missing or found is None or found.entries or found.gaps or found.lost):
-        aside.unlink(missing_ok=True)  # only rows that were deleted meanwhile
-    return "; ".join(untold)
+            untold.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
+    return untold
 
 
 def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
@@ -157,11 +172,22 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
                 found.lost.append(Gap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
             else:
                 found.n_unreadable += 1
-    for row in repaired.execute(selection("gaps", "WHERE id > ? ORDER BY id"), ends[1:]):
+    gaps = repaired.execute(selection("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
+    for row in gaps:
         with suppress(DamagedError, KeyError):
             number, epoch, first, last, reason = checked(journal.path, "a gap", row)
             found.gaps.append(Gap(sensors[number].name, first, last, reason, epoch))
+    found.is_complete = (
+        not found.n_unreadable
+        and len(found.gaps) == len(gaps)
+        and all(_is_unbroken(ids, end) for ids, end in zip((rows, gaps), ends, strict=True))
+    )
     return found
+
+
+def _is_unbroken(rows: Sequence[tuple[Any, ...]], end: int) -> bool:
+    """Return True if rows that begin with their ids continue after ``end`` without holes."""
+    return [row[0] for row in rows] == list(range(end + 1, end + 1 + len(rows)))
 
 
 def _add(journal: "Journal", found: _Found) -> list[str]:

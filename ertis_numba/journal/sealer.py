@@ -37,7 +37,8 @@ class Sealed:
     set_aside : Path or None
         New path of the journal if it has damaged or refused measurements; otherwise the journal was removed.
     lost : int
-        Missing measurements that were stored and then lost in a damaged log of the journal.
+        Missing numbers that the journal had noted before its log was damaged: each of a stored measurement, or of a
+        gap, or skipped by the sensor.
     damage : str
         Losses from a damaged log that no gap of the recording covers; empty if there are none.
     refused : dict of str to str

@@ -1,6 +1,6 @@
 """Fields of messages: how long and how large what comes over the wire may be, and those of each measurement."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -22,10 +22,12 @@ __all__ = [
     "Settled",
     "State",
     "Uint32",
+    "as_line",
 ]
 
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*\Z")]
-Line = Annotated[str, Meta(max_length=512)]
+MAX_LINE_LENGTH: Final = 512
+Line = Annotated[str, Meta(max_length=MAX_LINE_LENGTH)]
 Reason = Annotated[str, Meta(min_length=1, max_length=64)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
@@ -36,6 +38,11 @@ Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]
 Position = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+
+
+def as_line(text: str) -> str:
+    """Return text that fits a `Line`: cut to its length, and without the surrogates of names that are not UTF-8."""
+    return text.encode(errors="replace").decode()[:MAX_LINE_LENGTH]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):

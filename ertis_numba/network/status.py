@@ -168,11 +168,11 @@ class Status(msgspec.Struct, kw_only=True):
     processing: ProcessingStatus | None = None
 
     def encode(self) -> bytes:
-        """Return MessagePack; counts that somebody has driven beyond 64 bits are told as the highest there is."""
+        """Return MessagePack; counts beyond 64 bits become the highest count, surrogates become '?'."""
         try:
             return msgspec.msgpack.encode(self)
-        except OverflowError:
-            return msgspec.msgpack.encode(_clamped(msgspec.to_builtins(self)))
+        except (OverflowError, UnicodeEncodeError):
+            return msgspec.msgpack.encode(_encodable(msgspec.to_builtins(self)))
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
@@ -190,9 +190,11 @@ class Status(msgspec.Struct, kw_only=True):
             raise DataError(f"a status cannot be read ({told}); use the same release of ertis-numba on both") from error
 
 
-def _clamped(value: Any) -> Any:
+def _encodable(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _clamped(item) for key, item in value.items()}
+        return {key: _encodable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_clamped(item) for item in value]
+        return [_encodable(item) for item in value]
+    if isinstance(value, str):
+        return value.encode(errors="replace").decode()
     return min(value, _MOST) if isinstance(value, int) else value

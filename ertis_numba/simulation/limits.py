@@ -57,7 +57,9 @@ def _near_discs(shot: Snapshot) -> list[str]:
 
 
 def require_clear(shot: Snapshot) -> None:
-    """Refuse targets that touch or enclose a microphone of the sensor or an emitter.
+    """Refuse spheres that touch or enclose a microphone of the sensor or an emitter.
+
+    A point has no inside; its echo is bounded, which `notes` reports.
 
     Raises
     ------
@@ -71,15 +73,14 @@ def require_clear(shot: Snapshot) -> None:
         for channel, place in zip(shot.channels, shot.ear.positions_m, strict=True)
     }
     apart_m = np.linalg.norm(targets.positions_m[:, None] - np.array([*places.values()]), axis=2)
-    blocked = np.argwhere(apart_m < targets.radius_m[:, None] + _MIN_DISTANCE_M)
+    blocked = np.argwhere((apart_m < targets.radius_m[:, None] + _MIN_DISTANCE_M) & (targets.radius_m[:, None] > 0))
     if not len(blocked):
         return
     target, place = blocked[0]
     at = f" at {shot.time_s:g} s" if shot.scene.moves else ""
-    radius_m = targets.radius_m[target]
-    surface = f" and has a radius of {radius_m:g} m" if radius_m else ""
     raise ArgumentError(
-        f"{targets.names[target]} is {apart_m[target, place]:.3g} m from {[*places][place]}{at}{surface}; "
+        f"{targets.names[target]} is {apart_m[target, place]:.3g} m from {[*places][place]}{at} and has a radius of "
+        f"{targets.radius_m[target]:g} m; "
         f"leave at least {1000 * _MIN_DISTANCE_M:g} mm between them"
     )
 

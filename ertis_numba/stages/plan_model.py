@@ -22,7 +22,7 @@ from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
 
-__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Plan", "PlanModel", "plan_of"]
+__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "Nodes", "Plan", "PlanModel", "plan_of"]
 
 COARSEST_STOP_BAND_DB = 40.0
 TABLE_BYTES = 44

@@ -64,10 +64,6 @@ class Meddler:
         self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def retarget(self, target: str) -> None:
-        """Connect to another address from now on."""
-        self._target = target
-
     def cut(self) -> None:
         """Pass nothing on, and tell nobody, as a cable that is pulled out does."""
         self._plugged.clear()

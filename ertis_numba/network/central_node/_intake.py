@@ -14,6 +14,7 @@ from ertis_numba.network.central_node._items import Item, Run, Stored, Twin
 from ertis_numba.network.central_node._roles import Store, Unwanted, Viewer
 from ertis_numba.network.central_node._sharing import Sharing
 from ertis_numba.network.central_node._streams import Peer, Stream, Track
+from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
 
 __all__ = ["Intake"]
@@ -330,8 +331,8 @@ class Intake:
             stream.go_back()
         self.acks.owe(stream)
         if reason and stream.owner:
-            run = item.run
-            self._send(stream.owner, Refused(code="settings", reason=reason[:500], sensor=run.sensor, epoch=run.epoch))
+            run, line = item.run, as_line(reason)
+            self._send(stream.owner, Refused(code="settings", reason=line, sensor=run.sensor, epoch=run.epoch))
         self._forget(stream)
 
     def _done(self, item: Item) -> Stream | None:

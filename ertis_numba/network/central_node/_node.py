@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -25,7 +24,7 @@ from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Re
 from ertis_numba.network.central_node._reading import read, require_role
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._telling import Telling, text_of
-from ertis_numba.network.fields import State
+from ertis_numba.network.fields import State, as_line
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.messages import (
     AskStatus,
@@ -202,7 +201,7 @@ class CentralNode:
             self._hear()
         if self._greetings_fd in ready:
             for greeting in self._greetings.take():
-                self._guarded(greeting.frames, greeting.hello, partial(self._greet, greeting))
+                self._answer_greeting(greeting)
         if self._images is not None:
             for fd in ready.keys() & others:
                 self._images.ready(fd)
@@ -218,10 +217,7 @@ class CentralNode:
             frames = self._door.receive()
             if frames is None:
                 return
-            try:
-                self._handle(frames)
-            except Exception as error:  # noqa: BLE001  as in _guarded
-                self._internal(error)
+            self._handle(frames)
 
     def _internal(self, error: Exception) -> None:
         """Count a mistake in this package, and tell of it."""
@@ -229,42 +225,51 @@ class CentralNode:
         self._telling.internal(error)
 
     def _handle(self, frames: list[zmq.Frame]) -> None:
-        """Do what a message asks, or say why not."""
+        """Do what a message asks, or answer why not; never raises for a message."""
         arrived_ns = time.monotonic_ns()
         sender = frames[0].bytes
-        who = self._door.who(frames)
-        if who is None:  # counted there
-            self._greetings.forget(sender)
-            self._intake.bye(sender)
-            self._door.send(sender, Refused(code="role", reason="this key is not listed (any more); have it listed"))
-            return
         message: Message | None = None
         try:
+            who = self._door.who(frames)
+            if who is None:  # counted there
+                self._greetings.forget(sender)
+                self._intake.bye(sender)
+                reason = "this key is not listed (any more); have it listed"
+                self._door.send(sender, Refused(code="role", reason=reason))
+                return
             message = read(frames)
             require_role(who, message)
-        except Unwanted as error:
+            self._take(frames, who, message, arrived_ns)
+        except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
+            self._fail(sender, error, message)
+        else:
+            self._note_peer(frames)
+
+    def _fail(self, sender: bytes, error: Exception, message: Message | None) -> None:
+        """Answer a message that failed, so that its sender does not wait in vain."""
+        if isinstance(error, Unwanted):
             self._refuse(sender, error, message)
             return
-        self._guarded(frames, message, partial(self._take, frames, who, message, arrived_ns))
+        self._internal(error)
+        text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
+        self._door.send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
 
-    def _guarded(self, frames: list[zmq.Frame], message: Message, act: Callable[[], None]) -> None:
-        """Do what a message asks, or answer why not."""
-        sender = frames[0].bytes
-        try:
-            act()
-        except Unwanted as error:
-            self._refuse(sender, error, message)
-        except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
-            text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
-            self._door.send(sender, Unwanted("message", text, "internal").answer(message))
-            self._internal(error)
-        else:
-            if sender in self._intake.peers:
-                self._door.keep_badge(frames)
+    def _note_peer(self, frames: list[zmq.Frame]) -> None:
+        if frames[0].bytes in self._intake.peers:
+            self._door.keep_badge(frames)
 
     def _refuse(self, sender: bytes, error: Unwanted, message: Message | None) -> None:
         self._door.refused[error.kind] += 1
         self._door.send(sender, error.answer(message or Bye()))
+
+    def _answer_greeting(self, greeting: Greeting) -> None:
+        """Accept or refuse a greeting; never raises for a greeting."""
+        try:
+            self._greet(greeting)
+        except Exception as error:  # noqa: BLE001  as in _handle
+            self._fail(greeting.peer_id, error, greeting.hello)
+        else:
+            self._note_peer(greeting.frames)
 
     def _greet(self, greeting: Greeting) -> None:
         """Accept or refuse a greeting whose settings were read."""
@@ -296,7 +301,7 @@ class CentralNode:
             case Ping():
                 self._intake.ping(sender)
                 text = self._condition.trouble or self._intake.remark(sender)
-                self._door.send(sender, Pong(state=self.state, text=text[:500]))
+                self._door.send(sender, Pong(state=self.state, text=as_line(text)))
             case Hello():
                 key = "" if self._keys is None else who.public
                 self._greetings.offer(Greeting(frames[:2], message, [frame.bytes for frame in frames[2:]], key))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.network.central_node._items import Item, Run
+from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Hello, Message, Refused
 from ertis_numba.settings import Settings
 
@@ -32,7 +33,7 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
     def answer(self, about: Message) -> Refused:
         """Return what to tell the sender."""
         sensor, epoch = getattr(about, "sensor", ""), getattr(about, "epoch", 0)
-        return Refused(code=self.code, reason=str(self)[:500], sensor=sensor, epoch=epoch)
+        return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, epoch=epoch)
 
 
 class Store(Protocol):

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ertis_numba.network.processing.notes import Predicted
 
@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
 
 __all__ = ["Predictions"]
-
-_MAX_BYTES: Final = 256_000_000
 
 
 class Predictions:
@@ -52,11 +50,11 @@ class Predictions:
 
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
-        from ertis_numba.prediction import memory_bytes, planner_of, predict  # noqa: PLC0415
+        from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
 
         try:
             needed = memory_bytes(image)
-            if needed > _MAX_BYTES:
+            if needed > MAX_MEMORY_BYTES:
                 text = f"the error of images is not predicted: that takes {needed / 1e6:.0f} MB"
             else:
                 text = predict(planner_of(image, measurement, kernels.load(self._device), threads=1)).warning

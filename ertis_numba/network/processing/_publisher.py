@@ -11,6 +11,7 @@ import zmq
 
 from ertis_numba.errors import DataError, ErtisError, FormatVersionError
 from ertis_numba.network import sockets
+from ertis_numba.network.fields import as_line
 from ertis_numba.network.gate import Gate
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.messages import (
@@ -180,9 +181,9 @@ class _Publisher:
         try:
             message = decode(frames[1].bytes, (Subscribe, AskStatus, Ping, Bye))
         except FormatVersionError as error:
-            self._refuse(frames, Refused(code="version", reason=str(error)[:512]), "version")
+            self._refuse(frames, Refused(code="version", reason=as_line(str(error))), "version")
         except DataError as error:
-            self._refuse(frames, Refused(code="message", reason=str(error)[:512]), "message")
+            self._refuse(frames, Refused(code="message", reason=as_line(str(error))), "message")
         else:
             self._answer(frames, permission.name, message)
 

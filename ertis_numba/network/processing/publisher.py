@@ -178,7 +178,7 @@ class Publisher:
     def close(self) -> None:
         """End it."""
         if self._child is not None:
-            self._child.close(_CLOSED_S)
+            self._child.close(_CLOSED_S if self._serves else 0.0)
             self._child = None
         self._serves = False
 

@@ -34,7 +34,6 @@ _MODULE: Final = "ertis_numba.network.processing._worker"
 _LOADING_S: Final = 60.0
 _BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # before a worker that dies again and again is started again
 _TRIES: Final = 3  # workers that may die over getting ready for a kind for which none has ever been
-_CLOSED_S: Final = 2.0
 
 
 class Workers:
@@ -173,10 +172,10 @@ class Workers:
         """See `Runner`."""
         for worker in self._workers:
             if worker.child is not None:
-                worker.child.pipe.close()  # all notice at the same time
+                worker.child.kill()  # left alone, it would end without clearing up as well, but after its imports
         for worker in self._workers:
             if worker.child is not None:
-                worker.child.close(_CLOSED_S)
+                worker.child.close()
                 worker.child = None
             for slot in worker.slots:
                 slot.close()

@@ -90,7 +90,7 @@ class DiskSpool(Spool):
         """Report the losses of a damaged log; the central node receives them as gaps, too."""
         n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
         if n_lost:
-            self._on_note(f"the log of {journal.path.name} was damaged; stored numbers lost: {n_lost}")
+            self._on_note(f"the log of {journal.path.name} was damaged; up to {n_lost} stored measurements are lost")
         if journal.damage:
             self._on_note(f"the log of {journal.path.name} was damaged; also lost: {journal.damage}")
 

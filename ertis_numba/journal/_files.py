@@ -1,0 +1,97 @@
+"""Files beside a journal: the logs of SQLite, the tally, the limit, and copies kept as evidence of damage."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.errors import DataError
+from ertis_numba.journal._limit import LIMIT
+from ertis_numba.journal._tally import TALLY
+
+__all__ = ["LOGS", "beside", "disk_errors", "free_name", "keep_damaged_log", "rename_orphans", "unlink_all"]
+
+LOGS: Final = ("-wal", "-journal")  # what SQLite may leave when it is killed, and what may be all that is left
+_NOTES: Final = ("-shm", TALLY, LIMIT)  # which mean nothing without the journal
+
+
+def beside(path: Path, end: str) -> Path:
+    """Return the path of a file beside a journal."""
+    return path.with_name(f"{path.name}{end}")
+
+
+def free_name(path: Path, end: str) -> Path:
+    """Return the first of ``NAME.END``, ``NAME.2.END``, ``NAME.3.END``… that does not exist."""
+    number, free = 1, beside(path, f".{end}")
+    while free.exists():
+        number += 1
+        free = beside(path, f".{number}.{end}")
+    return free
+
+
+def keep_damaged_log(path: Path, content: bytes) -> Path | None:
+    """Keep a copy of a damaged log; return its path, or None if there is one with the same content.
+
+    Earlier copies stay: they may be all that is left of other measurements.
+
+    Parameters
+    ----------
+    path : Path
+        Of the journal.
+    content : bytes
+        Of its log.
+
+    Raises
+    ------
+    OSError
+        The disk is full or fails.
+    """
+    log = beside(path, "-wal")
+    for kept in log.parent.iterdir():
+        if kept.name.startswith(f"{log.name}.") and kept.suffix == ".damaged" and _holds(kept, content):
+            return None
+    made = free_name(log, "damaged")
+    try:
+        with made.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        made.unlink(missing_ok=True)
+        raise
+    return made
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    return path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content
+
+
+def unlink_all(path: Path) -> None:
+    """Remove a closed journal and the files beside it."""
+    for end in ("", *LOGS, *_NOTES):
+        beside(path, end).unlink(missing_ok=True)
+
+
+def rename_orphans(path: Path) -> str:
+    """Rename logs of an earlier journal with this name, and return their names as one line."""
+    for end in _NOTES:
+        beside(path, end).unlink(missing_ok=True)
+    moved = []
+    for log in (beside(path, end) for end in LOGS):
+        if log.exists():
+            number = 1
+            while (aside := beside(log, f".{number}.orphaned")).exists():
+                number += 1
+            log.rename(aside)
+            moved.append(f"{log.name} had no journal and is kept as {aside.name}")
+    return "; ".join(moved)
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the system as a `DataError` about a file."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; check the disk") from error
