@@ -67,7 +67,7 @@ def test_explains_in_words(recording, tmp_path):
     plain = run(recording, "-o", tmp_path / "a.h5", "--explain")
     assert plain.stdout == ""
     lines = plain.stderr.splitlines()
-    lines = [line for line in lines if not line.startswith(("ertis:", str(tmp_path)))]
+    lines = [line for line in lines if not line.startswith(("ertis:", "note:", str(tmp_path)))]
     assert lines[0] == "plan of eRTIS-7, for an error of -35 dB at the most:"
     assert "against spherical ones" in plain.stderr
     assert any(line.startswith("    interpolation of delayed samples") for line in lines)

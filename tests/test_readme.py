@@ -37,7 +37,8 @@ def place(tmp_path, monkeypatch):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "reflectors.h5")
     (tmp_path / "RUNS").mkdir()
     write_recording(tmp_path / "RUNS" / "first.h5", noise(SMALL, 1))
-    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.toml", tmp_path / "SCENE.toml")
+    for name in ("SCENE.toml", "reflectors.toml"):
+        shutil.copy(ROOT / "data" / "synthetic" / "reflectors.toml", tmp_path / name)
     return tmp_path
 
 

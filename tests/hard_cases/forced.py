@@ -40,7 +40,7 @@ def image_of(scene, index=0):
     for reflector in simulator.reflectors(index):
         numbers = (reflector.azimuth_deg, reflector.elevation_deg, reflector.range_m, reflector.level_db)
         assert np.all(np.isfinite((*numbers, *reflector.velocity_m_s)))
-        assert reflector.level_db <= 0
+        assert reflector.level_db <= 0 or reflector.emitter  # sound of others may be louder than the strongest echo
         assert reflector.range_m >= 0
     image = Pipeline(simulator.sensor.settings(), predict=False).process(measurement)  # some are silent
     assert np.all(np.isfinite(image.energy))
