@@ -1,12 +1,14 @@
 """What flows through the system: measurements in, energyscapes and peaks out."""
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Settings
 
@@ -103,9 +105,26 @@ class Energyscape:
     settings: Settings
     stamp: Stamp = Stamp()
 
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:  # noqa: FBT001  NumPy's
+        """Return the energies for NumPy functions: (direction, range)."""
+        return np.array(self.energy, dtype=dtype, copy=copy)
+
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed."""
-        return replace(self, **changes)
+        """Return a copy with some fields changed.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such field, or the shapes do not agree.
+        """
+        known = [each.name for each in fields(self)]
+        for name in changes.keys() - set(known):
+            raise ArgumentError(f"an image has no field {name!r}; give some of {', '.join(known)}")
+        made = replace(self, **changes)
+        n_directions = len(made.azimuth_rad)
+        checks.shape("elevation_rad", np.shape(made.elevation_rad), (n_directions,))
+        checks.shape("energy", np.shape(made.energy), (n_directions, len(made.range_m)))
+        return made
 
     @property
     def is_planar(self) -> bool:
@@ -205,10 +224,13 @@ class Peak:
     ----------
     azimuth_deg, elevation_deg, range_m : float
     level_db : float
-        Below the strongest reflector of the same energyscape, so at most 0.
+        Relative to the strongest reflector of the same energyscape, so at most 0.
+    level_dbfs : float
+        Relative to a full-scale echo in every microphone; NaN if it is unknown.
     """
 
     azimuth_deg: float
     elevation_deg: float
     range_m: float
     level_db: float
+    level_dbfs: float = field(default=math.nan, compare=False)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -79,7 +80,7 @@ class Pipeline:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: Settings | str | Path,
         device: str = "auto",
         threads: int | None = None,
         *,
@@ -88,6 +89,13 @@ class Pipeline:
         max_bytes: int | None = None,
         predict: bool = True,
     ) -> None:
+        if isinstance(settings, str | Path):
+            settings = Settings.load(settings)
+        if not isinstance(settings, Settings):
+            raise ArgumentError(
+                f"settings is of type {type(settings).__name__}; give Settings, such as those of a recording, or the "
+                "path of a TOML file"
+            )
         left_bytes = None if max_bytes is None else require_memory(settings, max_bytes)
         if isinstance(max_error_db, str):
             checks.choice("max_error_db", max_error_db, ERROR_PRESETS_DB)

@@ -100,14 +100,18 @@ def reference(document: str) -> tuple[Section, ...]:
     document : str
         A name in `DOCUMENTS`.
     """
-    examples = tomllib.loads(
-        resources.files("ertis_examples").joinpath(f"every_{document}_key.toml").read_text("utf-8")
-    )
+    examples = _read(f"every_{document}_key.toml")
+    if document == "settings":  # A call has an own waveform or the other keys, so no file holds all of them.
+        examples["call"] = _read("own_waveform.toml")["call"] | examples["call"]
     sections = [section for section in _Reader(examples).sections(DOCUMENTS[document]) if section.keys]
     if document != "mounting":
         return tuple(sections)
     poses = next(section for section in sections if section.header == "[[sensors]]")
     return (Section(poses.header, poses.about, tuple(key for key in poses.keys if key.name in _POSE)),)
+
+
+def _read(name: str) -> dict[str, Any]:
+    return tomllib.loads(resources.files("ertis_examples").joinpath(name).read_text("utf-8"))
 
 
 class _Reader:

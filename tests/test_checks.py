@@ -62,4 +62,4 @@ def test_each_error_is_also_what_a_caller_would_catch():
     assert issubclass(errors.DataError, ValueError)
     assert issubclass(errors.DeviceError, RuntimeError)
     for name in errors.__all__:
-        assert issubclass(getattr(errors, name), errors.ErtisError)
+        assert issubclass(getattr(errors, name), errors.ErtisError | UserWarning)

@@ -164,7 +164,7 @@ def test_files_that_settings_from_elsewhere_name_are_not_opened(tmp_path):
         ({"duration_s": 1e-3}, "call.waveform and call.duration_s contradict each other"),
         ({"ramp_fraction": 0.2}, "call.waveform and call.ramp_fraction contradict each other"),
         ({"modulation": "linear"}, "call.waveform and call.modulation are both given"),
-        ({"waveform": (0.0, 1.0)}, "call.waveform has 2 samples; give 16 to 4096, at 450000 Hz 9.1 ms at most"),
+        ({"waveform": (0.0, 1.0)}, "call.waveform has 2 samples; give 17 to 4096, at 450000 Hz 9.1 ms at most"),
         ({"waveform": np.ones(MAX_WAVEFORM_SAMPLES + 1)}, "call.waveform has 4097 samples"),
         ({"waveform": np.zeros(100)}, "call.waveform is silent"),
         ({"waveform": (*SAMPLES, np.nan)}, "call.waveform holds nan"),

@@ -24,6 +24,7 @@ __all__ = [
     "COMPILING",
     "DIRECTION",
     "ERROR_BUDGET",
+    "FALSE_ALARM",
     "INTERVAL",
     "PREPARING",
     "as_json",
@@ -109,6 +110,8 @@ CHANNELS = _Channels()
 DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
+FALSE_ALARM = 1e-3
+"""Probability that noise alone gives a reflector in an image that a command shows."""
 PREPARING = "preparing ..."
 """Note on a slow start."""
 COMPILING = "a first run compiles kernels, which takes longer ..."

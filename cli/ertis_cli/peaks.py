@@ -18,17 +18,19 @@ __all__ = ["peaks"]
 
 _TOP = 10
 _MIN_LEVEL_DB = -30.0
-_FALSE_ALARM = 1e-4
+_FALSE_ALARM = 1e-4  # of a bin, with CFAR
 _PLACE = {"azimuth_deg": "+.2f", "elevation_deg": "+.2f", "range_m": ".3f", "level_db": ".1f"}
 _ERROR = {"angle_deg": ".3f", "range_m": "+.4f", "level_db": "+.2f"}
 _COLUMNS: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(("measurement", *_PLACE), "right")}
+_LEVEL = {"level_dbfs": ".1f"}
+_LEVEL_COLUMN: dict[str, _tables.Side] = {"level_dbfs": "right"}
 _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "angle_error_deg": "right",
     "range_error_m": "right",
     "level_error_db": "right",
     "reflector": "left",
 }
-_DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4}
+_DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4, "level_dbfs": 4}
 
 
 @click.command()
@@ -57,6 +59,7 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     metavar="P",
     help=f"Probability per bin that noise stands out, with cfar; {_FALSE_ALARM:g} by default.",
 )
+@click.option("--all", "everything", is_flag=True, help="List maxima that noise alone may cause, too.")
 @click.option("--truth", is_flag=True, help="Compare with the truth, which the file of a simulated recording holds.")
 @options.as_json
 def peaks(
@@ -68,12 +71,15 @@ def peaks(
     measurement: int | None,
     detector: Literal["peaks", "cfar"],
     false_alarm: float | None,
+    everything: bool,
     truth: bool,
     as_json: bool,
 ) -> None:
     """List the reflectors in an energyscape file.
 
-    One entry per reflector, the strongest of each measurement first; levels are in dB below it.
+    One entry per reflector, the strongest of each measurement first. level_db is relative to the strongest,
+    level_dbfs to a full-scale echo in every microphone. A maximum that noise may cause, in one image of
+    1000, is left out; --all lists it, too. Beamformers other than delay-and-sum have no such limit.
 
     With --detector cfar, a reflector is what stands out of the noise around it in range, however weak it
     is, and is at most 10 dB below the strongest of its range. The noise is estimated from 32 bins of the
@@ -88,6 +94,10 @@ def peaks(
         raise click.UsageError("--top leaves out what --truth asks for; give one of them", click.get_current_context())
     if detector == "cfar" and truth:
         raise click.UsageError("--truth compares with --detector peaks; leave out one", click.get_current_context())
+    if everything and (truth or detector == "cfar"):
+        raise click.UsageError(
+            "--all is for --detector peaks without --truth; leave out one of them", click.get_current_context()
+        )
     if detector != "cfar" and false_alarm is not None:
         raise click.UsageError("--false-alarm is for --detector cfar; give both", click.get_current_context())
     sensors = options.sensors_of(path, sensor)
@@ -107,18 +117,23 @@ def peaks(
         cells = [row for place, comparison in compared for row in _beside_the_truth(place, comparison)]
         table = _tables.Table(_COLUMNS | _ERROR_COLUMNS, cells)
     else:
-        find = _finder(detector, _TOP if top is None else top, min_level, false_alarm)
+        find = _finder(detector, _TOP if top is None else top, min_level, false_alarm, everything=everything)
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
-        table = _tables.Table(_COLUMNS, [_cells(row, row) for row in rows])
+        levels = [[f"{row[name]:{form}}" for name, form in _LEVEL.items()] for row in rows]
+        cells = [(*_cells(row, row), *level) for row, level in zip(rows, levels, strict=True)]
+        table = _tables.Table(_COLUMNS | _LEVEL_COLUMN, cells)
     if as_json:
         options.print_json(report)
+        return
+    if not table.rows:
+        click.echo("nothing found", err=True)
         return
     table.print()
 
 
 def _finder(
-    detector: str, top: int, min_level: float | None, false_alarm: float | None
+    detector: str, top: int, min_level: float | None, false_alarm: float | None, *, everything: bool
 ) -> "Callable[[Energyscape], list[Peak]]":
     """Return what finds the reflectors of an image."""
     if detector == "cfar":
@@ -128,7 +143,12 @@ def _finder(
         return found if min_level is None else partial(found, min_level_db=min_level)
     from ertis_numba.stages.detect import find_peaks
 
-    return partial(find_peaks, top=top, min_level_db=_MIN_LEVEL_DB if min_level is None else min_level)
+    return partial(
+        find_peaks,
+        top=top,
+        min_level_db=_MIN_LEVEL_DB if min_level is None else min_level,
+        false_alarm=None if everything else options.FALSE_ALARM,
+    )
 
 
 def _found(

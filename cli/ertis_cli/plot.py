@@ -173,7 +173,7 @@ def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak]", look: dict[str,
 def _reflectors(image: "Energyscape", top: int) -> "list[Peak]":
     from ertis_numba.stages.detect import find_peaks
 
-    return find_peaks(image, top=top) if top else []
+    return find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else []
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":

@@ -110,7 +110,7 @@ class Canvas:
             bold=True,
         )
 
-    def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB below the strongest") -> Figure:
+    def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB re strongest") -> Figure:
         """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
         style, em_pt = self.style, self.style.em_pt
         height_pt = min(16 * em_pt, (0.45 if self.peaks else _SHARE_ALONE) * box.height)

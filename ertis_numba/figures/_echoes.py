@@ -16,7 +16,7 @@ from ertis_numba.frames import Measurement
 __all__ = ["draw"]
 
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
-_LEVEL = "dB below the strongest"
+_LEVEL = "dB re strongest"
 _CURVE_EMS = 14.0
 _MOST_PLACES = 1000
 

@@ -79,7 +79,7 @@ def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     ArgumentError
         There are too few or too many, one is not finite, or all are 0.
     """
-    least = 16
+    least = 17  # the duration of a call is at least 16 samples
     if not least <= len(samples) <= MAX_WAVEFORM_SAMPLES:
         raise ArgumentError(
             f"call.waveform has {len(samples)} samples; give {least} to {MAX_WAVEFORM_SAMPLES}, at "

@@ -7,8 +7,10 @@ import scipy.spatial
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.stages.noise import threshold_of
 from ertis_numba.stages.peak_interpolation import PeakInterpolator
 from ertis_numba.stages.point_spread import PointSpread
 
@@ -29,6 +31,7 @@ def find_peaks(
     top: int | None = 10,
     min_level_db: float = -30.0,
     where: NDArray[np.bool_] | None = None,
+    false_alarm: float | None = None,
 ) -> list[Peak]:
     """Return the reflectors of an image, strongest first.
 
@@ -46,17 +49,29 @@ def find_peaks(
         Level below the strongest reflector at which to stop.
     where : (direction, range) bool, optional
         Bins that may be the maximum of a reflector; all by default.
+    false_alarm : float, optional
+        Probability that noise alone gives a reflector anywhere in the image. Weaker maxima are left out, except for
+        beamformers whose noise is unknown: see `ertis_numba.stages.noise.threshold_of`. By default, maxima of noise
+        count as reflectors.
 
     Raises
     ------
     ArgumentError
-        ``top`` is below 1, ``min_level_db`` is above 0, or ``where`` has another shape than the image.
+        ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
+        ``false_alarm`` is not between 0 and 1.
     """
+    if not isinstance(image, Energyscape):
+        raise ArgumentError(
+            f"image is of type {type(image).__name__}; give an Energyscape, as of Pipeline.process, because places "
+            "need its directions and ranges"
+        )
     top = image.energy.size if top is None else checks.whole("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
     floor = float(np.max(image.energy, initial=0.0)) * 10 ** (min_level_db / 20)
+    if false_alarm is not None:
+        floor = max(floor, threshold_of(image, false_alarm))
     if where is not None:
         checks.shape("where", where.shape, image.energy.shape)
     places = _local_maxima(image.energy, neighbours, floor, where)
@@ -85,6 +100,7 @@ def find_peaks(
             elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, direction[2])))),
             range_m=range_m,
             level_db=20 * math.log10(level / found[0][2]),
+            level_dbfs=20 * math.log10(level),
         )
         for direction, range_m, level in found
     ]

@@ -13,15 +13,13 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import Texture
+from ertis_numba.stages.noise import noise_of
 from ertis_numba.stages.planner import Planner
 from ertis_numba.waveform import matched_spectrum
 
 __all__ = ["PositionUncertainty"]
 
 _WAVES = 64  # of the call's band, from which its widths are computed
-_SAMPLE = 32_768  # bins from which the noise is estimated, to a hundredth
-_BLOCKS = 16  # of ranges, the noise of each of which is estimated
-_QUIET = 1 / 3  # quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest
 _FLAT = 1e-12  # of the variance of an array, below which it has none
 _UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
 
@@ -102,7 +100,7 @@ class PositionUncertainty:
         resolution_rad : (point,) float64
             Spacing of the directions around points whose direction is not interpolated, 0 for others.
         """
-        noise = _noise(image) if len(amplitude) else 0.0
+        noise = noise_of(image) if len(amplitude) else 0.0
         if not noise:
             return np.full((len(amplitude), 2), np.nan, dtype=np.float32)
         plan = self._plan_error
@@ -149,13 +147,3 @@ class PositionUncertainty:
         least = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
         # What is left of rounding is no aperture.
         return np.asarray(np.where(least > _FLAT * (aa + bb), least, 0.0))
-
-
-def _noise(image: Energyscape) -> float:
-    """Return the root mean square of the noise of an image; 0 if it is unknown."""
-    if image.settings.processing.beamformer != "delay_and_sum":
-        return 0.0
-    some = image.energy[:: max(1, image.energy.size // _SAMPLE)]
-    blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)
-    level = float(np.quantile([np.median(block) for block in blocks], _QUIET))
-    return level / math.sqrt(math.log(2))
