@@ -13,6 +13,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
+from ertis_numba.stages.call_match import first_call_match
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
 
 __all__ = ["Making", "checked", "making"]
@@ -85,7 +86,8 @@ def making(
     most_bytes : float, optional
         See `SensorRun`.
     warn : callable
-        Called with a line for each sensor that has faulty microphones, or whose images may exceed the error budget.
+        Called with a line for each sensor that has faulty microphones, whose echoes do not match the
+        call, or whose images may exceed the error budget.
     show : callable
         Called with the name of a sensor and what was found out of its plan, as soon as it was.
 
@@ -111,6 +113,7 @@ def making(
             _look_over(run, recording, options, warn, show)
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
+            writer.note_call(recording.sensor, run.call_warning)
         yield Making(recordings, runs, writer)
 
 
@@ -157,6 +160,10 @@ def _look_over(
         raise DataError(faults)
     if faults:
         warn(faults)
+    match = first_call_match(map(run.known, recording))
+    if match is not None and match.warning:
+        run.call_warning = match.warning
+        warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
     first = run.known(recording[0])
     heard = None
     if run.pipeline.settings.processing.method != "paper":

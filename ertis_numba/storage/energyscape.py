@@ -75,6 +75,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
         self._predicted: dict[str, dict[str, float | str]] = {}
+        self._call_warnings: dict[str, str] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
         self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._mounting = {
@@ -121,6 +122,13 @@ class EnergyscapeWriter(Writer[Energyscape]):
             "error_warning": error_warning,
         }
 
+    def note_call(self, sensor: str, call_warning: str) -> None:
+        """Store a warning that a sensor's echoes do not match the call of its settings; empty if they do.
+
+        Call this before the sensor's first energyscape is written.
+        """
+        self._call_warnings[sensor] = call_warning
+
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         self._first[first.stamp.sensor] = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
@@ -133,6 +141,8 @@ class EnergyscapeWriter(Writer[Energyscape]):
         )
         describe_mounting(group, self._mounting.get(first.stamp.sensor, {}))
         describe(group, self._predicted.get(first.stamp.sensor, {}))
+        if first.stamp.sensor in self._call_warnings:
+            describe(group, {"call_warning": self._call_warnings[first.stamp.sensor]})
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
         describe(group["energy"], {"coordinates": "azimuth elevation"})
@@ -206,6 +216,9 @@ class EnergyscapeReader(Reader[Energyscape]):
         beamformer; otherwise ``image``. Empty if the file does not hold it.
     error_warning : str
         Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
+    call_warning : str
+        Warning that echoes of the recording do not match the call of its settings; empty if they do, or if it was not
+        examined.
     """
 
     _kind: ClassVar[str] = "energyscape"
@@ -221,6 +234,7 @@ class EnergyscapeReader(Reader[Energyscape]):
     max_error_db: float | None
     budget_applies_to: str
     error_warning: str
+    call_warning: str
 
     def _load(self) -> None:
         for name, field in _AXES.items():
@@ -230,8 +244,8 @@ class EnergyscapeReader(Reader[Energyscape]):
             _number(self.path, name, said[name]) if name in said else None
             for name in ("predicted_error_db", "max_error_db")
         )
-        self.budget_applies_to, self.error_warning = (
-            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning")
+        self.budget_applies_to, self.error_warning, self.call_warning = (
+            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
