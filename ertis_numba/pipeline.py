@@ -47,7 +47,7 @@ class Pipeline:
         Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
     max_bytes : int, optional
         Limit on the predicted memory, checked before any is allocated. By default, only a plan's tables are limited, to
-        2 GiB.
+        2 GiB, or to the memory that the machine has available if no plan within 2 GiB keeps the error budget.
     predict : bool
         Predict the error of the first image, and of each image that is 10 dB fainter than all predicted before. Issue
         an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
