@@ -19,7 +19,7 @@ from ertis_numba.words import word_format
 
 __all__ = ["CallMatch", "call_match", "first_call_match"]
 
-MIN_LOSS: Final = 4.0
+MIN_LOSS: Final = 2.0
 """Ratio of peak powers, another sweep's to the call's, from which the call is said not to match."""
 _MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; more is an echo of the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.

@@ -17,6 +17,7 @@ from ertis_numba.stages.memory import available_bytes
 from ertis_numba.stages.plan_model import Plan, PlanModel, plan_of
 from ertis_numba.stages.plan_search import open_plans
 from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.stages.wavefronts import with_wavefront
 
 __all__ = ["Chosen", "Planner", "complete"]
 
@@ -54,7 +55,7 @@ class Chosen:
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
-    """Return settings whose accuracy leaves nothing open; see `Planner.choose`.
+    """Return settings whose accuracy and wavefront leave nothing open; see `Planner.choose`.
 
     Raises
     ------
@@ -63,6 +64,9 @@ def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes:
     """
     if settings.processing.method == "paper":
         return settings
+    if settings.processing.wavefront == "auto":
+        plane = settings.replace(processing=settings.processing.replace(wavefront="plane"))
+        settings = with_wavefront(plane, Planner(plane, kernels, threads=threads, max_bytes=max_bytes).model)
     return Planner(settings, kernels, threads=threads, max_bytes=max_bytes).choose().settings
 
 
