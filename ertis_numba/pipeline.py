@@ -179,6 +179,32 @@ class Pipeline:
             self._check_budget(image, measurement)
         return images
 
+    def signals(self, measurement: Measurement, *, matched: bool = False) -> NDArray[Any]:
+        """Return the signals of the enabled microphones before beamforming.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        matched : bool
+            Apply the call's matched filter.
+
+        Returns
+        -------
+        (mic, sample) float32 or complex64
+            Demodulated signals at ``settings.signal_rate_hz``, divided by the calibrated gains, full scale 1. Matched
+            signals are analytic, and an echo has its peak where it begins.
+
+        Raises
+        ------
+        DataError
+            The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
+        """
+        from ertis_numba.stages.signals import matched_signals_of, signals_of  # noqa: PLC0415  few want them
+
+        self._require_open()
+        self._require_same_sensor(measurement.settings)
+        return (matched_signals_of if matched else signals_of)(measurement, settings=self.settings)
+
     @property
     def prediction(self) -> "Prediction | None":
         """Latest predicted error beside its budget; None before the first image that is not silent."""
