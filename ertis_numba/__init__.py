@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ertis_numba.devices.sonar import Sonar
     from ertis_numba.errors import (
         ArgumentError,
+        CallMismatchWarning,
         DamagedError,
         DataError,
         DeviceError,
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AllowList",
     "ArgumentError",
+    "CallMismatchWarning",
     "ClientKeys",
     "DamagedError",
     "DataError",
@@ -127,6 +129,7 @@ _HOMES = {
     "devices.sonar": ("Sonar",),
     "errors": (
         "ArgumentError",
+        "CallMismatchWarning",
         "DamagedError",
         "DataError",
         "DeviceError",

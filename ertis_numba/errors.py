@@ -17,12 +17,14 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it does not let this one in, or not do what was asked
 
-Each class also inherits the builtin that a caller would catch without knowing this package. One warning stands beside
-them: ``ErrorBudgetWarning (UserWarning)``, for images that may exceed their error budget.
+Each class also inherits the builtin that a caller would catch without knowing this package. Two warnings stand beside
+them, both ``UserWarning``: ``ErrorBudgetWarning``, for images that may exceed their error budget, and
+``CallMismatchWarning``, for echoes that do not match the call.
 """
 
 __all__ = [
     "ArgumentError",
+    "CallMismatchWarning",
     "DamagedError",
     "DataError",
     "DeviceError",
@@ -98,3 +100,7 @@ class RefusedError(NetworkError):
 
 class ErrorBudgetWarning(UserWarning):
     """Images may exceed the error budget that the pipeline was made for."""
+
+
+class CallMismatchWarning(UserWarning):
+    """Echoes are not those of the call that the settings name, so ranges in images are wrong."""

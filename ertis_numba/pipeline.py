@@ -2,14 +2,15 @@
 
 import warnings
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.errors import ArgumentError, DataError, DeviceError, ErrorBudgetWarning
+from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from ertis_numba.prediction import BudgetMonitor, Prediction
 
 __all__ = ["Pipeline"]
+
+_CALL_CHECKS: Final = 8
 
 
 class Pipeline:
@@ -45,11 +48,12 @@ class Pipeline:
         Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
     max_bytes : int, optional
         Limit on the predicted memory, checked before any is allocated. By default, only a plan's tables are limited, to
-        2 GiB.
+        2 GiB, or to the memory that the machine has available if no plan within 2 GiB keeps the error budget.
     predict : bool
         Predict the error of the first image, and of each image that is 10 dB fainter than all predicted before. Issue
         an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
         another image. Records whose prediction takes more than 256 MB have none, and nor has the paper's method.
+        Compare echoes with the call, too, and issue a `CallMismatchWarning` if they do not match.
 
     Attributes
     ----------
@@ -119,6 +123,7 @@ class Pipeline:
         self._closed = False
         self._monitor = _monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
         self._warned = False
+        self._unmatched = _CALL_CHECKS if predict and not kernel_set.simulated else 0
         self._chain = self._made_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
@@ -148,6 +153,7 @@ class Pipeline:
         energy = self._chain.new_image() if out is None else self._checked_out(out)
         self._chain.process(words, energy, threads=threads)
         image = self._energyscape(_rescaled(energy, exponent), measurement)
+        self._check_call(measurement)
         self._check_budget(image, measurement)
         return image
 
@@ -177,8 +183,35 @@ class Pipeline:
             for energy, (_, exponent), measurement in zip(energies, words, batch, strict=True)
         ]
         for image, measurement in zip(images, batch, strict=True):
+            self._check_call(measurement)
             self._check_budget(image, measurement)
         return images
+
+    def signals(self, measurement: Measurement, *, matched: bool = False) -> NDArray[Any]:
+        """Return the signals of the enabled microphones before beamforming.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        matched : bool
+            Apply the call's matched filter.
+
+        Returns
+        -------
+        (mic, sample) float32 or complex64
+            Demodulated signals at ``settings.signal_rate_hz``, divided by the calibrated gains, full scale 1. Matched
+            signals are analytic, and an echo has its peak where it begins.
+
+        Raises
+        ------
+        DataError
+            The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
+        """
+        from ertis_numba.stages.signals import matched_signals_of, signals_of  # noqa: PLC0415  few want them
+
+        self._require_open()
+        self._require_same_sensor(measurement.settings)
+        return (matched_signals_of if matched else signals_of)(measurement, settings=self.settings)
 
     @property
     def prediction(self) -> "Prediction | None":
@@ -197,6 +230,20 @@ class Pipeline:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _check_call(self, measurement: Measurement) -> None:
+        """Compare echoes with the call until a measurement has sound above the noise, in the first few only."""
+        if self._unmatched <= 0:
+            return
+        # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
+        from ertis_numba.stages.call_match import call_match  # noqa: PLC0415
+
+        self._unmatched -= 1
+        match = call_match(replace(measurement, settings=self.settings))
+        if match is not None:
+            self._unmatched = 0
+            if match.warning:
+                warnings.warn(match.warning, CallMismatchWarning, stacklevel=3)
 
     def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
         """Predict the error of an image if it needs a prediction, and issue the warning once."""

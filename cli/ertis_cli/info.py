@@ -153,6 +153,7 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "method": reader.settings.processing.method,
         **_mounting(reader),
         **_error(reader),
+        **({"call_warning": reader.call_warning} if reader.call_warning else {}),
     }
 
 

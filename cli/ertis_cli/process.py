@@ -50,7 +50,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 )
 @click.option(
     "--wavefront",
-    type=click.Choice(["plane", "spherical"]),
+    type=click.Choice(["plane", "spherical", "auto"]),
     help="What an echo looks like to the array; the recording's own choice by default.",
 )
 @click.option(

@@ -2,23 +2,19 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Any
 
 from ertis_numba import kernels, verification
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
-from ertis_numba.stages.beam_nodes import Aperture
 from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.wavefronts import plane_wave_error_db
 
 __all__ = ["examine"]
-
-_NEAREST_M: Final = 1e-3  # where range 0 is meant
 
 
 def examine(
@@ -100,16 +96,10 @@ def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]
     """Return what plane wavefronts are wrong by at both ends of the range axis; None where they are not plane."""
     if settings.processing.wavefront != "plane":
         return None
-    grid = direction_grid(settings.processing)
-    positions_m = microphones(settings.array).enabled_positions_m
-    aperture = Aperture.of(positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
-    speed_m_s = sound_speed_m_s(settings.air)
     return [
         {
             "range_m": range_m,
-            "error_db": round(
-                decibels(model.plane_waves(aperture, max(range_m, _NEAREST_M), sound_speed_m_s=speed_m_s)), 1
-            ),
+            "error_db": round(plane_wave_error_db(model, settings, range_m), 1),
         }
         for range_m in settings.processing.range_m
     ]

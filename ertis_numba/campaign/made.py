@@ -107,6 +107,8 @@ def difference(made: dict[str, Any], wanted: dict[str, Settings]) -> str:
 def _changed(made: Settings, wanted: Settings) -> str:
     """Return what is different; a plan may have settled whatever was left open."""
     opened = made.replace(accuracy=_reopened(made.accuracy, wanted.accuracy))
+    if wanted.processing.wavefront == "auto":
+        opened = opened.replace(processing=opened.processing.replace(wavefront="auto"))
     for table in Settings.__struct_fields__:
         came, asked = getattr(opened, table), getattr(wanted, table)
         if came != asked:

@@ -13,6 +13,9 @@ from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
+from ertis_numba.stages.call_match import first_call_match
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
 
 __all__ = ["Making", "checked", "making"]
@@ -85,7 +88,8 @@ def making(
     most_bytes : float, optional
         See `SensorRun`.
     warn : callable
-        Called with a line for each sensor that has faulty microphones, or whose images may exceed the error budget.
+        Called with a line for each sensor that has faulty microphones, whose echoes do not match the
+        call, or whose images may exceed the error budget.
     show : callable
         Called with the name of a sensor and what was found out of its plan, as soon as it was.
 
@@ -111,6 +115,8 @@ def making(
             _look_over(run, recording, options, warn, show)
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
+            writer.note_call(recording.sensor, run.call_warning)
+            writer.note_wavefront(recording.sensor, run.told.get("wavefront_error_db"))
         yield Making(recordings, runs, writer)
 
 
@@ -149,6 +155,19 @@ def checked(
         return {**(runs[0].told if len(runs) == 1 else {}), "sensors": rows}
 
 
+def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dict[str, float]:
+    """Return, and show, the error of plane wavefronts at the first range if it exceeds the budget."""
+    settings = planner.settings
+    if settings.processing.wavefront != "plane":
+        return {}
+    error_db = round(plane_wave_error_db(planner.model, settings, settings.processing.range_m[0]), 1)
+    if error_db <= settings.accuracy.max_error_db:
+        return {}
+    told = {"wavefront_error_db": error_db, "wavefront_error_range_m": settings.processing.range_m[0]}
+    show(recording.sensor, told)
+    return told
+
+
 def _look_over(
     run: SensorRun, recording: RecordingReader, options: Options, warn: Callable[[str], None], show: _Show
 ) -> None:
@@ -157,6 +176,10 @@ def _look_over(
         raise DataError(faults)
     if faults:
         warn(faults)
+    match = first_call_match(map(run.known, recording))
+    if match is not None and match.warning:
+        run.call_warning = match.warning
+        warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
     first = run.known(recording[0])
     heard = None
     if run.pipeline.settings.processing.method != "paper":
@@ -164,6 +187,7 @@ def _look_over(
         threads = kernel_set.max_threads if options.threads is None else options.threads
         heard = planner_of(run.pipeline.process(first), first, kernel_set, threads=threads)
         run.prediction = predict(heard)
+        run.told |= _wavefront(heard, recording, show)
         if run.prediction.warning:
             remedy = "give a lower --max-error"
             if not options.verify:

@@ -58,6 +58,8 @@ class SensorRun:
     told : dict
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
+    call_warning : str
+        Warning that echoes do not match the call; empty if they do.
     """
 
     def __init__(self, pipeline: Pipeline, *, batch: int, most_bytes: float | None = None) -> None:
@@ -65,6 +67,7 @@ class SensorRun:
         self.times_ms: list[float] = []
         self.told: dict[str, Any] = {}
         self.prediction: Prediction | None = None
+        self.call_warning = ""
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
         self._size = max(1, min(batch, int((most_bytes or MOST_BYTES) / image_bytes)))
 
@@ -110,6 +113,7 @@ class SensorRun:
             "ranges": len(self.pipeline.range_m),
             "median_ms": round(statistics.median(self.times_ms), 3),
             **(self.prediction.as_dict() if self.prediction else {}),
+            **({"call_warning": self.call_warning} if self.call_warning else {}),
             **self.told,
         }
 

@@ -32,9 +32,10 @@ class Processing(Table, frozen=True, kw_only=True):
     decimation : int, optional
         Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest that
         suits the method and the call's band; see `Settings.decimation`.
-    wavefront : {"plane", "spherical"}
+    wavefront : {"plane", "spherical", "auto"}
         What an echo looks like to the array: ``plane`` as the paper has it, ``spherical`` focuses on each
-        range, which matters nearer than some ten apertures.
+        range, which matters nearer than some ten apertures. ``auto`` is ``spherical`` if plane wavefronts exceed the
+        error budget at the first range, and ``plane`` otherwise and for adaptive beamformers.
     beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}
         How microphones are combined; ``docs/beamformers.md`` tells what each is good for. All but the first need
         the fast method and plane wavefronts.
@@ -55,7 +56,7 @@ class Processing(Table, frozen=True, kw_only=True):
     range_decimation: int = 100
     band_edges_hz: tuple[float, float] | None = None
     decimation: int | None = None
-    wavefront: Literal["plane", "spherical"] = "plane"
+    wavefront: Literal["plane", "spherical", "auto"] = "plane"
     beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
     dmas_order: int = 2
     snapshots: int = 5
@@ -83,10 +84,10 @@ class Processing(Table, frozen=True, kw_only=True):
                     f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
                     f"({self.range_decimation})"
                 )
-        checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical"))
-        if self.wavefront == "spherical" and self.method == "paper":
+        checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical", "auto"))
+        if self.wavefront != "plane" and self.method == "paper":
             raise ArgumentError(
-                "processing.wavefront is 'spherical', which the paper's method knows nothing of; give 'plane'"
+                f"processing.wavefront is {self.wavefront!r}, which the paper's method knows nothing of; give 'plane'"
             )
         self._check_beamformer()
 

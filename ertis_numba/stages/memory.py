@@ -1,5 +1,6 @@
 """Memory that a pipeline needs, predicted before any is allocated."""
 
+from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
@@ -7,13 +8,45 @@ from ertis_numba.geometry import direction_grid, grid_count, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import time_window
 
-__all__ = ["predicted_bytes", "require_memory"]
+__all__ = ["available_bytes", "predicted_bytes", "require_memory"]
 
 # Upper bounds of what was measured for 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
 _OF_DIRECTION: Final = 2500  # tables of beam-grid points that the planner compares
 _OF_DELAY: Final = 75  # a direction and a microphone: delays, offsets, weights, and copies while they are made
 _OF_SAMPLE: Final = 32  # a microphone and a sample of its transform: signal, spectrum, filter
 _OF_POINT: Final = 4  # of an image
+
+
+_CGROUP: Final = Path("/sys/fs/cgroup")
+_CGROUP_FILES: Final = (
+    ("memory.max", "memory.current"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+)
+"""Limit and use of a control group, of versions 2 and 1."""
+
+
+def available_bytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = _CGROUP) -> int:
+    """Return the memory that this process can still allocate, within the limit of its container; 0 if unknown.
+
+    Parameters
+    ----------
+    meminfo, cgroup : Path
+        Sources of the system's available memory and of the control group's limit.
+    """
+    lines = _read(meminfo).splitlines()
+    found = [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    for limit, used in _CGROUP_FILES:
+        numbers = [_read(cgroup / name).strip() for name in (limit, used)]
+        if all(number.isdigit() for number in numbers):  # "max" is no limit
+            found.append(max(0, int(numbers[0]) - int(numbers[1])))
+    return min(found, default=0)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text("ascii")
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 def predicted_bytes(settings: Settings) -> int:

@@ -1,6 +1,7 @@
 """The cheapest plan whose predicted error keeps a budget."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +13,15 @@ from ertis_numba.stages.adaptive import require_order
 from ertis_numba.stages.beamform import require_int16
 from ertis_numba.stages.costs import Costs, cache_file, costs_of
 from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.memory import available_bytes
 from ertis_numba.stages.plan_model import Plan, PlanModel, plan_of
 from ertis_numba.stages.plan_search import open_plans
 from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.stages.wavefronts import with_wavefront
 
 __all__ = ["Chosen", "Planner", "complete"]
 
-_MOST_BYTES = 2**31  # of a plan's signals, and of its delays
+_USUAL_BYTES = 2**31  # of a plan's signals and delays; larger plans are considered only where no other will do
 _ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
 _ROUNDED_DB = 1e-6
 
@@ -52,7 +55,7 @@ class Chosen:
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
-    """Return settings whose accuracy leaves nothing open; see `Planner.choose`.
+    """Return settings whose accuracy and wavefront leave nothing open; see `Planner.choose`.
 
     Raises
     ------
@@ -61,6 +64,9 @@ def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes:
     """
     if settings.processing.method == "paper":
         return settings
+    if settings.processing.wavefront == "auto":
+        plane = settings.replace(processing=settings.processing.replace(wavefront="plane"))
+        settings = with_wavefront(plane, Planner(plane, kernels, threads=threads, max_bytes=max_bytes).model)
     return Planner(settings, kernels, threads=threads, max_bytes=max_bytes).choose().settings
 
 
@@ -98,7 +104,7 @@ class Planner:
     ) -> None:
         self.settings = settings
         self._kernels = kernels
-        self._most_bytes = _MOST_BYTES if max_bytes is None else max_bytes
+        self._max_bytes = max_bytes
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
         self._threads = threads
@@ -111,6 +117,14 @@ class Planner:
     def model(self) -> ErrorModel:
         """Model of the errors of each step."""
         return self._plans.errors
+
+    def _rated(
+        self, plans: Sequence[Plan], sizes: Sequence[int], least: int, most: int
+    ) -> list[tuple[Plan, dict[str, float]]]:
+        """Return plans that need ``least`` to ``most`` bytes, with the parts of their errors."""
+        return [
+            (plan, self._plans.parts(plan)) for plan, size in zip(plans, sizes, strict=True) if least <= size <= most
+        ]
 
     def choose(self) -> Chosen:
         """Return the cheapest plan that keeps the budget.
@@ -127,13 +141,22 @@ class Planner:
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
-            rated = [(plan, self._plans.parts(plan)) for plan in plans if self._plans.n_bytes(plan) <= self._most_bytes]
+            sizes = [self._plans.n_bytes(plan) for plan in plans]
+            limit = _USUAL_BYTES if self._max_bytes is None else self._max_bytes
+            rated = self._rated(plans, sizes, 0, limit)
+            within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
+            # The usual limit comes first, so that the plan depends on a machine's memory only where it must.
+            if not within and self._max_bytes is None and max(sizes) > limit:
+                usual, limit = limit, max(limit, available_bytes())
+                rated += self._rated(plans, sizes, usual + 1, limit)
+                within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
         if not rated:
+            has = "the limit is" if self._max_bytes is not None else "this machine has available"
             raise ArgumentError(
-                "no plan fits into memory; give a later or shorter processing.range_m, fewer directions or "
+                f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
+                "Give a later or shorter processing.range_m, fewer directions or "
                 "microphones, or less of accuracy.oversampling or accuracy.zones"
             )
-        within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
         if within:
             # By the costs of all threads whatever their number now, so that it does not decide about the plan.
             costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
@@ -143,7 +166,7 @@ class Planner:
         if budget < sum(parts.values()) <= allowed:
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
-        memory = ", others do not fit into memory" if len(rated) < len(plans) else ""
+        memory = f", others do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
         wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
         raise ArgumentError(
             f"accuracy.max_error_db is {wanted_db:g}, and the best that these settings can is {best.error_db:.1f} "

@@ -1,5 +1,7 @@
 """The signals of a measurement by themselves, for whoever wants to look at them or take them elsewhere."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,9 +12,10 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.demodulate import demodulation
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.window import TimeWindow
+from ertis_numba.waveform import matched_filter
 from ertis_numba.words import word_format
 
-__all__ = ["signals_of"]
+__all__ = ["matched_signals_of", "signals_of"]
 
 
 def signals_of(
@@ -56,3 +59,30 @@ def signals_of(
     demodulate(word_format(settings).checked(measurement.words), demodulate.new_room(), out)
     out /= layout.gain[layout.enabled, None].astype(np.float32)
     return out
+
+
+def matched_signals_of(measurement: Measurement, *, settings: Settings | None = None) -> NDArray[np.complex64]:
+    """Return the signals of `signals_of` after the call's matched filter: (mic, sample) complex64, analytic.
+
+    An echo of amplitude 1 that begins at sample n has its peak, an envelope of 1, at sample n.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    settings : Settings, optional
+        The measurement's own by default.
+
+    Raises
+    ------
+    DataError
+        The words are not those of the settings.
+    """
+    settings = settings or measurement.settings
+    signals = signals_of(measurement, settings=settings)
+    count = signals.shape[1]
+    n_fft = count + math.ceil(settings.call.duration_s * settings.signal_rate_hz) + 1
+    matched = matched_filter(settings, n_fft=n_fft)
+    occupied = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    spectra = np.zeros((len(signals), n_fft), dtype=np.complex128)
+    spectra[:, occupied] = np.fft.rfft(signals, n_fft, axis=1)[:, occupied] * matched.values
+    return np.fft.ifft(spectra, axis=1)[:, :count].astype(np.complex64)

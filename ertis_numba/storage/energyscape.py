@@ -75,6 +75,8 @@ class EnergyscapeWriter(Writer[Energyscape]):
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
         self._predicted: dict[str, dict[str, float | str]] = {}
+        self._wavefront_errors_db: dict[str, float] = {}
+        self._call_warnings: dict[str, str] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
         self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._mounting = {
@@ -121,6 +123,21 @@ class EnergyscapeWriter(Writer[Energyscape]):
             "error_warning": error_warning,
         }
 
+    def note_call(self, sensor: str, call_warning: str) -> None:
+        """Store a warning that a sensor's echoes do not match the call of its settings; empty if they do.
+
+        Call this before the sensor's first energyscape is written.
+        """
+        self._call_warnings[sensor] = call_warning
+
+    def note_wavefront(self, sensor: str, wavefront_error_db: float | None) -> None:
+        """Store the error of plane wavefronts at the first range of a sensor; None stores nothing.
+
+        Call this before the sensor's first energyscape is written.
+        """
+        if wavefront_error_db is not None:
+            self._wavefront_errors_db[sensor] = wavefront_error_db
+
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         self._first[first.stamp.sensor] = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
@@ -133,6 +150,10 @@ class EnergyscapeWriter(Writer[Energyscape]):
         )
         describe_mounting(group, self._mounting.get(first.stamp.sensor, {}))
         describe(group, self._predicted.get(first.stamp.sensor, {}))
+        if first.stamp.sensor in self._call_warnings:
+            describe(group, {"call_warning": self._call_warnings[first.stamp.sensor]})
+        if first.stamp.sensor in self._wavefront_errors_db:
+            describe(group, {"wavefront_error_db": self._wavefront_errors_db[first.stamp.sensor]})
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
         describe(group["energy"], {"coordinates": "azimuth elevation"})
@@ -206,6 +227,11 @@ class EnergyscapeReader(Reader[Energyscape]):
         beamformer; otherwise ``image``. Empty if the file does not hold it.
     error_warning : str
         Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
+    wavefront_error_db : float, or None
+        Error of plane wavefronts at the first range, relative to spherical ones; None if it is within the budget.
+    call_warning : str
+        Warning that echoes of the recording do not match the call of its settings; empty if they do, or if it was not
+        examined.
     """
 
     _kind: ClassVar[str] = "energyscape"
@@ -221,17 +247,19 @@ class EnergyscapeReader(Reader[Energyscape]):
     max_error_db: float | None
     budget_applies_to: str
     error_warning: str
+    call_warning: str
+    wavefront_error_db: float | None
 
     def _load(self) -> None:
         for name, field in _AXES.items():
             setattr(self, field, np.asarray(self._group[name][:]))
         said = self._group.attrs
-        self.predicted_error_db, self.max_error_db = (
+        self.predicted_error_db, self.max_error_db, self.wavefront_error_db = (
             _number(self.path, name, said[name]) if name in said else None
-            for name in ("predicted_error_db", "max_error_db")
+            for name in ("predicted_error_db", "max_error_db", "wavefront_error_db")
         )
-        self.budget_applies_to, self.error_warning = (
-            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning")
+        self.budget_applies_to, self.error_warning, self.call_warning = (
+            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 

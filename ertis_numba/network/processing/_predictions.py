@@ -48,7 +48,21 @@ class Predictions:
             found.append(self._found.popleft())
         return found
 
+    def _report_call(self, sensor: str, measurement: "Measurement") -> None:
+        """Report echoes that do not match the call."""
+        from ertis_numba.stages.call_match import call_match  # noqa: PLC0415
+
+        try:
+            match = call_match(measurement)
+        except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
+            text = f"echoes are not compared with the call: {type(error).__name__}: {error}"
+        else:
+            text = match.warning if match else ""
+        if text:
+            self._found.append(Predicted(sensor=sensor, warning=text))
+
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
+        self._report_call(sensor, measurement)
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
         from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
 

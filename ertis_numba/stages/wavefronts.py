@@ -1,0 +1,31 @@
+"""Error of plane wavefronts against spherical ones, and the choice between both."""
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.settings import Settings
+from ertis_numba.stages.accuracy import ErrorModel, decibels
+from ertis_numba.stages.beam_nodes import Aperture
+
+__all__ = ["plane_wave_error_db", "with_wavefront"]
+
+
+def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -> float:
+    """Return the error of an image at one range by plane wavefronts, relative to one by spherical wavefronts."""
+    grid = direction_grid(settings.processing)
+    positions_m = microphones(settings.array).enabled_positions_m
+    aperture = Aperture.of(positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+    return decibels(model.plane_waves(aperture, range_m, sound_speed_m_s=sound_speed_m_s(settings.air)))
+
+
+def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
+    """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range.
+
+    Adaptive beamformers and the paper's method have plane wavefronts only.
+    """
+    processing = settings.processing
+    spherical = (
+        processing.method == "fast"
+        and processing.beamformer == "delay_and_sum"
+        and plane_wave_error_db(model, settings, processing.range_m[0]) > settings.accuracy.max_error_db
+    )
+    return settings.replace(processing=processing.replace(wavefront="spherical" if spherical else "plane"))

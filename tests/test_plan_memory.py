@@ -1,0 +1,47 @@
+"""Memory of plans: 2 GiB first, then what the machine has, and both numbers in the refusal."""
+
+import pytest
+
+from ertis_numba import kernels
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.stages import planner
+from ertis_numba.stages.memory import available_bytes
+from ertis_numba.stages.planner import Planner
+
+CPU = kernels.load("cpu")
+SETTINGS = Settings(
+    processing=Processing(directions="2d:9", range_m=(0.5, 1.0)),
+    accuracy=Accuracy(precision="float32", oversampling=4, delay_taps=4, beam_taps=0, stop_band_db=60.0),
+)
+
+
+def sources(folder, *, limit, used):
+    (folder / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    4000 kB\n")
+    (folder / "memory.max").write_text(f"{limit}\n")
+    (folder / "memory.current").write_text(f"{used}\n")
+    return folder / "meminfo", folder
+
+
+@pytest.mark.parametrize(("limit", "expected"), [("max", 4_096_000), ("3000000", 2_000_000), ("500", 0)])
+def test_available_memory_keeps_the_limit_of_the_container(tmp_path, limit, expected):
+    assert available_bytes(*sources(tmp_path, limit=limit, used=1_000_000)) == expected
+
+
+def test_available_memory_is_zero_if_unknown(tmp_path):
+    assert available_bytes(tmp_path / "none", tmp_path) == 0
+
+
+def test_plans_use_the_memory_of_the_machine_if_none_fits_the_usual_limit(monkeypatch):
+    usual = Planner(SETTINGS, CPU, threads=1).choose()
+    monkeypatch.setattr(planner, "_USUAL_BYTES", 1)
+    assert Planner(SETTINGS, CPU, threads=1).choose().settings == usual.settings
+
+
+def test_planner_names_both_numbers_if_no_plan_fits(monkeypatch):
+    monkeypatch.setattr(planner, "_USUAL_BYTES", 1)
+    monkeypatch.setattr(planner, "available_bytes", lambda: 5_000)
+    with pytest.raises(ArgumentError, match=r"the smallest needs \d+ MB, this machine has available 0 MB"):
+        Planner(SETTINGS, CPU, threads=1).choose()
+    with pytest.raises(ArgumentError, match=r"the smallest needs \d+ MB, the limit is 0 MB"):
+        Planner(SETTINGS, CPU, threads=1, max_bytes=1_000).choose()

@@ -1,0 +1,62 @@
+"""Wavefronts: their error is predicted and named, and ``auto`` chooses by the nearest range."""
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba import kernels, verification
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Accuracy
+from ertis_numba.stages.planner import Planner, complete
+from ertis_numba.stages.wavefronts import plane_wave_error_db
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.test_call_match import CALL, SETTINGS, heard
+
+CPU = kernels.load("cpu")
+
+
+def with_processing(**changes):
+    return SETTINGS.replace(processing=SETTINGS.processing.replace(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"range_m": (0.3, 1.2)}, "spherical"),
+        ({"range_m": (0.3, 1.2), "beamformer": "dmas"}, "plane"),
+        ({"range_m": (2.5, 2.6)}, "plane"),
+    ],
+)
+def test_auto_chooses_wavefronts_by_the_first_range(changes, expected):
+    settings = with_processing(wavefront="auto", **changes).replace(accuracy=Accuracy(max_error_db=-25.0))
+    assert complete(settings, CPU, threads=1).processing.wavefront == expected
+
+
+def test_predicted_wavefront_error_is_that_of_the_exact_images():
+    """Echoes of random directions are not planned for: the prediction is an upper bound within 10 dB."""
+    near = with_processing(range_m=(0.9, 1.2), directions="2d:31")
+    measurement = heard(CALL, noise=0.3)
+    images = []
+    for wavefront in ("plane", "spherical"):
+        settings = near.replace(processing=near.processing.replace(wavefront=wavefront))
+        with Pipeline(settings, "cpu", 1, predict=False) as pipeline:
+            image = pipeline.process(measurement)
+        images.append(verification.exact_image(image, measurement).energy)
+    true_db = verification.error_db(*images)
+    predicted_db = plane_wave_error_db(Planner(near, CPU, threads=1).model, near, 0.9)
+    assert predicted_db - 10 < true_db < predicted_db + 3
+
+
+def test_process_prints_and_stores_the_error_of_plane_wavefronts(tmp_path):
+    write_recording(tmp_path / "rec.h5", [heard(CALL)])
+    arguments = ["process", str(tmp_path / "rec.h5"), "-o", str(tmp_path / "image.h5"), "--force"]
+    done = CliRunner().invoke(cli, arguments)
+    assert "plane wavefronts err by up to" in done.stderr
+    with open_energyscapes(tmp_path / "image.h5") as images:
+        assert images.wavefront_error_db > images.max_error_db
+    done = CliRunner().invoke(cli, [*arguments, "--wavefront", "auto"])
+    assert done.exit_code == 0, done.stderr
+    assert "plane wavefronts" not in done.stderr
+    with open_energyscapes(tmp_path / "image.h5") as images:
+        assert images.wavefront_error_db is None
+        assert images.settings.processing.wavefront == "spherical"
