@@ -53,6 +53,15 @@ def test_slices_show_a_reflector_where_it_is():
     assert [np.nanmax(axes.images[0].get_array()) for axes in other.axes[:2]] == pytest.approx([-40, -40], abs=1)
 
 
+def test_slices_list_the_reflectors_in_their_planes_only():
+    inside = Peak(azimuth_deg=20.0, elevation_deg=0.0, range_m=3.0, level_db=0.0)
+    outside = Peak(azimuth_deg=-33.0, elevation_deg=40.0, range_m=3.0, level_db=-3.0)
+    figure = figures.slices(solid(), peaks=[outside, inside])
+    listed = "\n".join(text.get_text() for text in figure.texts)
+    assert "+20.0°" in listed
+    assert "33.0°" not in listed
+
+
 @pytest.mark.parametrize("azimuth_deg", [0.0, 35.0])
 def test_slices_show_a_single_direction_as_a_narrow_beam(azimuth_deg):
     """As wide as the sector draws it, not all of the plane."""
@@ -245,7 +254,7 @@ def test_both_parts_of_the_matched_filter_have_the_same_0_db():
     given = heard()
     figure = figures.matched_filter(given)
     upper, lower, scale = figure.axes
-    assert upper.get_ylabel() == scale.get_ylabel() == "dB below the strongest"
+    assert upper.get_ylabel() == scale.get_ylabel() == "dB re strongest"
     assert lower.images[0].get_array().max() == pytest.approx(0.0, abs=0.01)
     values = echoes(given).values
     mean_db = 20 * np.log10(np.sqrt(np.mean(values.astype(float) ** 2, axis=0)).max() / values.max())

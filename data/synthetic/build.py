@@ -6,8 +6,6 @@ same everywhere. A file also names the libraries that wrote it, so its own sum i
 the file as it is shipped.
 """
 
-# ruff: noqa: INP001 - a script, not a package
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- s
 ``<!-- /scene NAME -->``. All else on the page is written by hand.
 """
 
-# ruff: noqa: INP001 - a script, not a package
-
 import io
 import itertools
 import sys

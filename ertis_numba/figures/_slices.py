@@ -1,7 +1,7 @@
 """Cuts through an image: a level plane and an upright one, in metres of the sensor frame."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -42,6 +42,8 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
     if not image.is_planar:
         cuts.append(_upright(image, left_m or 0.0))
     rasters = [cut.sample(level_db, image) for cut in cuts]
+    drawn = tuple(peak for peak in canvas.peaks if any(cut.place(peak) for cut in cuts))
+    canvas = replace(canvas, peaks=drawn)  # the list has the reflectors in the planes only
     page, boxes, side = canvas.lay_out(
         _words.of_image(image), [cut.height_at(canvas) for cut in cuts], width_pt=720.0 if len(cuts) == 1 else 1008.0
     )
@@ -120,10 +122,11 @@ class _Cut:
         axes.set_ylim(*self.extent_m[2:])
         axes.locator_params(min_n_ticks=1)  # more would run into each other in a narrow picture
         canvas.grid(axes)
-        canvas.mark_peaks(axes, self._place)
+        canvas.mark_peaks(axes, self.place)
         return shown
 
-    def _place(self, peak: Peak) -> tuple[float, float] | None:
+    def place(self, peak: Peak) -> tuple[float, float] | None:
+        """Return where a reflector is in the picture; None if it is not in the plane."""
         unit = unit_vectors(np.radians(peak.azimuth_deg), np.radians(peak.elevation_deg))
         place_m = peak.range_m * unit
         if abs(place_m[self.normal] - self.at_m) > max(_NEAR_M, peak.range_m / 50):
