@@ -237,7 +237,7 @@ def test_a_low_picture_has_a_whole_scale_and_list(look, count):
     peaks = [Peak(azimuth_deg=10.0 * n, elevation_deg=0.0, range_m=1.0, level_db=-n) for n in range(count)]
     figure = figures.projection(image(), peaks=peaks, **look)
     figure.draw_without_rendering()
-    scale = next(axes for axes in figure.axes if "dB below" in axes.get_xlabel() + axes.get_ylabel())
+    scale = next(axes for axes in figure.axes if "dB re" in axes.get_xlabel() + axes.get_ylabel())
     length = max(scale.bbox.width, scale.bbox.height)
     label = scale.xaxis.label if scale.get_xlabel() else scale.yaxis.label
     extent = label.get_window_extent()
