@@ -14,7 +14,6 @@ from ertis_numba.stages.plan_model import TABLE_BYTES
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
-from ertis_numba.verification import sampled_error_db
 
 __all__ = [
     "MAX_MEMORY_BYTES",
@@ -121,6 +120,9 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     texture = texture_of(measurement, settings, kernels, threads=threads)
     if settings.processing.beamformer == "delay_and_sum":
         return Planner(settings, kernels, threads=threads, texture=texture)
+    # Imported here because it takes 0.1 s, and other images need none of it.
+    from ertis_numba.verification import sampled_error_db  # noqa: PLC0415
+
     beams = Planner(settings, kernels, threads=threads, texture=texture, sensitivity=Sensitivity())
     try:
         error_db = sampled_error_db(image, measurement, max_directions=_MAX_DIRECTIONS)

@@ -19,10 +19,11 @@ from ertis_numba.words import word_format
 
 __all__ = ["CallMatch", "call_match", "first_call_match"]
 
-MIN_LOSS: Final = 2.0
+MIN_LOSS: Final = 2.8
 """Ratio of peak powers, another sweep's to the call's, from which the call is said not to match."""
 _MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; more is an echo of the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.
+_MIN_SMEAR: Final = 0.2  # Least extent of a peak that another sweep leaves, relative to the call's duration.
 _TAPERED_S: Final = 0.3e-3  # at each end of the record
 _MAX_MICS: Final = 6
 _MAX_SAMPLES: Final = 2**20
@@ -101,23 +102,25 @@ def call_match(measurement: Measurement) -> CallMatch | None:
     call = settings.call
     bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
     n_fft = scipy.fft.next_fast_len(2 * len(frequency_hz))
-    plain = spectra * magnitude
-    before = _power(spectra * own, n_fft)
+    plain = (spectra * magnitude).astype(np.complex64)  # half the time of double precision
+    before = _power((spectra * own).astype(np.complex64), n_fft)
+    spacing_s = 1 / (n_fft * (frequency_hz[1] - frequency_hz[0]))
+    least_half = max(2, round(_MIN_SMEAR * call.duration_s / spacing_s))
+    if _snr(before) >= _MIN_SNR and _crest(before, least_half) >= _MAX_CREST:
+        return CallMatch(0.0, 1.0, call.modulation, matches=True)  # no other sweep could change this
     step = max(1 / (bandwidth_hz * call.duration_s), 2 * _MAX_SLOPE / _MAX_SLOPES)
     count = math.ceil(_MAX_SLOPE / step)
     slopes = (np.arange(-count, count + 1) * (_MAX_SLOPE / count)).tolist()
     best_ratio, best_slope, best_linear, best = 0.0, 0.0, False, before
     for linear, slope in itertools.product((False, True), slopes):
         curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
-        power = _power(plain * np.exp(1j * slope * curve_rad), n_fft)
+        power = _power(plain * np.exp(1j * slope * curve_rad).astype(np.complex64), n_fft)
         ratio = float(np.median(power.max(axis=1) / np.maximum(before.max(axis=1), 1e-300)))
         if ratio > best_ratio:
             best_ratio, best_slope, best_linear, best = ratio, slope, linear, power
-    snr = float(np.median(best.max(axis=1) / np.maximum(np.median(best, axis=1), 1e-300)))
-    if best_ratio == 0 or snr < _MIN_SNR:
+    if best_ratio == 0 or _snr(best) < _MIN_SNR:
         return None
-    smear_s = max(abs(best_slope - 1), 0.2) * call.duration_s
-    spacing_s = 1 / (n_fft * (frequency_hz[1] - frequency_hz[0]))
+    smear_s = max(abs(best_slope - 1), _MIN_SMEAR) * call.duration_s
     crest = _crest(before, max(2, round(smear_s / spacing_s)))
     wrong = best_ratio > MIN_LOSS and abs(best_slope) >= _MIN_SLOPE and crest < _MAX_CREST
     return CallMatch(
@@ -170,7 +173,13 @@ def _phase_of_sweep(call: Call, frequency_hz: NDArray[np.float64], *, linear: bo
 
 
 def _power(spectra: NDArray[Any], n_fft: int) -> NDArray[np.float64]:
-    return np.asarray(np.abs(scipy.fft.ifft(spectra, n_fft, axis=1)) ** 2, dtype=np.float64)
+    made = scipy.fft.ifft(spectra, n_fft, axis=1)
+    return np.asarray(made.real**2 + made.imag**2, dtype=np.float64)
+
+
+def _snr(power: NDArray[np.float64]) -> float:
+    """Return the peak power relative to the median, the median of the microphones."""
+    return float(np.median(power.max(axis=1) / np.maximum(np.median(power, axis=1), 1e-300)))
 
 
 def _crest(power: NDArray[np.float64], half: int) -> float:
