@@ -26,6 +26,8 @@ _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reac
 _MIN_SMEAR: Final = 0.2  # Least extent of a peak that another sweep leaves, relative to the call's duration.
 _TAPERED_S: Final = 0.3e-3  # at each end of the record
 _MAX_MICS: Final = 6
+_FEW_MICS: Final = 2  # whose signals choose the sweeps that are compared in all of them
+_MAX_LIKELY: Final = 16
 _MAX_SAMPLES: Final = 2**20
 _MAX_MEASUREMENTS: Final = 8
 _MAX_SLOPE: Final = 4.0
@@ -111,13 +113,21 @@ def call_match(measurement: Measurement) -> CallMatch | None:
     step = max(1 / (bandwidth_hz * call.duration_s), 2 * _MAX_SLOPE / _MAX_SLOPES)
     count = math.ceil(_MAX_SLOPE / step)
     slopes = (np.arange(-count, count + 1) * (_MAX_SLOPE / count)).tolist()
-    best_ratio, best_slope, best_linear, best = 0.0, 0.0, False, before
-    for linear, slope in itertools.product((False, True), slopes):
-        curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
-        power = _power(plain * np.exp(1j * slope * curve_rad).astype(np.complex64), n_fft)
-        ratio = float(np.median(power.max(axis=1) / np.maximum(before.max(axis=1), 1e-300)))
-        if ratio > best_ratio:
-            best_ratio, best_slope, best_linear, best = ratio, slope, linear, power
+    highest = np.maximum(before.max(axis=1), 1e-300)
+
+    def compared(candidates: Iterable[tuple[bool, float]], n_mics: int) -> list[tuple[float, bool, float]]:
+        """Return the ratio of the peak power after a sweep's filter to that after the call's own, for each sweep."""
+        found = []
+        for linear, slope in candidates:
+            turned = plain[:n_mics] * np.exp(1j * slope * curves_rad[linear]).astype(np.complex64)
+            peaks = _power(turned, n_fft).max(axis=1)
+            found.append((float(np.median(peaks / highest[:n_mics])), linear, slope))
+        return sorted(found, reverse=True)
+
+    curves_rad = {linear: _phase_of_sweep(call, frequency_hz, linear=linear) for linear in (False, True)}
+    likely = compared(itertools.product((False, True), slopes), _FEW_MICS)[:_MAX_LIKELY]
+    best_ratio, best_linear, best_slope = compared([(linear, slope) for _, linear, slope in likely], len(plain))[0]
+    best = _power(plain * np.exp(1j * best_slope * curves_rad[best_linear]).astype(np.complex64), n_fft)
     if best_ratio == 0 or _snr(best) < _MIN_SNR:
         return None
     smear_s = max(abs(best_slope - 1), _MIN_SMEAR) * call.duration_s
