@@ -92,7 +92,11 @@ def test_false_alarms_in_noise(method, false_alarm):
     found = cfar(given, false_alarm=false_alarm, method=method)
     for place in (0, MIDDLE, -1):
         assert_share(found[:, place], false_alarm)
-    quieter = given.replace(energy=given.energy[:5000] * np.float32(2**-30))
+    quieter = given.replace(
+        energy=given.energy[:5000] * np.float32(2**-30),
+        azimuth_rad=given.azimuth_rad[:5000],
+        elevation_rad=given.elevation_rad[:5000],
+    )
     np.testing.assert_array_equal(cfar(quieter, false_alarm=false_alarm, method=method), found[:5000])
 
 

@@ -261,7 +261,7 @@ def test_a_point_on_a_sensor_is_reported(emulate, tmp_path):
     process = emulate(tmp_path / "scene.toml")
     process.stdout.readline()
     _, _, errors = ended(process, signal.SIGTERM)
-    assert "note: points[1] is on sensor only, within 0.01 m; its echo hides all others" in errors
+    assert "note: points[1] is 0 mm from an emitter or a microphone of only" in errors
     assert "rendering 2 measurements ..." in errors
     assert not any("rehears" in line or "Traceback" in line for line in errors.splitlines())
 

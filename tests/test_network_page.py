@@ -112,7 +112,7 @@ def lines_of(page, prompt):
 )
 def test_one_machine(place, ports, platform, block):
     lines = lines_of(block, "")
-    assert [line.split()[0] for line in lines] == ["emulate", "serve", "capture", "listen", "status"]
+    assert [line.split()[0] for line in lines] == ["example", "emulate", "serve", "capture", "listen", "status"]
     with Shell(ports, platform) as shell:
         *_, heard, status = [shell.run(line) for line in lines]
     assert len([line for line in heard.splitlines() if re.match(r"(front|left) ", line)]) == 10

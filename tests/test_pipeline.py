@@ -113,7 +113,7 @@ def test_spawned_processes_give_the_same_bits():
 
 def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
     settings = Settings(processing=Processing(directions="3000"))
-    pipeline = Pipeline(settings)
+    pipeline = Pipeline(settings, predict=False)
     measurement = noise(settings)
     out = np.empty((3000, len(pipeline.range_m)), dtype=np.float32)
     first = pipeline.process(measurement)
