@@ -185,8 +185,8 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
             r"point\.facing_deg is given, but a point without a diameter .*give point\.diameter_m",
         ),
         (
-            "[[sensors]]\nemitter.quality_factor = 5.0",
-            r"emitter\.quality_factor is 5, but the emitter has no resonance; give emitter\.resonance_hz",
+            "[[sensors]]\nemitter.quality_factor = 6.0",
+            r"emitter\.quality_factor is 6, but the emitter has no resonance; give emitter\.resonance_hz",
         ),
         ("[[points]]\nrange_m = 1\nfacing_deg = [0, 99]", r"point\.facing_deg elevation is 99; give a number from -90"),
         (

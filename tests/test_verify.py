@@ -149,11 +149,22 @@ def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["line", "reflectors", "reflectors_3d"])
-def test_files_from_before_epochs_were_numbers_of_runs(name):
-    path = Path(__file__).parents[1] / "data" / "synthetic" / f"{name}.h5"
-    with h5py.File(path) as file:
+def test_files_from_before_epochs_were_numbers_of_runs(name, tmp_path):
+    shipped = Path(__file__).parents[1] / "data" / "synthetic" / f"{name}.h5"
+    path = tmp_path / "old.h5"
+    path.write_bytes(shipped.read_bytes())
+    with h5py.File(path, "r+") as file:
         (group,) = file["sensors"].values()
-        assert (group["epoch"].dtype, "gap_epoch" in group) == (np.dtype("<i4"), False)
+        file.move(f"{group.name}/epoch", f"{group.name}/epoch_of_today")
+        today = group["epoch_of_today"]
+        old = group.create_dataset("epoch", data=today[:].astype("<i4"))
+        for key, value in today.attrs.items():
+            if key not in {"DIMENSION_LIST", "REFERENCE_LIST"}:
+                old.attrs[key] = value
+        old.dims[0].attach_scale(group["measurement"])
+        del group["epoch_of_today"]
+        if "gap_epoch" in group:
+            del group["gap_epoch"]
     assert all(report.whole for report in verify(path))
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,8 +62,10 @@ class Emitter(Table, frozen=True, kw_only=True):
             checks.between("emitter.resonance_hz", self.resonance_hz, 1e3, 1e6)
         if self.quality_factor is not None:
             checks.between("emitter.quality_factor", self.quality_factor, *_QUALITY_FACTORS)
-            # Scenes in older recordings hold the default without a resonance.
-            if self.quality_factor != _QUALITY_FACTOR and self.resonance_hz is None:
+            if self.quality_factor == _QUALITY_FACTOR and self.resonance_hz is None:
+                # Scenes in older recordings hold the default without a resonance.
+                msgspec.structs.force_setattr(self, "quality_factor", None)
+            elif self.resonance_hz is None:
                 raise ArgumentError(
                     f"emitter.quality_factor is {self.quality_factor:g}, but the emitter has no resonance; "
                     "give emitter.resonance_hz, or leave quality_factor out"
