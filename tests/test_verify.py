@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
@@ -161,7 +160,8 @@ def test_files_from_before_epochs_were_numbers_of_runs(name, tmp_path):
         for key, value in today.attrs.items():
             if key not in {"DIMENSION_LIST", "REFERENCE_LIST"}:
                 old.attrs[key] = value
-        old.dims[0].attach_scale(group["measurement"])
+        for scale in today.dims[0].values():
+            old.dims[0].attach_scale(scale)
         del group["epoch_of_today"]
         if "gap_epoch" in group:
             del group["gap_epoch"]
