@@ -1,5 +1,6 @@
 """One recording to its energyscape file, in whatever process: the same for one and for many."""
 
+import itertools
 import statistics
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -171,16 +172,17 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
 def _look_over(
     run: SensorRun, recording: RecordingReader, options: Options, warn: Callable[[str], None], show: _Show
 ) -> None:
-    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", run.known(recording[0]))
+    first = run.known(recording[0])
+    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", first)
     if faults and options.strict:
         raise DataError(faults)
     if faults:
         warn(faults)
-    match = first_call_match(map(run.known, recording))
+    others = (run.known(recording[index]) for index in range(1, len(recording)))
+    match = first_call_match(itertools.chain([first], others))
     if match is not None and match.warning:
         run.call_warning = match.warning
         warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
-    first = run.known(recording[0])
     heard = None
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)

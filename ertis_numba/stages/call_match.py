@@ -1,6 +1,5 @@
 """Pulse compression of recorded echoes: a check that a recording was made with the call that its settings name."""
 
-import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,10 +27,11 @@ _TAPERED_S: Final = 0.3e-3  # at each end of the record
 _MAX_MICS: Final = 6
 _FEW_MICS: Final = 2  # whose signals choose the sweeps that are compared in all of them
 _MAX_LIKELY: Final = 16
+_BLOCK: Final = 32  # slopes at a time, whose arrays fit into a cache
 _MAX_SAMPLES: Final = 2**17  # so that long records take no more memory
 _MAX_MEASUREMENTS: Final = 8
 _MAX_SLOPE: Final = 4.0
-_MIN_SLOPE: Final = 0.15  # Shorter sweeps are not distinguished from clicks.
+_MIN_SLOPE: Final = 0.3  # Shorter sweeps are not distinguished from clicks.
 _MAX_SLOPES: Final = 400
 
 
@@ -112,22 +112,22 @@ def call_match(measurement: Measurement) -> CallMatch | None:
         return CallMatch(0.0, 1.0, call.modulation, matches=True)  # no other sweep could change this
     step = max(1 / (bandwidth_hz * call.duration_s), 2 * _MAX_SLOPE / _MAX_SLOPES)
     count = math.ceil(_MAX_SLOPE / step)
-    slopes = (np.arange(-count, count + 1) * (_MAX_SLOPE / count)).tolist()
-    highest = np.maximum(before.max(axis=1), 1e-300)
-
-    def compared(candidates: Iterable[tuple[bool, float]], n_mics: int) -> list[tuple[float, bool, float]]:
-        """Return the ratio of the peak power after a sweep's filter to that after the call's own, for each sweep."""
-        found = []
-        for linear, slope in candidates:
-            turned = plain[:n_mics] * np.exp(1j * slope * curves_rad[linear]).astype(np.complex64)
-            peaks = _power(turned, n_fft).max(axis=1)
-            found.append((float(np.median(peaks / highest[:n_mics])), linear, slope))
-        return sorted(found, reverse=True)
-
-    curves_rad = {linear: _phase_of_sweep(call, frequency_hz, linear=linear) for linear in (False, True)}
-    likely = compared(itertools.product((False, True), slopes), _FEW_MICS)[:_MAX_LIKELY]
-    best_ratio, best_linear, best_slope = compared([(linear, slope) for _, linear, slope in likely], len(plain))[0]
-    best = _power(plain * np.exp(1j * best_slope * curves_rad[best_linear]).astype(np.complex64), n_fft)
+    slopes = np.arange(-count, count + 1) * (_MAX_SLOPE / count)
+    highest = np.maximum(before.max(axis=1).astype(np.float64), 1e-300)
+    likely = []
+    for linear in (False, True):
+        curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
+        for some in np.array_split(slopes, math.ceil(len(slopes) / _BLOCK)):
+            peaks = _turned(plain[:_FEW_MICS], some, curve_rad, n_fft).max(axis=2)
+            ratios = np.median(peaks / highest[:_FEW_MICS], axis=1)
+            likely += [(ratio, linear, slope) for ratio, slope in zip(ratios.tolist(), some.tolist(), strict=True)]
+    best_ratio, best_slope, best_linear, best = 0.0, 0.0, False, before
+    for _, linear, slope in sorted(likely, reverse=True)[:_MAX_LIKELY]:
+        curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
+        (power,) = _turned(plain, np.array([slope]), curve_rad, n_fft)
+        ratio = float(np.median(power.max(axis=1) / highest))
+        if ratio > best_ratio:
+            best_ratio, best_slope, best_linear, best = ratio, slope, linear, power
     if best_ratio == 0 or _snr(best) < _MIN_SNR:
         return None
     smear_s = max(abs(best_slope - 1), _MIN_SMEAR) * call.duration_s
@@ -182,21 +182,31 @@ def _phase_of_sweep(call: Call, frequency_hz: NDArray[np.float64], *, linear: bo
     return np.asarray(2 * math.pi * (slowness * np.log(frequency_hz / frequency_hz[0]) - span * at_first))
 
 
-def _power(spectra: NDArray[Any], n_fft: int) -> NDArray[np.float64]:
-    made = scipy.fft.ifft(spectra, n_fft, axis=1)
-    return np.asarray(made.real**2 + made.imag**2, dtype=np.float64)
+def _turned(
+    spectra: NDArray[np.complex64], slopes: NDArray[np.float64], curve_rad: NDArray[np.float64], n_fft: int
+) -> NDArray[np.float32]:
+    """Return the power after the filters of some sweeps: (slope, mic, sample)."""
+    angles_rad = np.outer(slopes, curve_rad).astype(np.float32)
+    filters = np.cos(angles_rad) + np.complex64(1j) * np.sin(angles_rad)
+    return _power(filters[:, None] * spectra, n_fft)
 
 
-def _snr(power: NDArray[np.float64]) -> float:
+def _power(spectra: NDArray[np.complex64], n_fft: int) -> NDArray[np.float32]:
+    made = scipy.fft.ifft(spectra, n_fft, axis=-1)
+    return np.asarray(made.real**2 + made.imag**2)
+
+
+def _snr(power: NDArray[np.float32]) -> float:
     """Return the peak power relative to the median, the median of the microphones."""
-    return float(np.median(power.max(axis=1) / np.maximum(np.median(power, axis=1), 1e-300)))
+    middle = np.median(power, axis=1).astype(np.float64)
+    return float(np.median(power.max(axis=1) / np.maximum(middle, 1e-300)))
 
 
-def _crest(power: NDArray[np.float64], half: int) -> float:
+def _crest(power: NDArray[np.float32], half: int) -> float:
     """Return the peak power relative to the mean within ``half`` samples of it, the median of the microphones."""
     crests = []
     for row in power:
         peak = int(np.argmax(row))
         around = row[max(0, peak - half) : peak + half + 1]
-        crests.append(float(row[peak] / max(around.mean(), 1e-300)))
+        crests.append(float(row[peak]) / max(float(around.mean()), 1e-300))
     return float(np.median(crests))
