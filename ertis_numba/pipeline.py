@@ -36,7 +36,8 @@ class Pipeline:
 
     Parameters
     ----------
-    settings : Settings
+    settings : Settings or str or Path
+        Settings, or the path of a TOML file with them.
     device : {"auto", "cpu", "cuda", "numpy"}
         ``auto`` is an NVIDIA GPU, ``cuda``, where there is one and what it needs is installed, else ``cpu``. ``numpy``
         runs the same algorithm without compiled kernels, for comparison. The paper's method has no compiled kernels.

@@ -16,6 +16,7 @@ from ertis_numba.documents import Table
 from ertis_numba.geometry.layouts import LayoutFile
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.scene import Scene
+from ertis_numba.units import unit_of
 
 __all__ = ["DOCUMENTS", "Key", "Section", "reference"]
 
@@ -28,20 +29,6 @@ DOCUMENTS: Final[dict[str, type[Table]]] = {
 """Structure of each kind of file; a mounting is a scene of which only the poses of sensors are used."""
 
 _POSE: Final = ("name", "position_m", "yaw_deg", "pitch_deg", "roll_deg")
-_UNITS: Final = {
-    "_m_s": "m/s",
-    "_dbfs": "dBFS",
-    "_percent": "%",
-    "_ppm": "ppm",
-    "_deg": "°",
-    "_hz": "Hz",
-    "_db": "dB",
-    "_mm": "mm",
-    "_pa": "Pa",
-    "_c": "°C",
-    "_m": "m",
-    "_s": "s",
-}
 _TYPES: Final = {str: "text", int: "whole number", float: "number", bool: "true or false"}
 _OF_SETTINGS: Final = {type(value) for value in msgspec.structs.astuple(Settings())}
 _ENTRY: Final = re.compile(r"^(?P<names>\w+(?:, \w+)*)(?: : (?P<type>.*))?$")
@@ -169,7 +156,7 @@ def _key(field: msgspec.structs.FieldInfo, kind: str, about: str, example: Any) 
         name=field.name,
         about=about,
         shape=_shape(field.type) + (f" {parts[0]}" if parts else ""),
-        unit=next((unit for suffix, unit in _UNITS.items() if field.name.endswith(suffix)), ""),
+        unit=unit_of(field.name)[1],
         default="required" if default is msgspec.NODEFAULT else "none" if default is None else _toml(default),
         example="" if example is None else f"{field.name} = {_toml(example)}",
     )

@@ -6,16 +6,18 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
 from click.testing import CliRunner
+from ertis_cli.emulate import _get_ready
 from ertis_cli.main import cli
 
 from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import Sonar
-from ertis_numba.errors import SonarError
+from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.simulation import Scene
@@ -299,3 +301,17 @@ def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):
     assert done.exit_code == 0, done.stderr
     with open_recording(tmp_path / "new.h5") as made:
         assert made.translation_m.tolist() == [1.0, 2.0, 3.0]
+
+
+class Unrenderable(list):
+    """Measurements of a scene that cannot be rendered at this time."""
+
+    def __getitem__(self, _):
+        raise ArgumentError("spheres[0] is 0 m from emitter of sensor")
+
+
+def test_a_pulse_survives_measurements_that_cannot_be_rendered():
+    """The device renders them again, and reports the error."""
+    registers = SimpleNamespace(armed=True, active=True, amplifier=True, n_codes=0)
+    device = SimpleNamespace(name="sensor", error=None, registers=registers)
+    _get_ready([device], {"sensor": (Unrenderable([0]), None, None)}, 3)

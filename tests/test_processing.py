@@ -1,5 +1,6 @@
 """Processing in a loop: every measurement is published, dropped for a reason, or on its way, at any moment."""
 
+import dataclasses
 import time
 
 import msgspec
@@ -10,6 +11,7 @@ from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.messages import Image, Points
 from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.status import Status
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
@@ -222,3 +224,19 @@ def test_missed_error_budget_is_logged_once_per_sensor():
         found = [fields for event, fields in loop.lines if event == "error_budget"]
     assert [fields["sensor"] for fields in found] == ["quiet"]
     assert "images may exceed the error budget" in found[0]["text"]
+
+
+@pytest.mark.parametrize("is_paper", [True, False])
+def test_images_of_no_plan_and_silence_are_not_predicted(is_paper):
+    settings = SHORT.replace(processing=SHORT.processing.replace(method="paper")) if is_paper else SHORT
+    measurement = MEASUREMENT if is_paper else dataclasses.replace(MEASUREMENT, words=np.zeros_like(MEASUREMENT.words))
+    with Pipeline(settings, predict=False) as pipeline:
+        image = pipeline.process(dataclasses.replace(measurement, settings=settings))
+    if not is_paper:
+        image = image.replace(energy=np.zeros_like(image.energy))
+    predictions = Predictions("cpu")
+    predictions.add("sensor", image, measurement)
+    found = predictions.drain()
+    while predictions.busy:
+        found += predictions.drain()
+    assert found == []

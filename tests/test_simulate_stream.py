@@ -166,3 +166,11 @@ def test_things_on_their_sensor_are_noted(changes, name):
     notes = make_plan(Scene(sensors=(SENSOR,), **changes)).notes
     assert re.match(rf"{name} is [\d.]+ mm from an emitter or a microphone of sensor at 0 s", notes[0])
     assert make_plan(scene_of(Point(range_m=0.6))).notes == ()
+
+
+def test_things_near_an_emitter_beside_the_array_are_noted():
+    beside = SENSOR.replace(emitter=SENSOR.emitter.replace(position_m=(0.0, 0.2, 0.0)))
+    near = make_plan(Scene(sensors=(beside,), points=(Point(position_m=(0.005, 0.2, 0.0)),))).notes
+    assert re.match(r"points\[0\] is 5 mm from an emitter", near[0])
+    centre = make_plan(Scene(sensors=(beside,), points=(Point(position_m=(0.0, 0.1, 0.0)),))).notes
+    assert centre == ()

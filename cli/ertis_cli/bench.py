@@ -27,6 +27,13 @@ def _count(default: int) -> Callable[..., Any]:
     )
 
 
+def _seed(about: str, *, default: int = 0) -> Callable[..., Any]:
+    """Return the option of a seed that is the same in every run unless it is given."""
+    return click.option(
+        "--seed", type=click.IntRange(min=0), default=default, show_default=True, metavar="S", help=about
+    )
+
+
 def _random_settings(default: int) -> Callable[..., Any]:
     """Return the options of a campaign over random settings."""
     count = click.option(
@@ -37,14 +44,7 @@ def _random_settings(default: int) -> Callable[..., Any]:
         metavar="N",
         help="Random settings to try.",
     )
-    seed = click.option(
-        "--seed",
-        type=click.IntRange(min=0),
-        default=0,
-        show_default=True,
-        metavar="S",
-        help="Seed of the first setting.",
-    )
+    seed = _seed("Seed of the first setting.")
     return lambda command: count(seed(command))
 
 
@@ -127,7 +127,7 @@ def budgets(**given: Any) -> None:
 @click.option(
     "--count", type=click.IntRange(min=1), default=400, show_default=True, metavar="N", help="Points of each cell."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the places.")
+@_seed("Of the places.")
 @_update
 @options.quiet
 @options.as_json
@@ -225,7 +225,7 @@ def ptx(**given: Any) -> None:
 
 @bench.command("health")
 @click.option("--long", is_flag=True, help="1,000 healthy arrays and 30 trials of each fault rather than 40 and one.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S", help="Of the scenes.")
+@_seed("Of the scenes.")
 @_update
 @options.quiet
 @options.as_json
@@ -262,7 +262,7 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
     metavar="S",
     help="Of each part; five minutes of storage and one of all else by default.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, metavar="S", help="Of the words.")
+@_seed("Of the words.", default=1)
 @click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. storage, processing, …")
 @click.option(
     "--folder",

@@ -3,7 +3,6 @@
 import errno
 import re
 import sys
-import threading
 import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -290,7 +289,7 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
     from ertis_numba.devices.ports import resolve
     from ertis_numba.errors import SonarError
 
-    end_s, never = time.monotonic() + wait_s, threading.Event()
+    end_s = time.monotonic() + wait_s
     with options.note_when_slow(f"waiting for {', '.join(ports)} ...", quiet=quiet):
         for port in ports:
             while True:
@@ -302,7 +301,7 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
                 except SonarError as error:
                     if error.errno != errno.ENOENT or time.monotonic() >= end_s:
                         raise
-                never.wait(_LOOK_S)
+                time.sleep(_LOOK_S)
 
 
 def _configured(

@@ -4,7 +4,7 @@ import json
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -232,6 +232,8 @@ def _accepts(refusal: "Refusal", name: str, demand: "Demand") -> bool:
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
     """Make the measurements of a pulse before it comes, also of devices that are about to be armed."""
+    from ertis_numba.errors import ErtisError
+
     registers = {device.name: device.registers for device in devices if device.error is None}
     if not any(each.armed for each in registers.values()):
         return
@@ -239,7 +241,8 @@ def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> Non
         words, passive, _ = given[name]
         if each.armed or each.n_codes:
             chosen = words if (each.active and each.amplifier) or passive is None else passive
-            chosen[pulse % len(chosen)]  # which keeps it
+            with suppress(ErtisError):  # the device fails on it, too, and reports it
+                chosen[pulse % len(chosen)]  # which keeps it
 
 
 def _tell(name: str, port: str, *, quiet: bool) -> None:

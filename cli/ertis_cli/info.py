@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["info"]
 
-_UNITS = {"_m_s": "m/s", "_percent": "%", "_khz": "kHz", "_hz": "Hz", "_ms": "ms", "_c": "°C", "_db": "dB", "_m": "m"}
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
 _LOOKED_AT = 8
 _WIDTH = 7  # at least
@@ -77,8 +76,10 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 def _label(name: str) -> tuple[str, str]:
     """Return the name of a figure for people, and its unit after a space."""
-    suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
-    return name.removesuffix(suffix).replace("_", " "), f" {_UNITS[suffix]}" if suffix else ""
+    from ertis_numba.units import unit_of
+
+    suffix, unit = unit_of(name)
+    return name.removesuffix(suffix).replace("_", " "), f" {unit}" if unit else ""
 
 
 def _readable(value: Any) -> str:

@@ -25,8 +25,8 @@ def layout(*, name: str | None, as_json: bool) -> None:
             click.echo(text, nl=False)
         return
     rows = [
-        {"name": each, "microphones": int(load_layout(each).enabled.sum()), "word_bits": load_layout(each).word_bits}
-        for each in layout_names()
+        {"name": each, "microphones": int(made.enabled.sum()), "word_bits": made.word_bits}
+        for each, made in ((each, load_layout(each)) for each in layout_names())
     ]
     if as_json:
         options.print_json({"layouts": rows})

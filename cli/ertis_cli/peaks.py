@@ -22,8 +22,6 @@ _FALSE_ALARM = 1e-4  # of a bin, with CFAR
 _PLACE = {"azimuth_deg": "+.2f", "elevation_deg": "+.2f", "range_m": ".3f", "level_db": ".1f"}
 _ERROR = {"angle_deg": ".3f", "range_m": "+.4f", "level_db": "+.2f"}
 _COLUMNS: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(("measurement", *_PLACE), "right")}
-_LEVEL = {"level_dbfs": ".1f"}
-_LEVEL_COLUMN: dict[str, _tables.Side] = {"level_dbfs": "right"}
 _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "angle_error_deg": "right",
     "range_error_m": "right",
@@ -120,9 +118,8 @@ def peaks(
         find = _finder(detector, _TOP if top is None else top, min_level, false_alarm, everything=everything)
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
-        levels = [[f"{row[name]:{form}}" for name, form in _LEVEL.items()] for row in rows]
-        cells = [(*_cells(row, row), *level) for row, level in zip(rows, levels, strict=True)]
-        table = _tables.Table(_COLUMNS | _LEVEL_COLUMN, cells)
+        cells = [(*_cells(row, row), f"{row['level_dbfs']:.1f}") for row in rows]
+        table = _tables.Table({**_COLUMNS, "level_dbfs": "right"}, cells)
     if as_json:
         options.print_json(report)
         return

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.simulation.effects.emitter_offset import emitter_offset
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
@@ -23,9 +24,9 @@ def notes(shot: Snapshot) -> list[str]:
 def _near_targets(shot: Snapshot) -> list[str]:
     """Return a note for each target or source so near an emitter or a microphone that amplitudes no longer grow."""
     scene, sensor = shot.scene, shot.sensor
-    ends_m = np.concatenate([shot.ear.positions_m, shot.mouth.position_m[None]])
+    ends_m = np.concatenate([shot.ear.positions_m, emitter_offset(shot, shot.number).position_m[None]])
     targets = shot.targets
-    things = [(name, place) for name, place in zip(targets.names, targets.positions_m, strict=True)]
+    things = list(zip(targets.names, targets.positions_m, strict=True))
     for kind in ("tones", "noises", "sonars"):
         sources = enumerate(getattr(scene, kind))
         things += [(f"{kind}[{number}]", source.position_at(shot.time_s)) for number, source in sources]
@@ -88,7 +89,7 @@ def require_clear(shot: Snapshot) -> None:
 def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
     """Return the sensors that emit, and the positions of their emitters."""
     return [
-        (other, mouth.position_m + other.rotation() @ np.array(other.emitter.position_m))
-        for other, mouth in zip(shot.scene.sensors, shot.mouths, strict=True)
+        (other, emitter_offset(shot, number).position_m)
+        for number, other in enumerate(shot.scene.sensors)
         if not other.emitter.silent
     ]

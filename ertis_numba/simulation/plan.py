@@ -147,13 +147,11 @@ def _decided(
     """Return the verdict on one effect beside others."""
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
-    forced = scene.effects.get(name)
-    if forced is None and (name in ASKED_FOR or not scene.tolerance_db):
-        forced = True
+    given = scene.effects.get(name)
+    forced = True if given is None and (name in ASKED_FOR or not scene.tolerance_db) else given
     estimates = _estimates(name, others, shots)
     if not estimates:
         reason = f"the scene has nothing for it: {EFFECTS[name]}"
-        given = scene.effects.get(name)
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
     worst = estimates[0][0]
     if forced is not None:

@@ -1,5 +1,6 @@
 """Pulse compression of recorded echoes: a check that a recording was made with the call that its settings name."""
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -75,7 +76,7 @@ class CallMatch:
 
 def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
     """Return the match of the first measurement with sound above the noise; None if the first 8 have none."""
-    for _, measurement in zip(range(_MAX_MEASUREMENTS), measurements, strict=False):
+    for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
         found = call_match(measurement)
         if found is not None:
             return found

@@ -17,14 +17,22 @@ from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes, require_nodes
+from ertis_numba.stages.beam_nodes import Aperture, require_nodes
 from ertis_numba.stages.beamform import beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import FilterPcm, demodulation
-from ertis_numba.stages.fitting import DelayFit, one_thread
+from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.plan_elements import ahead_of, chain_taps, ringing_db, spectrum_of, zones_of
+from ertis_numba.stages.plan_elements import (
+    ahead_of,
+    chain_taps,
+    delay_fit,
+    nodes_of,
+    ringing_db,
+    spectrum_of,
+    zones_of,
+)
 from ertis_numba.stages.window import time_window
 
 __all__ = ["FastChain"]
@@ -70,18 +78,8 @@ class FastChain:
         aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad))
         spectrum = spectrum_of(settings)
         n_phases = plan.oversampling or 1
-        step_s = 1 / (settings.output_rate_hz * n_phases)
-        fit = DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum)
-        nodes = None
-        if plan.beam_taps and aperture.n_axes in {1, 2}:
-            nodes = BeamNodes(
-                aperture,
-                spectrum,
-                n_taps=plan.beam_taps,
-                density=plan.beam_density or 2.0,
-                high_hz=settings.call.high_frequency_hz,
-                sound_speed_m_s=speed_m_s,
-            )
+        fit, step_s = delay_fit(settings, spectrum)
+        nodes = nodes_of(settings, aperture, spectrum)
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
         ahead_s = ahead_of(fit, len(own_s), step_s)

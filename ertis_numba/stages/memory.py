@@ -10,19 +10,18 @@ from ertis_numba.stages.window import time_window
 
 __all__ = ["available_bytes", "predicted_bytes", "require_memory"]
 
-# Upper bounds of what was measured for 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
-_OF_DIRECTION: Final = 2500  # tables of beam-grid points that the planner compares
-_OF_DELAY: Final = 75  # a direction and a microphone: delays, offsets, weights, and copies while they are made
-_OF_SAMPLE: Final = 32  # a microphone and a sample of its transform: signal, spectrum, filter
-_OF_POINT: Final = 4  # of an image
-
-
 _CGROUP: Final = Path("/sys/fs/cgroup")
 _CGROUP_FILES: Final = (
     ("memory.max", "memory.current"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
 """Limit and use of a control group, of versions 2 and 1."""
+
+# Upper bounds of what was measured for 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
+_OF_DIRECTION: Final = 2500  # tables of beam-grid points that the planner compares
+_OF_DELAY: Final = 75  # a direction and a microphone: delays, offsets, weights, and copies while they are made
+_OF_SAMPLE: Final = 32  # a microphone and a sample of its transform: signal, spectrum, filter
+_OF_POINT: Final = 4  # of an image
 
 
 def available_bytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = _CGROUP) -> int:

@@ -6,13 +6,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
 from ertis_numba.stages.window import time_window
 from ertis_numba.stages.zones import zone_edges
 from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
 
-__all__ = ["ahead_of", "chain_taps", "ringing_db", "spectrum_of", "zones_of"]
+__all__ = ["ahead_of", "chain_taps", "delay_fit", "nodes_of", "ringing_db", "spectrum_of", "zones_of"]
 
 _PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
 _MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
@@ -31,6 +33,28 @@ def spectrum_of(settings: Settings) -> Spectrum:
 def _spectrum_of(settings: Settings) -> Spectrum:
     """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
     return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
+
+
+def nodes_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamNodes | None:
+    """Return the beam-grid points of a complete plan; None if every direction has its own beam."""
+    plan = settings.accuracy
+    if not plan.beam_taps or aperture.n_axes not in {1, 2}:
+        return None
+    return BeamNodes(
+        aperture,
+        spectrum,
+        n_taps=plan.beam_taps,
+        density=plan.beam_density or 2.0,
+        high_hz=settings.call.high_frequency_hz,
+        sound_speed_m_s=sound_speed_m_s(settings.air),
+    )
+
+
+def delay_fit(settings: Settings, spectrum: Spectrum) -> tuple[DelayFit, float]:
+    """Return the fractional-delay filters of a complete plan, and the time between the samples that they take."""
+    plan = settings.accuracy
+    step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
+    return DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum), step_s
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:

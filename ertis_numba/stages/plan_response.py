@@ -11,8 +11,8 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
-from ertis_numba.stages.fitting import DelayFit, one_thread
-from ertis_numba.stages.plan_elements import ahead_of, spectrum_of
+from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.plan_elements import ahead_of, delay_fit, nodes_of, spectrum_of
 
 __all__ = ["Deviation", "deviation_of"]
 
@@ -65,7 +65,7 @@ def _deviation_of(settings: Settings, directions: bytes) -> Deviation | None:
 
 
 def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
-    plan, layout, spectrum = settings.accuracy, microphones(settings.array), spectrum_of(settings)
+    layout, spectrum = microphones(settings.array), spectrum_of(settings)
     aperture = Aperture.of(layout.enabled_positions_m, directions)
     speed_m_s = sound_speed_m_s(settings.air)
     is_plane = settings.processing.wavefront == "plane"
@@ -74,22 +74,12 @@ def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation 
     power = spectrum.power[chosen] / spectrum.power[chosen].sum()
     centre_hz = float(power @ frequency_hz)
     offset_hz = frequency_hz - centre_hz
-    nodes = None
-    if plan.beam_taps and aperture.n_axes in {1, 2}:
-        nodes = BeamNodes(
-            aperture,
-            spectrum,
-            n_taps=plan.beam_taps,
-            density=plan.beam_density or 2.0,
-            high_hz=settings.call.high_frequency_hz,
-            sound_speed_m_s=speed_m_s,
-        )
-    elif not is_plane:
+    nodes = nodes_of(settings, aperture, spectrum)
+    if nodes is None and not is_plane:
         return None
     points = aperture.directions if nodes is None else nodes.points
     delays_s = aperture.delays_s(points, sound_speed_m_s=speed_m_s)
-    step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
-    fit = DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum)
+    fit, step_s = delay_fit(settings, spectrum)
     ahead_s = ahead_of(fit, delays_s.shape[1], step_s)
     taken_s = layout.delay_s[layout.enabled] - ahead_s + delays_s
     first, fractions = fit.split(taken_s)

@@ -137,7 +137,7 @@ class Planner:
         wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
         # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
-        # that of the beams; see `prediction` for the warning.
+        # that of the beams; see `ertis_numba.prediction` for the warning.
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
@@ -151,7 +151,8 @@ class Planner:
                 rated += self._rated(plans, sizes, usual + 1, limit)
                 within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
         if not rated:
-            has = "the limit is" if self._max_bytes is not None else "this machine has available"
+            measured = self._max_bytes is None and limit > _USUAL_BYTES
+            has = "this machine has available" if measured else "the limit is"
             raise ArgumentError(
                 f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
                 "Give a later or shorter processing.range_m, fewer directions or "

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.geometry import mounting
-from ertis_numba.storage.schema import describe
+from ertis_numba.storage.schema import describe, plain
 
 __all__ = ["describe_mounting", "read_mounting"]
 
@@ -38,7 +38,7 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
         The attributes are no mounting.
     """
     said = group.attrs
-    status = _text(said["mounting"]) if "mounting" in said else ""
+    status = str(plain(said["mounting"])) if "mounting" in said else ""
     if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & said.keys()):
         return None, None
     if status not in {"", _GIVEN}:
@@ -52,7 +52,3 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
     if not status and "truth" not in group and (*translation_m.tolist(), *rotation_xyzw.tolist()) == _ORIGIN:
         return None, None
     return translation_m, rotation_xyzw
-
-
-def _text(value: object) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

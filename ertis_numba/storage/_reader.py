@@ -12,17 +12,16 @@ from types import TracebackType
 from typing import ClassVar, Self, TypeVar, overload
 
 import h5py
-import numpy as np
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError, SettingsError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
+from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256, plain
 from ertis_numba.storage.structure import child, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import Truth, read_truth
 
-__all__ = ["Reader", "file_kind", "plain", "sensor_names"]
+__all__ = ["Reader", "file_kind", "sensor_names"]
 
 Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
@@ -278,13 +277,6 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
             f"{path} has format version {version}, this package reads up to {FORMAT_VERSION}; update ertis-numba"
         )
     return str(kind)
-
-
-def plain(value: object) -> object:
-    """Return what an attribute holds as Python has it."""
-    if isinstance(value, bytes):
-        return value.decode(errors="replace")
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _reason(error: BaseException) -> str:

@@ -22,7 +22,7 @@ from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out
+from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out, plain
 from ertis_numba.storage.truth import Truth, TruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
@@ -259,7 +259,7 @@ class EnergyscapeReader(Reader[Energyscape]):
             for name in ("predicted_error_db", "max_error_db", "wavefront_error_db")
         )
         self.budget_applies_to, self.error_warning, self.call_warning = (
-            _text(said.get(name, "")) for name in ("budget_applies_to", "error_warning", "call_warning")
+            str(plain(said.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
@@ -275,10 +275,6 @@ class EnergyscapeReader(Reader[Energyscape]):
             settings=self.settings,
             stamp=self._rows.stamp(index, self.sensor),
         )
-
-
-def _text(value: object) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def _number(path: Path, name: str, value: Any) -> float:

@@ -18,10 +18,10 @@ from ertis_numba.geometry import mounting as mounted
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._gaps import Missing
 from ertis_numba.storage._mounting import describe_mounting, read_mounting
-from ertis_numba.storage._reader import Reader, plain
+from ertis_numba.storage._reader import Reader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
-from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out
+from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out, plain
 from ertis_numba.storage.truth import Truth, TruthLog
 from ertis_numba.waveform import call_samples
 from ertis_numba.words import WordFormat, word_format

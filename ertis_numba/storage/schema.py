@@ -35,6 +35,7 @@ __all__ = [
     "date_created",
     "describe",
     "lay_out",
+    "plain",
     "sensor_path",
     "software_versions",
     "text_type",
@@ -220,6 +221,13 @@ def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[s
             owner.attrs.create(name, text, dtype=text_type(len(text)))
         else:
             owner.attrs[name] = value
+
+
+def plain(value: object) -> object:
+    """Return what an attribute holds as Python has it."""
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def text_type(n_bytes: int) -> np.dtype[Any]:

@@ -15,7 +15,7 @@ from ertis_numba import checks
 from ertis_numba.atomic import remedy
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
-from ertis_numba.storage.schema import TRUTH, describe, lay_out, text_type
+from ertis_numba.storage.schema import TRUTH, describe, lay_out, plain, text_type
 
 __all__ = ["Truth", "TruthLog", "read_truth", "write_truth"]
 
@@ -232,12 +232,12 @@ def read_truth(group: h5py.Group) -> Truth | None:
                 for target in range(n_targets)
             )
         )
-    left_out = group.attrs.get("effects_left_out", b"")  # of older files, unknown
+    left_out = str(plain(group.attrs.get("effects_left_out", b"")))  # of older files, unknown
     return Truth(
         scene=group["scene"][()].decode(),
         seed=int(group.attrs["seed"]),
         reflectors=tuple(rows),
-        left_out=tuple(bytes(left_out).decode().split()),
+        left_out=tuple(left_out.split()),
     )
 
 

@@ -59,10 +59,12 @@ class Predictions:
         else:
             text = match.warning if match else ""
         if text:
-            self._found.append(Predicted(sensor=sensor, warning=text))
+            self._found.append(Predicted(sensor=sensor, event="call_mismatch", warning=text))
 
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
         self._report_call(sensor, measurement)
+        if image.settings.processing.method == "paper" or not image.energy.any():
+            return  # the paper's method has no plan, and silence no relative error
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
         from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
 
@@ -75,4 +77,4 @@ class Predictions:
         except Exception as error:  # noqa: BLE001  a failed prediction must not end a worker that makes images
             text = f"the error of images is not predicted: {type(error).__name__}: {error}"
         if text:
-            self._found.append(Predicted(sensor=sensor, warning=text))
+            self._found.append(Predicted(sensor=sensor, event="error_budget", warning=text))

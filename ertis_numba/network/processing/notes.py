@@ -123,9 +123,10 @@ class Failed(_Note, frozen=True, kw_only=True):
 
 
 class Predicted(_Note, frozen=True, kw_only=True):
-    """Warning that a sensor's images may exceed their error budget."""
+    """Warning about a sensor's images, and the log event that reports it."""
 
     sensor: str
+    event: Literal["error_budget", "call_mismatch"]
     warning: str
 
 

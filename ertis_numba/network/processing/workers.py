@@ -222,8 +222,8 @@ class Workers:
                 worker.preparing, worker.deadline_s = None, float("inf")
                 if self._kinds.pop(kind, None) is not None:
                     return [KindFailed(kind, text)]
-            case Predicted(sensor=sensor, warning=warning):
-                self._log.warning("error_budget", sensor=sensor, text=warning)
+            case Predicted(sensor=sensor, event=event, warning=warning):
+                self._log.warning(event, sensor=sensor, text=warning)
             case Made() | Failed():
                 return self._finished(worker, note)
         return []
