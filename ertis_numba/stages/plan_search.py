@@ -3,7 +3,7 @@
 import itertools
 import math
 
-from ertis_numba.settings import INTERPOLATIONS, MOST_ZONES
+from ertis_numba.settings import INTERPOLATIONS, MAX_ZONES
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES
 from ertis_numba.stages.plan_model import COARSEST_STOP_BAND_DB, Plan, PlanModel
 
@@ -109,6 +109,6 @@ def _zone_count(model: PlanModel, budget: float) -> int:
     if model.settings.processing.wavefront == "plane":
         return 1
     count = 1
-    while model.zone_error(count) > _SMALL * budget and count < MOST_ZONES:
-        count = min(MOST_ZONES, max(count + 1, math.ceil(1.2 * count)))
+    while model.zone_error(count) > _SMALL * budget and count < MAX_ZONES:
+        count = min(MAX_ZONES, max(count + 1, math.ceil(1.2 * count)))
     return count
