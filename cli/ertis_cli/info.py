@@ -82,7 +82,7 @@ def _label(name: str) -> tuple[str, str]:
 
 
 def _readable(value: Any) -> str:
-    """Return a value for people: lists without brackets, and times in UTC without digits that nobody reads."""
+    """Format a value for display: lists without brackets, times in UTC to the millisecond."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):
