@@ -47,7 +47,7 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """What a choice of nodes means: how many, their errors, and the sum of a beam's squared weights."""
+    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights."""
 
     count: int
     n_pairs: int
@@ -57,7 +57,7 @@ class Nodes:
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """What a choice of samples means."""
+    """Predicted properties of a delay interpolation."""
 
     n_taps: int
     error: float

@@ -13,7 +13,7 @@ _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
 _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
 _STOP_BANDS_DB = (COARSEST_STOP_BAND_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
-_STOP_BANDS = 3  # of them are tried: more damping than that is of no use
+_STOP_BANDS = 3  # number of candidates; more attenuation brings no benefit
 _NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
