@@ -138,7 +138,7 @@ class Mainboard:
         return True
 
     def _refuses(self, *, judge: bool) -> bool:
-        """Return True if there are no measurements for what the device was told; ask only if it is told all."""
+        """Return True if no measurements exist for the registers; check new registers only if ``judge`` is set."""
         if judge and self._is_new and self._accepts is not None:
             self._is_new = False
             self._is_refused = not self._accepts(self.registers.demand)
