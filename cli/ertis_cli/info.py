@@ -76,7 +76,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _label(name: str) -> tuple[str, str]:
-    """Return the name of a figure for people, and its unit after a space."""
+    """Return a key in words, and its unit after a space."""
     suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
     return name.removesuffix(suffix).replace("_", " "), f" {_UNITS[suffix]}" if suffix else ""
 
