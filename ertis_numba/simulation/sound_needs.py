@@ -52,7 +52,7 @@ def sync_delay(sight: Sight) -> Estimate | None:
 
 
 def direct_sound(sight: Sight) -> Estimate | None:
-    """Estimate the direct sound that reaches into the image."""
+    """Compare the direct sound that reaches into the image with the reflectors."""
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None

@@ -1,4 +1,4 @@
-"""Search space of the planner: the plans that settings leave open."""
+"""Search space of the planner: the plans that settings permit."""
 
 import itertools
 import math
@@ -19,13 +19,13 @@ _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
 def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Plan]:
-    """Return the plans that the settings leave open, without those that are needlessly exact.
+    """Return the plans that the settings permit, except needlessly exact ones.
 
     Parameters
     ----------
     model : PlanModel
     budget : float
-        Error power that a plan may have.
+        Largest error power of a plan.
     has_int16 : bool
         The device has a dot product of 16-bit numbers.
     """
