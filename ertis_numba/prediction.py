@@ -117,8 +117,10 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     threads : int
     """
     settings = image.settings
-    texture = texture_of(measurement, settings, kernels, threads=threads)
-    if settings.processing.beamformer == "delay_and_sum":
+    adaptive = settings.processing.beamformer != "delay_and_sum"
+    energy = None if adaptive else image.energy
+    texture = texture_of(measurement, settings, kernels, threads=threads, energy=energy)
+    if not adaptive:
         return Planner(settings, kernels, threads=threads, texture=texture)
     # Imported here because it takes 0.1 s, and other images need none of it.
     from ertis_numba.verification import sampled_error_db  # noqa: PLC0415
@@ -148,11 +150,12 @@ def predict(planner: Planner) -> Prediction:
 
 
 def memory_bytes(image: Energyscape) -> int:
-    """Return an estimate of the memory for a prediction: signals, a rough image, its squares and its tables."""
-    settings = image.settings
-    n_mics = int(microphones(settings.array).enabled.sum())
-    n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
-    table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
+    """Return an estimate of the memory for a prediction: signals, squares of an image, and tables of a rough one."""
+    settings, table = image.settings, 0
+    if settings.processing.beamformer != "delay_and_sum":
+        n_mics = int(microphones(settings.array).enabled.sum())
+        n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
+        table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
     return table + 20 * image.energy.size + _BYTES_PER_SAMPLE * settings.recording.n_samples
 
 

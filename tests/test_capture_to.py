@@ -302,7 +302,7 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
         (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, and a measurement has 0.131 MB; give", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, and a", 1),
         (["--mounting", "none.toml"], "none.toml", 1),
-        (["--mounting", "empty.toml"], "says nothing of sensor 'one'; add it, or call it one of sensor by --name", 1),
+        (["--mounting", "empty.toml"], "does not hold sensor 'one'; add it, or choose one of sensor by --name", 1),
     ],
 )
 def test_errors_are_one_line(tmp_path, arguments, message, code):

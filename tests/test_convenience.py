@@ -1,4 +1,4 @@
-"""What users try first in Python: arrays of images, paths of settings, and arguments of the wrong kind."""
+"""Images as arrays, settings paths, argument checks, and noise thresholds of peaks."""
 
 import json
 

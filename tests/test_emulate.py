@@ -184,7 +184,7 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
         ask(port, b"!G,131072,0,0\n")
         for counter, active in enumerate((1, 1, 0, 1)):
             port.write(b"!A,%d,0,0\n" % active)
-            heard = scene if active else silent  # with all effects: to decide which ones matter takes longer
+            heard = scene if active else silent  # with all effects: determining the relevant ones takes longer
             words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).words
             assert is_block(block(port), counter, words)
     assert ended(process, signal.SIGTERM) == (143, "", "")
@@ -216,13 +216,13 @@ def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
 
 
 def captured(port, settings):
-    """Tell a device what ``ertis capture`` tells it, and measure once."""
+    """Configure a device as ``ertis capture`` does, and measure once."""
     with Sonar.open(port) as sonar:
         sonar.configure(Setup.of(settings))
         return sonar.measure().words
 
 
-def test_a_scene_is_rendered_for_the_call_that_a_sensor_is_given(emulate, tmp_path):
+def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--quiet")
     settings = Settings.from_preset("short_20_80")
@@ -237,7 +237,7 @@ def test_a_scene_is_rendered_for_the_call_that_a_sensor_is_given(emulate, tmp_pa
 @pytest.mark.parametrize(
     ("source", "told"),
     [
-        ("scene", "only was given a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"),
+        ("scene", "only received a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"),
         ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),
     ],
 )
@@ -249,8 +249,8 @@ def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, so
         call=Call(start_frequency_hz=25e3, stop_frequency_hz=50e3), recording=Recording(n_samples=N_SAMPLES)
     )
     settings = settings.replace(processing=Processing(range_m=(0.3, 0.5)))
-    for _ in range(2):  # the second time, the device still holds the call
-        with pytest.raises(SonarError, match="'ertis emulate' tells why"):
+    for _ in range(2):  # the device still holds the call at the second attempt
+        with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
             captured(port, settings)
         assert process.stderr.readline().startswith(f"ertis: warning: {told}")
     accepted = settings.replace(call=Call())
@@ -269,7 +269,7 @@ def test_a_point_on_a_sensor_is_reported(emulate, tmp_path):
 
 
 def test_pulses_wait_until_a_scene_is_rendered(emulate, tmp_path):
-    """With a SYNC line the port is there before anything is rendered, and all pulses have their words."""
+    """With a SYNC line, the port exists before anything is rendered, and every pulse has its measurement."""
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--sync-rate", 5)
     with Sonar.open(process.stdout.readline().rstrip()) as sonar:

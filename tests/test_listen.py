@@ -229,7 +229,7 @@ def test_refuses_usage(arguments, match):
 def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
     monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.0)
     heard = Heard(as_json=False, quiet=False)
-    heard.silent("tcp://here", ("energyscape",), 0)  # nobody answers yet, which is reported elsewhere
+    heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet, which is reported elsewhere
     heard.subscribed("tcp://here", (), ("energyscape",))
     for _ in range(2):
         heard.silent("tcp://here", ("energyscape",), n_received)

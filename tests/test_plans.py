@@ -67,7 +67,9 @@ def test_explains_in_words(recording, tmp_path):
     plain = run(recording, "-o", tmp_path / "a.h5", "--explain")
     assert plain.stdout == ""
     lines = plain.stderr.splitlines()
-    lines = [line for line in lines if not line.startswith(("ertis:", "note:", "eRTIS-7: plane", str(tmp_path)))]
+    lines = [
+        line for line in lines if not line.startswith(("ertis:", "note:", "eRTIS-7: the error of plane", str(tmp_path)))
+    ]
     assert lines[0] == "plan of eRTIS-7, for an error of -35 dB at the most:"
     assert "against spherical ones" in plain.stderr
     assert any(line.startswith("    interpolation of delayed samples") for line in lines)
@@ -108,7 +110,7 @@ def test_verifies(recording, tmp_path, wavefront):
 
 def test_verifies_in_words(recording, tmp_path):
     told = run(recording, "-o", tmp_path / "a.h5", "--verify").stderr.splitlines()
-    told = [line for line in told if not line.startswith("eRTIS-7: plane wavefronts")]
+    told = [line for line in told if not line.startswith("eRTIS-7: the error of plane wavefronts")]
     assert told[0].startswith("measurement 10 of eRTIS-7: error -")
     assert told[0].endswith("allowed -35 dB")
     assert told[1].startswith("  10 of the strongest 10 reflectors found, within ")

@@ -120,8 +120,8 @@ def test_interrupted_command_does_not_finalise_what_it_has_interrupted():
     assert (done.returncode, done.stderr) == (143, "")
 
 
-def test_ctrl_c_in_code_that_is_made_of_text_exits_with_its_code(tmp_path):
-    """Python would end itself by SIGINT, as such code makes it believe that nobody handles the exception."""
+def test_ctrl_c_in_code_run_by_exec_exits_with_code_130(tmp_path):
+    """Python by default ends itself by SIGINT, because code run by `exec` makes it treat the exception as unhandled."""
     (tmp_path / "sitecustomize.py").write_text(
         """
 import signal, sys

@@ -138,7 +138,7 @@ def test_recordings_without_a_mounting_are_exported_in_the_sensors_own_frame(tmp
         assert (recording.translation_m, recording.rotation_xyzw) == (None, None)
     done = CliRunner().invoke(cli, ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"])
     assert done.exit_code == 0, done.stderr
-    assert "note: the mounting of sensor left is unknown; all is in the frame of the sensor" in done.stderr
+    assert "note: the mounting of sensor left is unknown; the export is in the frame of the sensor" in done.stderr
     assert "frame left" in plyfile.PlyData.read(tmp_path / "a.ply").comments
     info = CliRunner().invoke(cli, ["info", str(path), "--json"])
     assert '"mounting": "unknown"' in info.stdout

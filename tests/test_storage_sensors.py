@@ -124,7 +124,7 @@ def test_mounting_is_kept(tmp_path):
         assert left.translation_m.tolist() == [1.0, -2.0, 0.5]
         assert left.rotation_xyzw.tolist() == list(TURNED)
         assert left.rotation_xyzw.dtype == np.float64
-        assert (right.translation_m, right.rotation_xyzw) == (None, None)  # nobody gave one
+        assert (right.translation_m, right.rotation_xyzw) == (None, None)  # none was given
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_process_prints_and_stores_the_error_of_plane_wavefronts(tmp_path):
     write_recording(tmp_path / "rec.h5", [heard(CALL)])
     arguments = ["process", str(tmp_path / "rec.h5"), "-o", str(tmp_path / "image.h5"), "--force"]
     done = CliRunner().invoke(cli, arguments)
-    assert "plane wavefronts err by up to" in done.stderr
+    assert "the error of plane wavefronts is up to" in done.stderr
     with open_energyscapes(tmp_path / "image.h5") as images:
         assert images.wavefront_error_db > images.max_error_db
     done = CliRunner().invoke(cli, [*arguments, "--wavefront", "auto"])

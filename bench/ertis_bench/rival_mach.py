@@ -54,7 +54,9 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
     """
     chain = FastChain(settings, kernels.load(device), threads=1)
     image = chain.new_image()
-    analytic, lead = chain.analytic(measurement.words.reshape(settings.recording.n_samples, -1), image)
+    words = measurement.words.reshape(settings.recording.n_samples, -1)
+    analytic, lead = chain.analytic(words)
+    chain.process(words, image)
     speed_m_s, layout = sound_speed_m_s(settings.air), microphones(settings.array)
     n_mics, n_phases, n_outputs = analytic.shape
     rate_hz = settings.output_rate_hz * n_phases

@@ -8,7 +8,7 @@ def main() -> None:
     import signal
 
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are there, which takes some imports
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are installed, after some imports
     from ertis_cli._signals import interruption, leave, obey_signals
 
     obey_signals()

@@ -1,4 +1,4 @@
-"""Words of emulated sensors: rendered for the call that a sensor was given, or replayed from a recording."""
+"""Samples of emulated sensors: rendered for the call that a sensor received, or replayed from a recording."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -8,27 +8,27 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ertis_numba.devices.emulator import Demand
+    from ertis_numba.devices.emulator import DeviceConfig
     from ertis_numba.settings import Call, Recording
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.engine import Engine
     from ertis_numba.storage import RecordingReader
 
-__all__ = ["Replayed", "Stage"]
+__all__ = ["Replayed", "SceneRenderer"]
 
 
-class _Told(NamedTuple):
-    """Part of the settings that a sensor was told."""
+class _SensorConfig(NamedTuple):
+    """Settings that the host can change: call and recording."""
 
     call: "Call"
     recording: "Recording"
 
 
-class Stage:
-    """Measurements of a scene's sensors, rendered when they are first needed.
+class SceneRenderer:
+    """Renderer of the measurements of a scene's sensors, each when it is first needed.
 
-    All effects are simulated, except those that the scene switches off. This takes longer than rendering the effects
-    that matter, but much less than finding out which ones do.
+    All effects are simulated, except those that the scene switches off. This takes longer than rendering only the
+    relevant effects, but much less time than determining them.
 
     Parameters
     ----------
@@ -37,32 +37,32 @@ class Stage:
 
     def __init__(self, scene: "Scene") -> None:
         self._scene = scene
-        self._told = {sensor.name: _Told(sensor.call, sensor.recording) for sensor in scene.sensors}
+        self._configs = {sensor.name: _SensorConfig(sensor.call, sensor.recording) for sensor in scene.sensors}
         self._engines: dict[tuple[str, bool], Engine] = {}
         self._words: dict[tuple[str, bool, int], NDArray[np.uint32]] = {}
         self._turn = threading.Lock()
 
-    def refusal(self, name: str, demand: "Demand") -> str:
-        """Render for what a sensor was told from now on; return why that is impossible, or an empty text."""
+    def refusal(self, name: str, config: "DeviceConfig") -> str:
+        """Render for this configuration from now on; return the reason if that is impossible, or an empty text."""
         from ertis_numba.settings import PRESETS, Settings
 
         sensor = self._scene.sensor(name)
         calls = [sensor.call, *(Settings.from_preset(preset).call for preset in PRESETS)]
-        call = next((each for each in calls if demand.holds(each)), None)
+        call = next((each for each in calls if config.holds(each)), None)
         if call is None:
             return (
-                f"{name} was given a call that is neither a preset's nor its scene's ({_described(sensor.call)}). It "
-                "measures nothing; give 'ertis capture' a --preset, or --settings with the scene's call"
+                f"{name} received a call that is neither a preset's nor its scene's ({_described(sensor.call)}). It "
+                "does not measure; give 'ertis capture' a --preset, or --settings with the scene's call"
             )
-        recording = sensor.recording.replace(n_samples=demand.n_samples, sample_rate_hz=demand.pdm_rate_hz)
+        recording = sensor.recording.replace(n_samples=config.n_samples, sample_rate_hz=config.pdm_rate_hz)
         with self._turn:
-            if self._told[name] != (told := _Told(call, recording)):
-                self._told[name] = told
+            if self._configs[name] != (wanted := _SensorConfig(call, recording)):
+                self._configs[name] = wanted
                 self._engines, self._words = {}, {}
         return ""
 
     def of(self, name: str, *, active: bool) -> "Sequence[NDArray[np.uint32]]":
-        """Return the measurements of a sensor, with all sensors silent if they are not active."""
+        """Return the measurements of a sensor; unless ``active``, all sensors are silent."""
         return _Words(self, name, active=active)
 
     def words(self, name: str, index: int, *, active: bool) -> "NDArray[np.uint32]":
@@ -88,9 +88,9 @@ class Stage:
             scene = self._scene.replace(
                 sensors=tuple(
                     sensor.replace(
-                        **self._told[sensor.name]._asdict(),
+                        **self._configs[sensor.name]._asdict(),
                         processing=suit_ranges(
-                            Processing(), self._told[sensor.name].recording, self._told[sensor.name].call
+                            Processing(), self._configs[sensor.name].recording, self._configs[sensor.name].call
                         ),
                         emitter=sensor.emitter if active else sensor.emitter.replace(silent=True),
                     )
@@ -102,14 +102,14 @@ class Stage:
 
 
 class _Words(Sequence["NDArray[np.uint32]"]):
-    def __init__(self, stage: Stage, name: str, *, active: bool) -> None:
-        self._stage, self._name, self._active = stage, name, active
+    def __init__(self, renderer: SceneRenderer, name: str, *, active: bool) -> None:
+        self._renderer, self._name, self._active = renderer, name, active
 
     def __len__(self) -> int:
-        return self._stage.count
+        return self._renderer.count
 
     def __getitem__(self, index: Any) -> Any:
-        return self._stage.words(self._name, index, active=self._active)
+        return self._renderer.words(self._name, index, active=self._active)
 
 
 class Replayed(Sequence["NDArray[np.uint32]"]):
@@ -124,20 +124,20 @@ class Replayed(Sequence["NDArray[np.uint32]"]):
     def __getitem__(self, index: Any) -> Any:
         return self._recording[index].words
 
-    def refusal(self, name: str, demand: "Demand") -> str:
-        """Return why the recording is no answer to what the sensor was told, or an empty text."""
+    def refusal(self, name: str, config: "DeviceConfig") -> str:
+        """Return the reason if the recording does not match this configuration, or an empty text."""
         call, recording = self._recording.settings.call, self._recording.settings.recording
         fits = (
-            demand.holds(call)
-            and demand.n_samples <= recording.n_samples
-            and demand.pdm_rate_hz == recording.sample_rate_hz
+            config.holds(call)
+            and config.n_samples <= recording.n_samples
+            and config.pdm_rate_hz == recording.sample_rate_hz
         )
         if fits:
             return ""
         return (
             f"{name} was recorded with a call of {_described(call)} and {recording.n_samples} samples at "
-            f"{recording.sample_rate_hz / 1e6:g} MHz. It was told otherwise, and measures nothing; give "
-            f"'ertis capture' {_remedy(call, recording)}"
+            f"{recording.sample_rate_hz / 1e6:g} MHz. It received other settings and does not measure; "
+            f"give 'ertis capture' {_remedy(call, recording)}"
         )
 
 

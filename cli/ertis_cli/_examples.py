@@ -11,11 +11,11 @@ from ertis_cli._config import instead
 __all__ = ["description", "examples", "named"]
 
 _FOLDERS: Final = (("ertis_examples", ()), ("ertis_examples.synthetic", ()), ("ertis_examples.synthetic", ("scenes",)))
-"""Packages and folders in them that have files to copy."""
+"""Packages, and folders in them, with files to copy."""
 
 _SUFFIXES: Final = {".toml", ".h5", ".py"}
 _TOOLS: Final = {"__init__.py", "build.py", "gallery.py"}
-"""Files of these packages that are no examples."""
+"""Files of these packages that are not examples."""
 
 
 def examples() -> dict[str, Traversable]:
@@ -48,7 +48,7 @@ def named(name: str) -> dict[str, Traversable]:
 
 
 def description(name: str, item: Traversable) -> str:
-    """Return the first sentence that a file says about itself."""
+    """Return the first sentence of a file's own description."""
     suffix = PurePath(name).suffix
     if suffix == ".h5":
         return f"Recording simulated from {PurePath(name).stem}.toml."

@@ -54,7 +54,7 @@ class Heard:
         self._said = True
 
     def silent(self, address: str, products: tuple[str, ...], n_received: int) -> None:
-        """Report, after a while and once, that a publisher answers but nothing has come."""
+        """Report once, after a delay, that a connected publisher has sent nothing."""
         if self._subscribed_s is None or (not n_received and time.monotonic() - self._subscribed_s < _SILENT_S):
             return
         self._subscribed_s = None

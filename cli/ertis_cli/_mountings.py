@@ -1,4 +1,4 @@
-"""Mountings of sensors: read from a file that was given, and reported if they are unknown."""
+"""Mountings of sensors: read from a file, and reported if they are unknown."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -19,12 +19,12 @@ mounting: "Decorator" = click.option(
     "--mounting",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Where sensors are on their platform: a scene, its [[sensors]], or a recording that holds it.",
+    help="Mountings of sensors on their platform: a scene, its [[sensors]], or a recording that holds them.",
 )
 
 
 def mountings(path: Path | None, sensors: Iterable[str]) -> dict[str, Mounting] | None:
-    """Return where sensors are, which a scene says when it begins; None without a file.
+    """Return the mountings of sensors, in a scene those at its start; None without a file.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def mountings(path: Path | None, sensors: Iterable[str]) -> dict[str, Mounting] 
     for name in sensors:
         if name not in known:
             raise ArgumentError(
-                f"{path} says nothing of sensor {name!r}; add it, or call it one of {', '.join(known)} by --name"
+                f"{path} does not hold sensor {name!r}; add it, or choose one of {', '.join(known)} by --name"
                 if known
                 else f"{path} does not hold the mounting of any sensor; give a scene, or its [[sensors]]"
             )

@@ -38,7 +38,7 @@ def said_of(sensor: str, told: dict[str, Any]) -> Iterator[str]:
         yield from _explained(sensor, told["plan"])
     if "wavefront_error_db" in told:
         yield (
-            f"{sensor}: plane wavefronts err by up to {told['wavefront_error_db']:.1f} dB at "
+            f"{sensor}: the error of plane wavefronts is up to {told['wavefront_error_db']:.1f} dB at "
             f"{told['wavefront_error_range_m']:g} m, in addition to the error budget; --wavefront auto corrects it"
         )
     if "verified" in told:

@@ -39,7 +39,7 @@ class Interruption:
     Attributes
     ----------
     asked : bool
-        A signal has asked the command to end, whichever handler it had.
+        A signal has requested the command to end.
     """
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["capture"]
 
-_LOOK_S = 0.1  # how often ports are looked for
+_LOOK_S = 0.1  # interval between searches for ports
 
 
 @click.command()
@@ -72,7 +72,7 @@ _LOOK_S = 0.1  # how often ports are looked for
     default=0.0,
     show_default=True,
     metavar="S",
-    help="Wait so many seconds for ports that are not there yet.",
+    help="Seconds to wait for ports that do not exist yet.",
 )
 @click.option(
     "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor, or SYNC pulses."
@@ -280,12 +280,12 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
 
 
 def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> None:
-    remedy = "give --mounting FILE to lay their images over one another"
+    remedy = "give --mounting FILE to combine their images"
     _mountings.note_unknown(sensors if path is None else [], remedy, quiet=quiet)
 
 
 def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
-    """Wait until all ports are there, or refuse the first that is not."""
+    """Wait until all ports exist; raise an error for the first that does not in time."""
     from ertis_numba.devices.ports import resolve
     from ertis_numba.errors import SonarError
 

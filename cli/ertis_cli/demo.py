@@ -30,7 +30,7 @@ _WRITTEN: Final = (
     "image.h5",
     "image.png",
 )
-"""Names of all that a demo writes to its folder."""
+"""Names of all files and folders that a demo writes."""
 
 _NODE: Final = (sys.executable, "-m", "ertis_cli")
 _ANY_PORT: Final = "tcp://127.0.0.1:0"
@@ -73,7 +73,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     run = _Run(os.environ | sensors, quiet=quiet)
     ports = [word for name in _SENSORS for word in ("--port", name)]
     with ExitStack() as nodes:
-        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # which shows its progress
+        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
         nodes.enter_context(run.node(*emulating, output=folder / "emulate.jsonl"))
         serving = ("serve", "--listen", _ANY_PORT, "--publish", _ANY_PORT, "--record", folder / "recordings")
         central = nodes.enter_context(run.node(*serving, "--json", "--quiet", output=folder / "serve.jsonl"))
@@ -87,19 +87,19 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
         run("status", central["address"], "--once")
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
-    run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may be too late for a pulse
+    run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse
     run("process", recordings[0], "--sensor", _SENSORS[0], "--output", image, "--directions", "2d:181")
     run("peaks", image, "--measurement", "0")
     run("plot", image, "--output", folder / "image.png")
 
 
 def _make(folder: Path, *, force: bool) -> None:
-    """Make the folder, and remove what an earlier demo has left in it.
+    """Make the folder, and remove the files of an earlier demo.
 
     Raises
     ------
     ArgumentError
-        Files of an earlier demo are there, and may not be replaced.
+        Files of an earlier demo exist and may not be replaced.
     """
     from ertis_numba.errors import ArgumentError
 
@@ -138,7 +138,7 @@ class _Run:
         Raises
         ------
         ClickException
-            It has failed.
+            The command has failed.
         """
         typed = self._printed(words)
         done = subprocess.run([*_NODE, *map(str, words)], env=self._environment, check=False)  # noqa: S603  our own
@@ -152,7 +152,7 @@ class _Run:
         Raises
         ------
         ClickException
-            It has ended before it was ready.
+            The command has ended before it was ready.
         """
         typed = self._printed(words)
         with output.open("wb") as file:

@@ -17,11 +17,11 @@ from ertis_cli._signals import broken_off_by_signals, interrupt_later, stopped_b
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ertis_cli._emulation import Stage
-    from ertis_numba.devices.emulator import Demand, Emulator
+    from ertis_cli._emulation import SceneRenderer
+    from ertis_numba.devices.emulator import DeviceConfig, Emulator
 
-    Refusal = Callable[[str, Demand], str]
-    # By sensor: measurements, those without emission, and why there are none for what the sensor was told.
+    Refusal = Callable[[str, DeviceConfig], str]
+    # By sensor: measurements, measurements without emission, and the check of a configuration.
     Given = Mapping[str, tuple[Any, Any, Refusal]]
 
 __all__ = ["emulate"]
@@ -100,11 +100,11 @@ def emulate(
     commands of a real one, and measures what the scene lets it hear, or what was recorded, over and over.
     Measurements without emission are those of the scene while all sensors are silent.
 
-    A scene is rendered for the call that 'ertis capture' gives the sensor: that of the scene or of a preset. Without
-    --sync-rate, all measurements with the scene's call are rendered first. With it, they are rendered as pulses come,
-    and the first pulses come more slowly. A recording has one call only; with another one, the sensor does not measure.
+    A scene is rendered for the call that 'ertis capture' uploads: the scene's own or that of a preset. Without
+    --sync-rate, all measurements with the scene's call are rendered first. With it, each is rendered at its pulse, and
+    the first pulses are slower. A recording has one call only; with any other, the sensor does not measure.
 
-    The same file gives 'ertis capture' the mounting of the sensors: --mounting SCENE.toml|REC.h5.
+    'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
     from ertis_numba.devices.emulator import Emulator, SyncChain
     from ertis_numba.devices.emulator.faults import Faults
@@ -126,10 +126,10 @@ def emulate(
         links = {name: link or emulated_folder() / name for name in names}
         for each in links.values():  # the same
             HeldLink(each).release()
-        stage = _staged(path, names, count=count, seed=seed, quiet=quiet) if is_scene else None
-        if stage is not None and sync_rate is None:
-            _render_all(stage, names, quiet=quiet)
-        given = _replayed(path, names, stack) if stage is None else _rendered(stage, names)
+        renderer = _renderer(path, names, count=count, seed=seed, quiet=quiet) if is_scene else None
+        if renderer is not None and sync_rate is None:
+            _render_all(renderer, names, quiet=quiet)
+        given = _replayed(path, names, stack) if renderer is None else _rendered(renderer, names)
         log = None if log_path is None else stack.enter_context(log_path.open("a", encoding="utf-8"))
         devices = [
             stack.enter_context(
@@ -153,9 +153,9 @@ def emulate(
         ended = threading.Event()
         signals.obey(ended.set)
         if sync_rate is not None:
-            if stage is not None:
-                told = f"{options.counted(stage.count, 'measurement')} of each sensor"
-                options.say(f"rendering {told} as pulses come; the first round is slower", quiet=quiet)
+            if renderer is not None:
+                measurements = f"{options.counted(renderer.count, 'measurement')} of each sensor"
+                options.say(f"rendering {measurements} as pulses come; the first round is slower", quiet=quiet)
             stack.enter_context(SyncChain(devices, sync_rate, before=partial(_get_ready, devices, given)))
         _look_after(devices, sorted(absences), ended)
     options.say("the emulated sensors have ended", quiet=quiet)
@@ -181,9 +181,11 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
     return list(settings)
 
 
-def _staged(path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool) -> "Stage":
+def _renderer(
+    path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool
+) -> "SceneRenderer":
     """Return the scene, ready to be rendered; the first run compiles kernels."""
-    from ertis_cli._emulation import Stage
+    from ertis_cli._emulation import SceneRenderer
     from ertis_numba.simulation import limits, load_scene
     from ertis_numba.simulation.snapshot import snapshot
 
@@ -198,20 +200,20 @@ def _staged(path: Path, names: "Sequence[str]", *, count: int | None, seed: int 
         from ertis_numba.simulation.render import compile_kernels
 
         compile_kernels()
-    return Stage(scene)
+    return SceneRenderer(scene)
 
 
-def _render_all(stage: "Stage", names: "Sequence[str]", *, quiet: bool) -> None:
-    """Render what a first capture with the scene's call needs, so that no measurement comes late."""
-    options.say(f"rendering {options.counted(stage.count * len(names), 'measurement')} ...", quiet=quiet)
-    todo = ((name, index) for index in range(stage.count) for name in names)
-    with options.progress(todo, length=stage.count * len(names), label="rendering", quiet=quiet) as shown:
+def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: bool) -> None:
+    """Render the measurements for the scene's call in advance, so that none is late."""
+    options.say(f"rendering {options.counted(renderer.count * len(names), 'measurement')} ...", quiet=quiet)
+    todo = ((name, index) for index in range(renderer.count) for name in names)
+    with options.progress(todo, length=renderer.count * len(names), label="rendering", quiet=quiet) as shown:
         for name, index in shown:
-            stage.words(name, index, active=True)
+            renderer.words(name, index, active=True)
 
 
-def _rendered(stage: "Stage", names: "Sequence[str]") -> "Given":
-    return {name: (stage.of(name, active=True), stage.of(name, active=False), stage.refusal) for name in names}
+def _rendered(renderer: "SceneRenderer", names: "Sequence[str]") -> "Given":
+    return {name: (renderer.of(name, active=True), renderer.of(name, active=False), renderer.refusal) for name in names}
 
 
 def _replayed(path: Path, names: "Sequence[str]", stack: ExitStack) -> "Given":
@@ -222,16 +224,16 @@ def _replayed(path: Path, names: "Sequence[str]", stack: ExitStack) -> "Given":
     return {name: (each, None, each.refusal) for name, each in words.items()}
 
 
-def _accepts(refusal: "Refusal", name: str, demand: "Demand") -> bool:
-    """Return False, and tell why, if there are no measurements for what a sensor was told."""
-    reason = refusal(name, demand)
+def _accepts(refusal: "Refusal", name: str, config: "DeviceConfig") -> bool:
+    """Return False, and print the reason, if no measurements exist for a configuration."""
+    reason = refusal(name, config)
     if reason:
         click.echo(f"ertis: warning: {reason}", err=True)
     return not reason
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
-    """Make the measurements of a pulse before it comes, also of devices that are about to be armed."""
+    """Render the measurements of a pulse in advance, also for devices that are about to be armed."""
     from ertis_numba.errors import ErtisError
 
     registers = {device.name: device.registers for device in devices if device.error is None}
@@ -241,8 +243,8 @@ def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> Non
         words, passive, _ = given[name]
         if each.armed or each.n_codes:
             chosen = words if (each.active and each.amplifier) or passive is None else passive
-            with suppress(ErtisError):  # the device fails on it, too, and reports it
-                chosen[pulse % len(chosen)]  # which keeps it
+            with suppress(ErtisError):  # the device fails as well, and reports the error
+                chosen[pulse % len(chosen)]  # stores the rendered measurement
 
 
 def _tell(name: str, port: str, *, quiet: bool) -> None:

@@ -48,7 +48,7 @@ def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, a
     for name in names:
         chosen |= _examples.named(name)
     contents = {folder / name: item.read_bytes() for name, item in chosen.items()}
-    # A copy that is there already stays: pages that need the same file can be pasted one after the other.
+    # An existing copy stays, so that commands of pages that need the same file can be pasted one after the other.
     missing = {path: content for path, content in contents.items() if not _holds(path, content)}
     for path in missing:
         check_target(path, overwrite=force)
@@ -70,5 +70,5 @@ def _list(*, as_json: bool) -> None:
 
 
 def _holds(path: Path, content: bytes) -> bool:
-    """Return whether a file is a copy already."""
+    """Return True if a file is already a copy of the example."""
     return path.is_file() and not path.is_symlink() and path.read_bytes() == content

@@ -126,7 +126,7 @@ def export(
         )
     if known is not None:
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
-        remedy = "all is in the frame of the sensor; give --mounting FILE for that of the platform"
+        remedy = "the export is in the frame of the sensor; give --mounting FILE for that of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
     options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
@@ -145,7 +145,7 @@ def export(
 def _known(
     readers: "Sequence[RecordingReader | EnergyscapeReader]", given: Path | None
 ) -> "dict[str, _mountings.Mounting]":
-    """Return where sensors are: as a file says that was given, or else as their own file says."""
+    """Return the mountings of sensors, from the file of --mounting or else from their own file."""
     if given is not None:
         return _mountings.mountings(given, [reader.sensor for reader in readers]) or {}
     return {

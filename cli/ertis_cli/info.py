@@ -75,7 +75,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _label(name: str) -> tuple[str, str]:
-    """Return the name of a figure for people, and its unit after a space."""
+    """Return a key in words, and its unit after a space."""
     from ertis_numba.units import unit_of
 
     suffix, unit = unit_of(name)
@@ -83,7 +83,7 @@ def _label(name: str) -> tuple[str, str]:
 
 
 def _readable(value: Any) -> str:
-    """Return a value for people: lists without brackets, and times in UTC without digits that nobody reads."""
+    """Format a value for display: lists without brackets, times in UTC to the millisecond."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""``ertis layout``: the arrays that the package knows."""
+"""``ertis layout``: the shipped arrays."""
 
 import click
 
@@ -13,7 +13,7 @@ __all__ = ["layout"]
 def layout(*, name: str | None, as_json: bool) -> None:
     """List the shipped layouts, or print one as TOML.
 
-    Save what is printed to a file, edit it, and give that file as array.layout in settings or scenes, or as --layout.
+    Save the output to a file, edit it, and give that file as array.layout in settings or scenes, or as --layout.
     """
     from ertis_numba.geometry import layout_names, layout_text, load_layout
 

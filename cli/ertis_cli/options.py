@@ -76,7 +76,7 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         with suppress(ValueError):
             return tuple(int(channel) for channel in str(value).split(","))
-        return self.fail(f"{value!r} is no list of channels, give whole numbers as in 5,12", param, ctx)
+        return self.fail(f"{value!r} is not a list of channels; give whole numbers as in 5,12", param, ctx)
 
 
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -296,7 +296,7 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 
 @contextmanager
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
-    """Print ``text`` if the block takes longer than ``after_s``; yield the timer that does it.
+    """Print ``text`` if the block takes longer than ``after_s``; yield the timer.
 
     If kernels are compiled in the block, print that once in a command.
     """

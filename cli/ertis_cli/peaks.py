@@ -57,7 +57,7 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     metavar="P",
     help=f"Probability per bin that noise stands out, with cfar; {_FALSE_ALARM:g} by default.",
 )
-@click.option("--all", "everything", is_flag=True, help="List maxima that noise alone may cause, too.")
+@click.option("--all", "everything", is_flag=True, help="Also list maxima that noise alone may cause.")
 @click.option("--truth", is_flag=True, help="Compare with the truth, which the file of a simulated recording holds.")
 @options.as_json
 def peaks(
@@ -77,7 +77,7 @@ def peaks(
 
     One entry per reflector, the strongest of each measurement first. level_db is relative to the strongest,
     level_dbfs to a full-scale echo in every microphone. A maximum that noise may cause, in one image of
-    1000, is left out; --all lists it, too. Beamformers other than delay-and-sum have no such limit.
+    1000, is left out unless --all is given. Beamformers other than delay-and-sum have no such limit.
 
     With --detector cfar, a reflector is what stands out of the noise around it in range, however weak it
     is, and is at most 10 dB below the strongest of its range. The noise is estimated from 32 bins of the

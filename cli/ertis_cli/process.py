@@ -213,7 +213,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
         with open_energyscapes(path, sensor=name) as images:
             if images.translation_m is None:
                 unknown.append(name)
-    _mountings.note_unknown(unknown, "images are in the frame of their sensor, and the file says so", quiet=quiet)
+    _mountings.note_unknown(unknown, "images are in the frame of their sensor, as the file states", quiet=quiet)
 
 
 def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as_json: bool) -> dict[str, Any]:

@@ -25,7 +25,7 @@ _WIDTH = 100
 def settings(*, document: str, as_json: bool) -> None:
     """Print every key of a settings, scene, layout or mounting file.
 
-    KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and take the # from
+    KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and remove the # from
     the keys to set. Each key has its meaning, its type, its unit, its default and an example.
     """
     from ertis_numba.reference import reference

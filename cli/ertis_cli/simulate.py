@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["simulate"]
 
 _FOLLOWED = 0.6  # of full scale, by the modulators
-_COLUMN_BYTES = 72  # of a measurement, beside its words: stamp, CRC-32 and air
+_COLUMN_BYTES = 72  # of a measurement, in addition to its samples: stamp, CRC-32 and air
 _REFLECTOR_BYTES = 200  # of a reflector, in the recording and in the temporary file
 _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
@@ -38,7 +38,7 @@ _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
     "--tolerance-db",
     type=float,
     metavar="DB",
-    help="Leave out effects that the scene does not ask for and that change no image by more; 0 keeps all. The scene's "
+    help="Leave out effects that no key requests and that change no image by more; 0 keeps all. The scene's "
     "own, 0.1, by default.",
 )
 @click.option("--explain", is_flag=True, help="Print a table of effects: on or off, why, and what they cost.")
@@ -131,7 +131,7 @@ def simulate(
 
 
 def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflectors: int = 0) -> None:
-    """Refuse a recording that exceeds the room on the disk."""
+    """Raise an error if the recording exceeds the free disk space."""
     from ertis_numba.atomic import require_room
     from ertis_numba.words import word_format
 
@@ -146,7 +146,7 @@ def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflec
 def _measurements(
     simulators: "Sequence[Simulator]", firsts: "dict[str, list[Reflector]]", logs: "dict[str, TruthLog]"
 ) -> "Iterator[Measurement]":
-    """Yield what sensors measure together, one sensor after the other, and log what an image should show."""
+    """Yield simultaneous measurements, one sensor after the other, and log their ground truth."""
     scene = simulators[0].scene
     for index in range(scene.count):
         for simulator in simulators:

@@ -164,7 +164,7 @@ class Dialogue(SerialLine):
             if held != wanted:
                 raise SonarError(
                     f"{self.path} was sent a call with hash {wanted:#06x} and holds one with {held:#06x}; plug it out "
-                    "and in, and try again (of an emulated one, 'ertis emulate' tells why)"
+                    "and in, and try again (for an emulated one, 'ertis emulate' prints the reason)"
                 )
             _log.info("%s: a call of %d samples was sent", self.path, len(setup.codes))
         for command in (*setup.after_call(), Command("B", counter)):

@@ -191,7 +191,7 @@ class Rows(Contents):
         known = self._sensor(sensor)
         which = self._ids[known.name], epoch, up_to
         with self._turn:
-            # What is deleted is no secret. To overwrite it, as some builds of SQLite do, takes as long as to store it.
+            # Deleted measurements are not secret. Some builds of SQLite overwrite them, which takes as long as storing.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
             with disk_errors(self.tally.path):

@@ -5,7 +5,7 @@ refused. ``Settings()`` is the default eRTIS measurement; ``Settings.from_preset
 recording presets.
 """
 
-from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MOST_ZONES, Accuracy
+from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MAX_ZONES, Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.processing import Processing
@@ -20,7 +20,7 @@ __all__ = [
     "INTERPOLATIONS",
     "MAX_CALL_SAMPLES",
     "MAX_WAVEFORM_SAMPLES",
-    "MOST_ZONES",
+    "MAX_ZONES",
     "PRESETS",
     "Accuracy",
     "Air",

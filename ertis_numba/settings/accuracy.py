@@ -6,7 +6,7 @@ from ertis_numba import checks
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MOST_ZONES", "Accuracy"]
+__all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MAX_ZONES", "Accuracy"]
 
 INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubic": 4}
 """Ways of making a delayed sample, and how many samples each takes; None where that is a choice."""
@@ -14,7 +14,7 @@ INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubi
 ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
 """Error budgets by name."""
 
-MOST_ZONES = 1_000_000
+MAX_ZONES = 1_000_000
 """More steps of curvature than an image has ranges, even near the array."""
 
 
@@ -66,7 +66,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
         checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, MOST_ZONES)):
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, MAX_ZONES)):
             if getattr(self, name) is not None:
                 checks.whole(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:

@@ -14,7 +14,7 @@ __all__ = ["MAX_CALL_SAMPLES", "Call"]
 
 MAX_CALL_SAMPLES = 2**20
 """Limit on the samples of a call, about one second at 1 MHz: files store them, and filters make several copies."""
-_BAND_MISS_HZ = 200.0  # by which the band of a waveform may differ between processors
+_BAND_MISS_HZ = 200.0  # tolerance of the band, which may differ between processors
 
 
 class Call(Table, frozen=True, kw_only=True):
@@ -34,10 +34,10 @@ class Call(Table, frozen=True, kw_only=True):
         Whether its period or its frequency goes evenly from first to last. eRTIS is hyperbolic: motion only shifts such
         echoes, where it blurs those of a linear sweep.
     waveform : str or tuple of float, optional
-        Own waveform instead of a sweep: samples at ``sample_rate_hz``, or the name of a file with them, which
-        `Settings.load` looks for beside the settings and reads. WAV files have a rate of their own. The samples are
-        scaled to a peak of 1. They replace the other keys: the two frequencies become the edges of their band, at -20
-        dB, and the duration becomes theirs.
+        Own waveform instead of a sweep: samples at ``sample_rate_hz``, or the name of a file with them, relative to
+        the folder of the settings. WAV files have a rate of their own. The samples are scaled to a peak of 1. The other
+        keys follow from the samples: the two frequencies are the edges of their band, at -20 dB, and the duration is
+        theirs.
     """
 
     start_frequency_hz: float = 50_000.0
@@ -52,7 +52,7 @@ class Call(Table, frozen=True, kw_only=True):
         super().__post_init__()
         checks.positive("call.sample_rate_hz", self.sample_rate_hz)
         if isinstance(self.waveform, str):
-            return  # checked when it is read
+            return  # the file is checked when it is read
         if self.waveform is not None:
             self._adopt(self.waveform)
         for name in ("start_frequency_hz", "stop_frequency_hz"):
@@ -107,7 +107,7 @@ class Call(Table, frozen=True, kw_only=True):
 
     @classmethod
     def from_file(cls, path: str | Path, *, sample_rate_hz: float | None = None) -> Self:
-        """Return the call whose waveform a file holds.
+        """Read a call from a file with its waveform.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class Call(Table, frozen=True, kw_only=True):
         return cls(waveform=str(path), **given).beside(Path())
 
     def beside(self, folder: Path) -> Self:
-        """Return the call with the samples of the file that it names, which is looked for in a folder.
+        """Return the call with the samples of the file that it names, relative to a folder.
 
         Raises
         ------
@@ -147,12 +147,12 @@ class Call(Table, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def require_samples(self) -> None:
-        """Refuse a waveform that is still the name of a file.
+        """Raise an error if the waveform is still the name of a file.
 
         Raises
         ------
         ArgumentError
-            It is.
+            The file has not been read.
         """
         if isinstance(self.waveform, str):
             raise ArgumentError(
@@ -174,5 +174,5 @@ class Call(Table, frozen=True, kw_only=True):
 
 
 def _default(name: str) -> Any:
-    """Return the default of a field, which stands for one that is not given."""
+    """Return the default of a field, which counts as not given."""
     return next(field.default for field in msgspec.structs.fields(Call) if field.name == name)

@@ -42,7 +42,7 @@ class Settings(Document, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.call.waveform, str):
-            return  # checked when it is read
+            return  # the file is checked when it is read
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
@@ -109,7 +109,7 @@ class Settings(Document, frozen=True, kw_only=True):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file; files that it names, of a layout, a call or directions, are looked for beside it.
+        """Read a file; layouts, calls and directions in other files are relative to its folder.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Settings(Document, frozen=True, kw_only=True):
         return super().load(path).beside(Path(path).parent)
 
     def changed_by(self, path: str | Path) -> Self:
-        """Return settings changed by the keys that a file holds.
+        """Return settings changed by the keys of a file.
 
         An array is replaced as a whole if the file names a layout or positions, and a call if either has an own
         waveform.
@@ -149,9 +149,9 @@ class Settings(Document, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def beside(self, folder: Path) -> Self:
-        """Return settings whose files are looked for in a folder: of a layout, of directions, and of a call.
+        """Return settings whose files are relative to a folder: of a layout, of directions, and of a call.
 
-        The waveform of a call is read, because its band decides about much else.
+        The waveform of a call is read, because other settings depend on its band.
         """
         array, processing = self.array, self.processing
         if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:

@@ -19,13 +19,13 @@ MAX_WAVEFORM_SAMPLES = 4096
 `Settings.max_bytes`."""
 WAVEFORM_FILES = {".wav", ".csv", ".npy"}
 _MAX_FILE_BYTES = 2**22
-_DIGITS = 7  # of a sample in settings: 20 dB below the rounding of a converter of 20 bits
-_IN_BAND = 0.1  # of the top of the spectrum
-_STEP_HZ = 100.0  # to which edges are rounded, so that they do not depend on the last digits of a transform
+_DIGITS = 7  # decimals of a sample; their rounding error is 20 dB below that of a 20-bit converter
+_IN_BAND = 0.1  # relative to the maximum of the spectrum
+_STEP_HZ = 100.0  # step of the edges, so that they do not depend on rounding in the transform
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
-    """Return the samples in a file, and their rate where the file holds it.
+    """Return the samples in a file, and their rate if the file holds it.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
         raise SettingsError(
             f"call.waveform {path} holds {values.dtype} of shape {values.shape}; give one channel of real numbers"
         )
-    # Unsigned bytes are the only numbers of WAV whose silence is not 0.
+    # Unsigned bytes are the only WAV samples whose silence is not 0.
     middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0
     return tuple((values.astype(np.float64) - middle).tolist()), rate_hz
 
@@ -77,7 +77,7 @@ def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     Raises
     ------
     ArgumentError
-        There are too few or too many, one is not finite, or all are 0.
+        The samples are too few or too many, one is not finite, or all are 0.
     """
     least = 17  # the duration of a call is at least 16 samples
     if not least <= len(samples) <= MAX_WAVEFORM_SAMPLES:
@@ -95,9 +95,9 @@ def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
 
 @functools.lru_cache(maxsize=16)
 def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
-    """Return the edges of a waveform's band, in the order in which it sweeps over them.
+    """Return the edges of a waveform's band, in the order of its sweep.
 
-    The band is that in which the spectrum lies less than 20 dB below its top.
+    The band is where the spectrum is less than 20 dB below its maximum.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
     high_hz = math.ceil(strong[-1] / _STEP_HZ) * _STEP_HZ
     if low_hz <= 0:
         raise ArgumentError(
-            "call.waveform has a band that reaches 0 Hz; subtract its mean, and remove what lies below the call"
+            "call.waveform has a band that reaches 0 Hz; subtract its mean, and remove sound below the call"
         )
     if high_hz >= rate_hz / 2:
         raise ArgumentError(

@@ -107,9 +107,9 @@ def mouth_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Mouth:
 def echoes(
     shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch, *, n_frequencies: int = 1
 ) -> list[Paths]:
-    """Return the paths of an emitter's call over targets and walls, and straight from another sensor's.
+    """Return the paths of an emitter's call over targets and walls, and the direct path from another sensor's.
 
-    ``n_frequencies`` are those at which their amplitudes are to be computed.
+    ``n_frequencies`` is the number of frequencies at which their amplitudes will be computed.
 
     Raises
     ------

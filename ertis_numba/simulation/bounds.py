@@ -12,15 +12,15 @@ __all__ = [
 ]
 
 MAX_PATHS = 20_000
-"""Limit on the ways of the sound to one sensor in one measurement: times of estimates grow with the square."""
+"""Limit on the sound paths to one sensor in one measurement; the time of estimates grows with its square."""
 MAX_MIRROR_POINTS = 2**21
-"""Limit on chains of walls, times the targets whose mirror points they have: 300 MB with four reflections."""
+"""Limit on chains of walls, times mirrored targets: 300 MB with four reflections."""
 MAX_AMPLITUDES = 2**26
-"""Limit on paths, times microphones, times frequencies: about 2 GB while they are computed."""
+"""Limit on paths, times microphones, times frequencies: about 2 GB during computation."""
 
 
 def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
-    """Refuse a scene of which the mirror images would exceed the memory.
+    """Raise an error if the mirror images of a scene would exceed the memory.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
 
 
 def require_few_paths(n_paths: int) -> None:
-    """Refuse a scene of which the estimates would take too long.
+    """Raise an error if the estimates of a scene would take too long.
 
     Raises
     ------
@@ -46,13 +46,13 @@ def require_few_paths(n_paths: int) -> None:
     """
     if n_paths > MAX_PATHS:
         raise ArgumentError(
-            f"scene has more than {MAX_PATHS} ways of the sound to one sensor, which is the limit (got {n_paths} so "
-            "far). Lower max_reflections, or give fewer targets or walls"
+            f"scene has more than {MAX_PATHS} sound paths to one sensor, which is the limit (got {n_paths} so far). "
+            "Lower max_reflections, or give fewer targets or walls"
         )
 
 
 def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> None:
-    """Refuse a scene of which one measurement would exceed the memory.
+    """Raise an error if one measurement of a scene would exceed the memory.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> Non
     """
     if n_paths * n_mics * n_frequencies > MAX_AMPLITUDES:
         raise ArgumentError(
-            f"scene has {n_paths} ways of the sound to {n_mics} microphones at {n_frequencies} frequencies, "
+            f"scene has {n_paths} sound paths to {n_mics} microphones at {n_frequencies} frequencies, "
             f"{n_paths * n_mics * n_frequencies} amplitudes; the limit is {MAX_AMPLITUDES}. Lower max_reflections, or "
             "give fewer targets, walls or microphones"
         )

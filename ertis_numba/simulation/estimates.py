@@ -1,4 +1,4 @@
-"""Estimated change of an image by one effect, and the comparisons that several effects share."""
+"""Estimated change of an image by one effect, and comparisons shared by several effects."""
 
 import math
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ def filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
 
 
 def noise(sight: Sight, level: float, reason: str) -> Estimate:
-    """Return the change by noise of a level beside the weakest reflector."""
+    """Return the change of the weakest reflector by noise of a level."""
     ratio_db = 20 * math.log10(max(level / sight.floor, 1e-15))
     return Estimate(
         change_db=change_db(np.array([level]), np.array([sight.quietest])),

@@ -1,4 +1,4 @@
-"""Limits of the models of targets: places that a target cannot have, and notes on inaccurate echoes."""
+"""Limits of the target models: impossible positions, and notes on inaccurate echoes."""
 
 import math
 
@@ -22,7 +22,7 @@ def notes(shot: Snapshot) -> list[str]:
 
 
 def _near_targets(shot: Snapshot) -> list[str]:
-    """Return a note for each target or source so near an emitter or a microphone that amplitudes no longer grow."""
+    """Return a note for each target or source so close to an emitter or a microphone that its amplitude is limited."""
     scene, sensor = shot.scene, shot.sensor
     ends_m = np.concatenate([shot.ear.positions_m, emitter_offset(shot, shot.number).position_m[None]])
     targets = shot.targets
@@ -58,14 +58,14 @@ def _near_discs(shot: Snapshot) -> list[str]:
 
 
 def require_clear(shot: Snapshot) -> None:
-    """Refuse spheres that touch or enclose a microphone of the sensor or an emitter.
+    """Raise an error for spheres that touch or enclose a microphone of the sensor or an emitter.
 
     A point has no inside; its echo is bounded, which `notes` reports.
 
     Raises
     ------
     ArgumentError
-        A surface is closer than 1 mm, or around the place.
+        A surface is closer than 1 mm, or encloses the place.
     """
     targets = shot.targets
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}

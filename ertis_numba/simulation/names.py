@@ -50,5 +50,6 @@ ASKED_FOR: Final = frozenset(
         "microphone_faults",
     }
 )
-"""Effects of which a scene has none unless a key asks for it, such as ``electronics.noise_dbfs``. They are simulated
-even where no image shows them, because recordings do."""
+"""Effects that a scene lacks unless a key requests them, such as ``electronics.noise_dbfs``.
+
+They are simulated even where no image shows them, because recordings hold them."""

@@ -31,7 +31,7 @@ def spreading(sight: Sight) -> Estimate | None:
     if not len(sight.heard):
         return None
     longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
-    return filtered(sight, "spreading", f"on ways of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
+    return filtered(sight, "spreading", f"on paths of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
 
 
 def emitter_offset(sight: Sight) -> Estimate | None:

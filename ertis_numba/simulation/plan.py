@@ -39,8 +39,7 @@ class Verdict:
     estimate_db : float or None
         By how much it changes the image; None where it cannot be left out or finds nothing to act upon.
     forced : bool
-        The scene decides, whatever the estimate: by ``effects``, by a key that asks for the effect, or by a tolerance
-        of 0.
+        The scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a tolerance of 0.
     rehearsed : bool
         The estimate was too close to the tolerance, so two renderings were compared: their change stands for it.
     coupled : bool
@@ -84,8 +83,8 @@ class Plan:
 def make_plan(scene: Scene) -> Plan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    Effects that the scene asks for by a key of their own are on, see `names.ASKED_FOR`; with a tolerance of 0, so are
-    all on which the scene has something to act.
+    Effects that a key of the scene requests are on, see `names.ASKED_FOR`. With a tolerance of 0, all effects that
+    apply to something in the scene are on.
 
     For the others, all sensors are asked, at the beginning, at the end, in between and at way points; the greatest
     change counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then

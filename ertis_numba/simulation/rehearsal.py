@@ -25,7 +25,7 @@ __all__ = ["Rehearsal", "image_change_db"]
 Image = NDArray[np.float32]
 
 _KEPT = 24  # images: most verdicts are about the same effects with one more or less
-_KEPT_BYTES = 2**28  # of images, of which large grids have few
+_KEPT_BYTES = 2**28  # total of stored images, which are few for large grids
 
 
 class Rehearsal:
@@ -147,7 +147,7 @@ def _local(image: Image, spacing_m: float) -> Image:
 
 
 def _image_bytes(settings: Settings) -> int:
-    """Return the size of an image, about."""
+    """Return the approximate size of an image."""
     range_rate_m = 2 * settings.output_rate_hz / sound_speed_m_s(settings.air)
     n_ranges = np.ptp(settings.processing.range_m) * range_rate_m + 1
     return int(4 * len(direction_grid(settings.processing).azimuth_rad) * n_ranges)

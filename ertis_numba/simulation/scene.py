@@ -39,7 +39,7 @@ class Scene(Document, frozen=True, kw_only=True):
     sync_every : int
         Measurements from one SYNC to the next; between SYNCs, sample clocks are not synchronised.
     tolerance_db : float
-        Effects that change no image by more are left out, unless a key of the scene asks for them; 0 keeps all.
+        Effects that change no image by more are left out, unless a key of the scene requests them; 0 keeps all.
     max_reflections : int
         Walls that a sound may meet on its way.
     effects : dict of str to bool
@@ -125,7 +125,7 @@ class Scene(Document, frozen=True, kw_only=True):
         return self.sensors[0 if name is None else names.index(name)]
 
     def with_files_of(self, folder: Path) -> Self:
-        """Return a scene that depends on no file of a layout or a call; those it names are looked for in ``folder``.
+        """Return a scene that depends on no file of a layout or a call; ``folder`` is that of the files.
 
         So are files of directions.
         """

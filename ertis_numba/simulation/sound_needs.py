@@ -52,7 +52,7 @@ def sync_delay(sight: Sight) -> Estimate | None:
 
 
 def direct_sound(sight: Sight) -> Estimate | None:
-    """Ask what is left of the direct sound where the image begins."""
+    """Compare the direct sound that reaches into the image with the reflectors."""
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
@@ -98,7 +98,7 @@ def _part_in_window(sight: Sight, sonar: Sonar) -> float:
     """Return how much of a foreign call reaches into the image, in the measurement where it does most."""
     scene, shot = sight.shot.scene, sight.shot
     if scene.count > 1:
-        return 1.0  # nobody keeps it in step, so some measurement or other meets it
+        return 1.0  # its calls are not synchronised, so some measurement contains one
     way = effect("interference", "way_from")(shot, sonar)
     calls_s = effect("interference", "calls_of")(shot, sonar) + np.mean(way.length_m) / shot.speed_m_s
     return float(np.max(sight.reach(calls_s), initial=0.0))

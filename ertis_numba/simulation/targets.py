@@ -41,7 +41,7 @@ class Point(Placed, frozen=True, kw_only=True):
             checks.between("point.facing_deg elevation", self.facing_deg[1], -90.0, 90.0)
             if not self.diameter_m:
                 raise ArgumentError(
-                    "point.facing_deg is given, but a point without a diameter returns sound alike in all directions; "
+                    "point.facing_deg is given, but a point without a diameter reflects equally in all directions; "
                     "give point.diameter_m for a disc, or leave facing_deg out"
                 )
 

@@ -17,7 +17,7 @@ _SILENT = 1e-9  # of the strongest
 
 
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
-    """Return the echoes of a sensor's own call as an image should show them, then those of other sensors' calls.
+    """Return the echoes of a sensor's own call for comparison with an image, then those of other sensors' calls.
 
     A reflector stands at half of the way of its sound, in the direction from which the sound comes; by a wall, that
     is the place of its mirror image. Its level is that of the mean amplitude over the microphones and the

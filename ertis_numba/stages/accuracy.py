@@ -162,11 +162,17 @@ class ErrorModel:
         covariance = self.texture.covariance
         if covariance is None or nodes.is_bent:
             return self._of(_UNLIKE * self.texture.colour * float(nodes.errors @ self.texture.shares))
-        heard = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.steering), optimize=True)
-        missed = np.einsum("twmn,nwu->tmwu", covariance, np.conj(nodes.wrong), optimize=True)
-        beams = np.einsum("mwu,tmwu->tu", nodes.steering, heard).real
-        both = np.einsum("mwu,tmwu->tu", nodes.wrong, heard)
-        errors = np.einsum("mwu,tmwu->tu", nodes.wrong, missed).real
+        n_tiles, n_waves, _, _ = covariance.shape
+        n_directions = nodes.steering.shape[2]
+        beams, errors = np.zeros((2, n_tiles, n_directions))
+        both = np.zeros((n_tiles, n_directions), dtype=np.complex128)
+        for wave in range(n_waves):  # one at a time, so that everything stays in the cache
+            steering, missed = nodes.steering[:, wave], nodes.wrong[:, wave]
+            sums = covariance[:, wave] @ np.conj(np.concatenate([steering, missed], axis=1))
+            heard, lost = sums[:, :, :n_directions], sums[:, :, n_directions:]
+            beams += np.sum(steering * heard, axis=1).real
+            both += np.sum(missed * heard, axis=1)
+            errors += np.sum(missed * lost, axis=1).real
         beams = np.maximum(beams, 1e-9 * beams.max(initial=1e-30))
         wrong = both.real**2 / beams + 0.5 * np.maximum(errors - np.abs(both) ** 2 / beams, 0.0)
         return _UNLIKE * float(wrong.sum() / beams.sum())

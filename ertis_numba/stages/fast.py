@@ -188,16 +188,15 @@ class FastChain:
     def _executor(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
 
-    def analytic(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32]
-    ) -> tuple[NDArray[np.complex64], int]:
-        """Do as `process`; return the analytic signals too, (mic, phase, sample), and the sample of the first range."""
+    def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
+        """Return the analytic signals, (mic, phase, sample), and the sample of the first range."""
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
-        buffers = self._begin(words, out, self._threads)
-        try:
+        with self._taken(self._threads) as buffers:
+            here = buffers.lane.send(words)
+            self._demodulate(here, buffers.room, buffers.signals)
+            self._matched_filter(buffers.transforms, buffers.analytic, threads=self._threads)
             buffers.lane.fetch(buffers.analytic, heard)
-        finally:
-            self._finish(buffers)
+        self._finish(buffers)
         return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:

@@ -16,6 +16,7 @@ using gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutto
 transforms using min-max interpolation, IEEE Trans. Signal Process. 51, 2003.)
 """
 
+import functools
 import math
 import threading
 from contextlib import AbstractContextManager
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import threadpoolctl
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ertis_numba.settings import INTERPOLATIONS
@@ -35,7 +37,6 @@ WAVES = 40
 
 _TURNS = 12  # the error falls by less than 0.1 dB after that
 _LEAST_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
-_AT_A_TIME = 2**15  # weights
 _TARGETS = 65  # over one step of the samples that are kept
 
 
@@ -165,7 +166,8 @@ class DelayFit:
         self._interpolation = interpolation
         self._step_s = step_s
         self._spectrum = spectrum
-        self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + (self.n_taps - 1) // 2 - 0.5 * (self.n_taps % 2)
+        self._middle = (self.n_taps - 1) // 2 + 0.5 * (1 - self.n_taps % 2)
+        self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + self._middle - 0.5
         self._gain = np.ones(len(spectrum.power), dtype=np.complex128)
         if interpolation == "fitted":
             self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
@@ -196,11 +198,21 @@ class DelayFit:
 
     def weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them."""
-        flat = np.ravel(fractions)
-        # In parts, since each weight takes a wave at every frequency of the spectrum.
-        parts = np.array_split(flat, max(1, -(-len(flat) // _AT_A_TIME)))
-        found = np.concatenate([self._weights(part).T for part in parts])
-        return np.ascontiguousarray(found).reshape(*np.shape(fractions), self.n_taps)
+        found = chebyshev.chebval(2 * (fractions - self._middle), self._polynomials)
+        return np.ascontiguousarray(np.moveaxis(found, 0, -1))
+
+    @functools.cached_property
+    def _polynomials(self) -> NDArray[np.complex128]:
+        """Chebyshev coefficients of the weights over the fractions of one step: (degree, tap).
+
+        Each weight is a sum of waves, at all frequencies of the spectrum. Their coefficients are Bessel functions of
+        half the phase of a step, and negligible in double precision beyond the degree below.
+        """
+        half_phase = math.pi * float(self._spectrum.frequency_hz.max()) * self._step_s
+        degree = math.ceil(1.5 * half_phase) + 20
+        places = chebyshev.chebpts1(degree + 1)
+        values = self._weights(self._middle + places / 2).T
+        return np.asarray(np.linalg.solve(chebyshev.chebvander(places, degree), values))
 
     def _weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         if self._interpolation != "fitted":

@@ -85,8 +85,8 @@ def ringing_db(settings: Settings) -> float:
 def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
     """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
 
-    Without it all microphones would interpolate alike where their delays are, straight ahead, and err alike. With the
-    golden ratio's multiples any few of them are spread evenly.
+    Without offsets, microphones with equal delays, as straight ahead, would have equal interpolation errors. Multiples
+    of the golden ratio spread the offsets of any few consecutive microphones evenly.
     """
     return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0 * step_s if fit.is_fitted else np.zeros(1)
 

@@ -26,10 +26,10 @@ __all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "Nodes", "Plan", "P
 
 COARSEST_STOP_BAND_DB = 40.0
 TABLE_BYTES = 44
-"""Bytes of a delay and a weight, as they are made and as kernels take them."""
+"""Bytes of a delay and a weight, both as computed and as passed to kernels."""
 
 _MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
-_MAX_FITS = 288  # four times the fits that one search tries
+_MAX_FITS = 288  # four times the number of fits in one search
 
 
 class Plan(NamedTuple):
@@ -47,7 +47,7 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """What a choice of nodes means: how many, their errors, and the sum of a beam's squared weights."""
+    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights."""
 
     count: int
     n_pairs: int
@@ -57,7 +57,7 @@ class Nodes:
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """What a choice of samples means."""
+    """Predicted properties of a delay interpolation."""
 
     n_taps: int
     error: float
@@ -126,7 +126,7 @@ class PlanModel:
         return parts
 
     def work(self, plan: Plan) -> Work:
-        """Return the work of a plan, which its predicted time depends on."""
+        """Return the work of a plan, from which its time is predicted."""
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         taps, _ = self.filter(plan.stop_band_db)
         tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES

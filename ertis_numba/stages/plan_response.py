@@ -16,7 +16,7 @@ from ertis_numba.stages.plan_elements import ahead_of, delay_fit, nodes_of, spec
 
 __all__ = ["Deviation", "deviation_of"]
 
-_WAVES = 9  # over which errors of a plan are smooth
+_WAVES = 9  # scale on which errors of a plan are smooth
 
 
 class Deviation(NamedTuple):
@@ -41,10 +41,10 @@ class Deviation(NamedTuple):
 
 
 def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
-    """Return the deviation of a complete plan of the fast method; None where the plan's beams are exact or unknown.
+    """Return the deviation of a complete plan of the fast method; None if the plan's beams are exact or unknown.
 
-    It covers beams interpolated between beam-grid points, and samples interpolated between those kept. The latter
-    depend on the range if wavefronts are spherical, and are left out then.
+    It covers interpolation between beam-grid points and between stored samples. The latter depends on the range if
+    wavefronts are spherical, and is then left out.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Search space of the planner: the plans that settings leave open."""
+"""Search space of the planner: the plans that settings permit."""
 
 import itertools
 import math
 
-from ertis_numba.settings import INTERPOLATIONS, MOST_ZONES
+from ertis_numba.settings import INTERPOLATIONS, MAX_ZONES
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES
 from ertis_numba.stages.plan_model import COARSEST_STOP_BAND_DB, Plan, PlanModel
 
@@ -13,19 +13,19 @@ _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
 _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
 _STOP_BANDS_DB = (COARSEST_STOP_BAND_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
-_STOP_BANDS = 3  # of them are tried: more damping than that is of no use
+_STOP_BANDS = 3  # number of candidates; more attenuation brings no benefit
 _NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
 def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Plan]:
-    """Return the plans that the settings leave open, without those that are needlessly exact.
+    """Return the plans that the settings permit, except needlessly exact ones.
 
     Parameters
     ----------
     model : PlanModel
     budget : float
-        Error power that a plan may have.
+        Largest error power of a plan.
     has_int16 : bool
         The device has a dot product of 16-bit numbers.
     """
@@ -109,6 +109,6 @@ def _zone_count(model: PlanModel, budget: float) -> int:
     if model.settings.processing.wavefront == "plane":
         return 1
     count = 1
-    while model.zone_error(count) > _SMALL * budget and count < MOST_ZONES:
-        count = min(MOST_ZONES, max(count + 1, math.ceil(1.2 * count)))
+    while model.zone_error(count) > _SMALL * budget and count < MAX_ZONES:
+        count = min(MAX_ZONES, max(count + 1, math.ceil(1.2 * count)))
     return count

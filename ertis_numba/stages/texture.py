@@ -23,6 +23,7 @@ __all__ = ["ROUGH_DELAY_TAPS", "ROUGH_ZONES", "texture_of"]
 ROUGH_DELAY_TAPS = 2
 ROUGH_ZONES = 8
 
+_FEW_DIRECTIONS = "2d:19"  # where no image is made
 _TILE = 96  # ranges
 _MAX_BINS = 2**18  # of an image, of which quantiles are taken
 _MOST_MICS = 8  # whose noise is looked at
@@ -31,12 +32,29 @@ _TAPERED = 0.5  # of the ranges, at each end
 _QUANTILES = (np.arange(16) + 0.5) / 16
 
 
-def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet, *, threads: int = 1) -> Texture:
+def texture_of(
+    measurement: Measurement,
+    settings: Settings,
+    kernels: KernelSet,
+    *,
+    threads: int = 1,
+    energy: NDArray[np.float32] | None = None,
+) -> Texture:
     """Return the texture of a measurement that is to be imaged by ``settings``.
 
-    A rough image is enough, since what is wanted are its mean power, and that of what it is summed from.
+    Parameters
+    ----------
+    measurement : Measurement
+    settings : Settings
+    kernels : KernelSet
+    threads : int
+    energy : (direction, range) float32, optional
+        Delay-and-sum image of the measurement, if there is one already; by default, a rough one is made.
     """
     low_hz, high_hz = matched_band_hz(settings)
+    processing = settings.processing.replace(beamformer="delay_and_sum")
+    if energy is not None:
+        processing = processing.replace(directions=_FEW_DIRECTIONS)
     rough = settings.replace(
         accuracy=Accuracy(
             precision="float32",
@@ -48,14 +66,18 @@ def texture_of(measurement: Measurement, settings: Settings, kernels: KernelSet,
             stop_band_db=60.0,
             zones=ROUGH_ZONES,
         ),
-        processing=settings.processing.replace(beamformer="delay_and_sum"),
+        processing=processing,
     )
     chain = FastChain(rough, kernels, threads=threads)
     form = word_format(settings)
-    words, _ = form.normalised(form.checked(measurement.words))  # all that is measured here is relative
-    image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+    words, exponent = form.normalised(form.checked(measurement.words))  # all that is measured here is relative
     try:
-        heard, lead = chain.analytic(words, image)
+        heard, lead = chain.analytic(words)
+        if energy is None:
+            image = chain.new_image()
+            chain.process(words, image)
+        else:
+            image = np.ldexp(energy, -exponent)
     finally:
         chain.close()
     analytic = heard[:, :, lead:]

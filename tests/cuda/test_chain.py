@@ -59,7 +59,8 @@ def test_signals_and_analytic_signals_are_the_processors():
     for device in ("cpu", "cuda"):
         chain = FastChain(settings, kernels.load(device), threads=1)
         image, heard = chain.new_image(), chain.new_image()
-        analytic, lead = chain.analytic(words, image)
+        analytic, lead = chain.analytic(words)
+        chain.process(words, image)
         chain.process_signals(signals, heard)
         found[device] = (analytic.view(np.float32), image, heard, lead)
     for mine, theirs in zip(found["cuda"][:3], found["cpu"][:3], strict=True):

@@ -2,7 +2,7 @@
 
 from ertis_numba.devices.emulator.device import Emulator
 from ertis_numba.devices.emulator.mainboard import Quirks
-from ertis_numba.devices.emulator.registers import Demand
+from ertis_numba.devices.emulator.registers import DeviceConfig
 from ertis_numba.devices.emulator.sync_chain import SyncChain
 
-__all__ = ["Demand", "Emulator", "Quirks", "SyncChain"]
+__all__ = ["DeviceConfig", "Emulator", "Quirks", "SyncChain"]

@@ -62,9 +62,8 @@ class Emulator:
         another line, whose fault is "unplugged"; the last line about a measurement holds. Lines about the device itself
         have an event instead, "unplugged" or "plugged in".
     accepts : callable, optional
-        Takes a `Demand`, the call and the record that the host asked for; returns False if there are no words for it.
-        Then the device tells a wrong hash of the call and does not measure. By default the words are sent whatever
-        was asked for.
+        Called with a `DeviceConfig`, the call and the record that the host has configured. If it returns False, the
+        device reports a wrong hash of the call and does not measure. By default, every configuration is accepted.
     quirks : Quirks
         May be replaced at any time.
     on_port : callable, optional

@@ -9,17 +9,17 @@ from ertis_numba.devices.blocks import COUNTERS
 from ertis_numba.devices.commands import Command, encode_answer
 from ertis_numba.devices.emulator.faults import Stall
 from ertis_numba.devices.emulator.measurements import Measurements, Output
-from ertis_numba.devices.emulator.registers import Demand, Registers
+from ertis_numba.devices.emulator.registers import DeviceConfig, Registers
 from ertis_numba.devices.emulator.terminal import CommandReader
 from ertis_numba.errors import DataError
 
 __all__ = ["Accepts", "Mainboard", "Quirks"]
 
-Accepts = Callable[[Demand], bool]
-"""Return True if there are measurements for what a device was told."""
+Accepts = Callable[[DeviceConfig], bool]
+"""Return True if measurements exist for a configuration."""
 
 _LEFT_NS = 20_000_000  # an unfinished line that is a whole command is taken after so long
-_TOLD = frozenset("CDEFG")  # commands on which the words depend
+_CONFIG_COMMANDS = frozenset("CDEFG")  # commands that change the call or the record
 _BUFFERED = 2  # measurements that wait for a reader
 
 
@@ -71,8 +71,8 @@ class Mainboard:
     ----------
     measurements : Measurements
     accepts : callable, optional
-        Asked after a call was loaded, and before a measurement, if anything has changed. If there are no measurements
-        for the call and the record, the device tells a wrong hash of the call and does not measure.
+        Called with a changed configuration, after a call was loaded and before a measurement. If it returns False, the
+        device reports a wrong hash of the call and does not measure.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Mainboard:
         self.outputs: deque[Output] = deque()
         self.refused = 0
         self._measurements, self._accepts = measurements, accepts
-        self._is_new = self._is_loaded = self._is_refused = False  # settings, a whole call, and both of them
+        self._is_new = self._is_loaded = self._is_refused = False  # a configuration, a complete call, the configuration
         self._lines = CommandReader()
         self._left_ns: int | None = None  # when an unfinished line is taken
         self._recording: _Recording | None = None
@@ -113,7 +113,7 @@ class Mainboard:
         answer = None if command is None else self.registers.answer(command)
         self.refused += answer is None
         answer = answer or 0  # nothing better is known for what is refused
-        if command is not None and command.code in _TOLD:
+        if command is not None and command.code in _CONFIG_COMMANDS:
             self._is_new, self._is_loaded = True, command.code == "C"
             self._is_refused = self._is_refused and not self._is_loaded
         if command is not None and command.code == "L" and (quirks.wrong_hash or self._refuses(judge=self._is_loaded)):
@@ -138,10 +138,10 @@ class Mainboard:
         return True
 
     def _refuses(self, *, judge: bool) -> bool:
-        """Return True if there are no measurements for what the device was told; ask only if it is told all."""
+        """Return True if no measurements exist for the registers; check new registers only if ``judge`` is set."""
         if judge and self._is_new and self._accepts is not None:
             self._is_new = False
-            self._is_refused = not self._accepts(self.registers.demand)
+            self._is_refused = not self._accepts(self.registers.config)
         return self._is_refused
 
     def go_on(self, quirks: Quirks, now_ns: int) -> None:

@@ -20,7 +20,7 @@ from ertis_numba.devices.commands import (
 from ertis_numba.devices.setup import call_codes
 from ertis_numba.settings import Call
 
-__all__ = ["FIRMWARE", "Demand", "Registers"]
+__all__ = ["FIRMWARE", "DeviceConfig", "Registers"]
 
 FIRMWARE = 0x00_01_00_00
 """Version that emulated devices answer, 1.0.0: bytes 2, 1 and 0."""
@@ -39,8 +39,8 @@ _NUMBERS = {  # by command: which register takes the first number, and from wher
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Demand:
-    """Call and record that a device was told to emit and to measure.
+class DeviceConfig:
+    """Call and record that the host has configured.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Demand:
     pdm_rate_hz: float
 
     def holds(self, call: Call) -> bool:
-        """Return True if this is the call that was loaded, or if none was."""
+        """Return True if ``call`` is loaded, or if no call is."""
         if not self.codes.any():
             return True
         return self.dac_rate_hz == call.sample_rate_hz and np.array_equal(self.codes, call_codes(call))
@@ -109,10 +109,10 @@ class Registers:
         return self.n_samples * 1_000_000_000 // round(PDM_RATES_HZ[self.clock])
 
     @property
-    def demand(self) -> Demand:
-        """Call and record as they stand."""
+    def config(self) -> DeviceConfig:
+        """Current call and record."""
         codes = self.codes[: self.n_codes].copy()
-        return Demand(codes, self.dac_rate_hz, self.n_samples, PDM_RATES_HZ[self.clock])
+        return DeviceConfig(codes, self.dac_rate_hz, self.n_samples, PDM_RATES_HZ[self.clock])
 
     @property
     def hash(self) -> int:

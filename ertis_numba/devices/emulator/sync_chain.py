@@ -30,8 +30,8 @@ class SyncChain:
         In the order of the chain.
     rate_hz : float
     before : callable, optional
-        Called with the number of each pulse before it is given. If that takes longer than a period, pulses are left
-        out meanwhile.
+        Called with the number of each pulse before the pulse. If it takes longer than a period, the pulses meanwhile
+        are left out.
 
     Attributes
     ----------

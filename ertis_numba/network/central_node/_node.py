@@ -231,7 +231,7 @@ class CentralNode:
         message: Message | None = None
         try:
             who = self._door.who(frames)
-            if who is None:  # counted there
+            if who is None:  # the server socket has counted it
                 self._greetings.forget(sender)
                 self._intake.bye(sender)
                 reason = "this key is not listed (any more); have it listed"
