@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.simulation.effects.emitter_offset import emitter_offset
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
@@ -24,7 +23,7 @@ def notes(shot: Snapshot) -> list[str]:
 def _near_targets(shot: Snapshot) -> list[str]:
     """Return a note for each target or source so close to an emitter or a microphone that its amplitude is limited."""
     scene, sensor = shot.scene, shot.sensor
-    ends_m = np.concatenate([shot.ear.positions_m, emitter_offset(shot, shot.number).position_m[None]])
+    ends_m = np.concatenate([shot.ear.positions_m, _emitter_m(shot, shot.number)[None]])
     targets = shot.targets
     things = list(zip(targets.names, targets.positions_m, strict=True))
     for kind in ("tones", "noises", "sonars"):
@@ -89,7 +88,15 @@ def require_clear(shot: Snapshot) -> None:
 def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
     """Return the sensors that emit, and the positions of their emitters."""
     return [
-        (other, emitter_offset(shot, number).position_m)
-        for number, other in enumerate(shot.scene.sensors)
-        if not other.emitter.silent
+        (other, _emitter_m(shot, number)) for number, other in enumerate(shot.scene.sensors) if not other.emitter.silent
     ]
+
+
+def _emitter_m(shot: Snapshot, number: int) -> NDArray[np.float64]:
+    """Return the position of a sensor's emitter: (axis,) float64."""
+    if not any(shot.scene.sensors[number].emitter.position_m):
+        return shot.mouths[number].position_m
+    # Imported here because most emitters are at the centre of the array.
+    from ertis_numba.simulation.effects.emitter_offset import emitter_offset  # noqa: PLC0415
+
+    return emitter_offset(shot, number).position_m
