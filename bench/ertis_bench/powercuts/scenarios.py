@@ -33,7 +33,7 @@ class Setting:
     ----------
     folder : Path
         Empty; of this run alone.
-    library : Path
+    disk_log : Path
     seed : int
     count : int
         Measurements of each sensor.
@@ -41,7 +41,7 @@ class Setting:
     """
 
     folder: Path
-    library: Path
+    disk_log: Path
     seed: int
     count: int
     fail: Fail = None
@@ -58,7 +58,7 @@ class Setting:
 
     def preloaded(self, command: list[str], *, acks: Path | None = None, fail: Fail = None) -> list[str]:
         """Return a command that runs with the log."""
-        chosen = environment(self.library, self.disk, self.log, acks=acks, fail=fail)
+        chosen = environment(self.disk_log, self.disk, self.log, acks=acks, fail=fail)
         names = [name for name in chosen if name.startswith(("POWERCUT_", "LD_PRELOAD"))]
         return ["env", *(f"{name}={chosen[name]}" for name in names), *command]
 

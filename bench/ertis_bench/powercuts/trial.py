@@ -87,7 +87,7 @@ def try_cuts(
             n_sent = rng.randint(min(4, n_measurements), n_measurements)
             first = _FIRST_SYNC + rng.randint(0, n_sent)  # about one sync for each measurement
             fail = (first, rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
-            setting = Setting(folder=place, library=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
+            setting = Setting(folder=place, disk_log=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
             trace = _run(name, setting)
             of_kind["runs"] += 1
             _cut(name, trace, rng, min(states_of_a_run, wanted - of_kind["states"]), of_kind, say=say, keep=keep)

@@ -231,7 +231,8 @@ class CentralNode:
         message: Message | None = None
         try:
             who = self._door.who(frames)
-            if who is None:  # the server socket has counted it
+            if who is None:
+                # The server socket counts messages of keys that are not listed.
                 self._greetings.forget(sender)
                 self._intake.bye(sender)
                 reason = "this key is not listed (any more); have it listed"
