@@ -3,7 +3,9 @@
 import itertools
 import statistics
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
-from ertis_numba.stages.call_match import first_call_match
+from ertis_numba.stages.call_match import CallMatch, first_call_match
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
@@ -23,6 +25,7 @@ __all__ = ["Making", "checked", "making"]
 
 _Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
+_Checks = tuple[str, CallMatch | None]
 
 
 class Making:
@@ -108,12 +111,13 @@ def making(
             for recording in recordings
         ]
         writer = EnergyscapeWriter(target, recording=recordings, dtype=options.dtype, overwrite=options.overwrite)
+        checks = _begin_checks(stack, recordings, chosen)
         runs = [
             SensorRun(pipeline, batch=options.batch, most_bytes=most_bytes)
             for pipeline in stack.enter_context(pipelines(chosen))
         ]
-        for run, recording in zip(runs, recordings, strict=True):
-            _look_over(run, recording, options, warn, show)
+        for run, recording, check in zip(runs, recordings, checks, strict=True):
+            _look_over(run, recording, check.result(), options, warn, show)
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
             writer.note_call(recording.sensor, run.call_warning)
@@ -149,9 +153,10 @@ def checked(
     """
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
+        checks = _begin_checks(stack, recordings, list(settings.values()))
         runs = [SensorRun(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))]
-        for run, recording in zip(runs, recordings, strict=True):
-            _look_over(run, recording, options, warn, lambda *_: None)
+        for run, recording, check in zip(runs, recordings, checks, strict=True):
+            _look_over(run, recording, check.result(), options, warn, lambda *_: None)
         rows = [{"sensor": recording.sensor, **run.told} for recording, run in zip(recordings, runs, strict=True)]
         return {**(runs[0].told if len(runs) == 1 else {}), "sensors": rows}
 
@@ -169,17 +174,37 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
     return told
 
 
+def _begin_checks(
+    stack: ExitStack, recordings: Sequence[RecordingReader], settings: Sequence[Settings]
+) -> list[Future[_Checks]]:
+    """Begin the checks of all sensors' signals in a thread, beside the planning and loading of pipelines."""
+    thread = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="ertis-checks"))
+    return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
+
+
+def _check(recording: RecordingReader, settings: Settings) -> _Checks:
+    """Return what is wrong with the microphones of a sensor, empty if nothing is, and the match of its call."""
+    first = recording[0]
+    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
+    others = (recording[index] for index in range(1, len(recording)))
+    heard = (replace(each, settings=settings) for each in itertools.chain([first], others))
+    return faults, first_call_match(heard)
+
+
 def _look_over(
-    run: SensorRun, recording: RecordingReader, options: Options, warn: Callable[[str], None], show: _Show
+    run: SensorRun,
+    recording: RecordingReader,
+    checks: _Checks,
+    options: Options,
+    warn: Callable[[str], None],
+    show: _Show,
 ) -> None:
     first = run.known(recording[0])
-    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", first)
+    faults, match = checks
     if faults and options.strict:
         raise DataError(faults)
     if faults:
         warn(faults)
-    others = (run.known(recording[index]) for index in range(1, len(recording)))
-    match = first_call_match(itertools.chain([first], others))
     if match is not None and match.warning:
         run.call_warning = match.warning
         warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
