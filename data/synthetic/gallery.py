@@ -28,7 +28,7 @@ _MIN_LEVELS_DB = (-10.0, -30.0)
 _MOST_MARKS = 8
 _MOST_BYTES = 150_000  # of a picture
 _SHEET = (1.0, 92)  # the share of a figure's width that is shown, and dots per inch
-_FRAME = (0.76, 84)  # the same of the figures of a strip: without colour bar and list
+_FRAME = (0.745, 84)  # the same of the figures of a strip: without colour bar and list
 _IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
 
 
