@@ -84,14 +84,12 @@ def running(folder=None, **options):
     archive = options.pop("archive", None) or (None if folder is None else Archive(folder, seal=False))
     with CentralNode("tcp://127.0.0.1:0", archive=archive, on_event=events.append, **options) as central:
         central.events = events
-        stop = threading.Event()
-        thread = threading.Thread(target=central.run, args=(stop,))
-        central.end = stop.set
+        thread = threading.Thread(target=central.run)
         thread.start()
         try:
             yield central
         finally:
-            stop.set()
+            central.stop()
             thread.join()
 
 

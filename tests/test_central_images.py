@@ -1,6 +1,7 @@
 """A central node and what makes images, whatever that does."""
 
 import os
+import threading
 from collections import Counter
 from types import SimpleNamespace
 from typing import ClassVar
@@ -8,10 +9,12 @@ from typing import ClassVar
 import pytest
 
 from ertis_numba.network import messages
+from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.network.messages import Ack, Ping, Pong
 from ertis_numba.network.status import Percentiles, ProcessingStatus
 from tests.central import Node, running, stored, wanted
 from tests.journals import EPOCH, entries
+from tests.sending import SOON_S, until
 
 
 class Images:
@@ -37,7 +40,7 @@ class Images:
     def fds(self):
         return ()
 
-    def start(self):
+    def start(self, _):
         pass
 
     def tick(self, _):
@@ -128,3 +131,34 @@ def test_what_processing_drops_is_told_to_its_node(monkeypatch):
             node.send(Ping())
             told = node.hear(Ack).dropped
     assert told == ((10, "superseded"),)
+
+
+class Loading(Images):
+    """Images whose processes never become ready."""
+
+    def __init__(self):
+        self.waits, self.closed = threading.Event(), False
+
+    def start(self, stopping):
+        self.waits.set()
+        until(stopping)
+
+    def close(self, _):
+        self.closed = True
+
+
+def test_stop_ends_the_wait_for_processes_that_are_loading(tmp_path):
+    images, events = Loading(), []
+    central = CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path), processing=images, on_event=events.append)
+
+    def stop():
+        assert images.waits.wait(SOON_S)
+        central.stop()
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    with central:
+        central.run()
+    thread.join()
+    assert images.closed
+    assert "listening" not in [event["event"] for event in events]

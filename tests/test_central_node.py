@@ -259,7 +259,7 @@ def test_a_central_node_needs_something_to_do():
 
 def test_it_is_run_in_a_with_statement(tmp_path):
     with pytest.raises(ArgumentError, match="not open"):
-        CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path)).run(lambda: True)
+        CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path)).run()
 
 
 def test_a_folder_belongs_to_one_central_node(tmp_path):
@@ -337,5 +337,5 @@ def test_a_disk_that_does_not_answer_is_told(tmp_path, monkeypatch):
 def test_nodes_hear_that_it_ends(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
-        central.end()
+        central.stop()
         assert node.hear(Pong).state == "closing"

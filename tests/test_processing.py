@@ -17,7 +17,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
 from ertis_numba.stages.points import PointExtractor
 from tests.cases import SHORT
-from tests.driven import MEASUREMENT, Application, driven, hello
+from tests.driven import ANY, MEASUREMENT, Application, driven, hello
 
 WIDE = SHORT.replace(processing=SHORT.processing.replace(directions="2d:9"))
 
@@ -173,6 +173,15 @@ def test_an_address_that_is_taken_is_told_in_a_line():
         other = Processing(Options(publish=loop.processing.address, device="numpy"))
         with pytest.raises(NetworkError, match="cannot be listened at"):
             other.start()
+
+
+def test_start_returns_before_the_publisher_listens_once_it_is_to_stop():
+    processing = Processing(Options(publish=ANY, device="numpy"))
+    try:
+        processing.start(lambda: True)
+        assert processing.address == ANY
+    finally:
+        processing.close()
 
 
 def test_status_reaches_who_asks_and_who_subscribes():

@@ -71,25 +71,25 @@ BUSY = Status(
 @contextlib.contextmanager
 def central_node(keys=None):
     """A real one, in a thread of its own; its address."""
-    addresses, end = queue.Queue(), threading.Event()
+    opened = queue.Queue()
 
     def run():
         try:
             with tempfile.TemporaryDirectory() as folder, _open(folder, keys) as node:
-                addresses.put(node.address)
-                node.run(end)
+                opened.put(node)
+                node.run()
         except BaseException as error:
-            addresses.put(error)
+            opened.put(error)
             raise
 
     thread = threading.Thread(target=run)
     thread.start()
+    node = opened.get(timeout=PATIENCE_S)
+    assert isinstance(node, CentralNode), node
     try:
-        address = addresses.get(timeout=PATIENCE_S)
-        assert isinstance(address, str), address
-        yield address
+        yield node.address
     finally:
-        end.set()
+        node.stop()
         thread.join(PATIENCE_S)
 
 

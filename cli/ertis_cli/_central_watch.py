@@ -172,16 +172,15 @@ def run(
     ErtisError
         It cannot begin.
     """
-    stop = threading.Event()
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
-        signals.obey(stop.set)  # before anybody is told that it listens, and may want it to end
+        signals.obey(node.stop)  # before anybody is told that it listens, and may want it to end
         stack.enter_context(node)
         if metrics is not None:
             stack.enter_context(metrics)
         made.clear()
         with watch.shows(lambda: node.latest):
-            node.run(stop, duration_s)
+            node.run(duration_s)
 
 
 def size(n_bytes: float) -> str:

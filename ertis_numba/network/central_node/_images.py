@@ -33,8 +33,8 @@ class Images(Protocol):
     def refused(self) -> Mapping[str, int]:
         """Applications that were refused, by reason."""
 
-    def start(self) -> None:
-        """Begin."""
+    def start(self, stopping: Callable[[], bool]) -> None:
+        """Start; return early once ``stopping`` returns True."""
 
     def know(self, hello: Hello, settings: Settings) -> None:
         """Take note of a sensor."""
@@ -87,9 +87,9 @@ class Guarded:
             self._on_error(error)
             return instead
 
-    def start(self) -> None:
-        """Begin; raises what `Images.start` does."""
-        self._images.start()
+    def start(self, stopping: Callable[[], bool]) -> None:
+        """Start; raise what `Images.start` raises."""
+        self._images.start(stopping)
 
     def know(self, hello: Hello, settings: Settings) -> None:
         """Take note of a sensor."""

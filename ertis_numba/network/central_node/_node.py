@@ -116,6 +116,7 @@ class CentralNode:
         )
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = -1
+        self._stopping = threading.Event()
         self._next_tick_s = self._next_told_s = self._next_status_s = 0.0
         self.latest = self.status()
 
@@ -134,7 +135,9 @@ class CentralNode:
         if self._archive is not None:
             self._archive_fd = self._archive.open()
         if self._images is not None:
-            self._images.start()
+            self._images.start(self._stopping.is_set)
+            if self._stopping.is_set():
+                return
         self._greetings_fd = self._greetings.open()
         self._door.open(self._listen, most_bytes=self._most_bytes)
         self._telling.tell("listening", address=self._condition.address, pid=os.getpid())
@@ -160,20 +163,27 @@ class CentralNode:
             stack.callback(self._door.close)
             self._telling.refused(self._door.refused)
 
-    def run(self, stop: Callable[[], bool] | threading.Event, duration_s: float | None = None) -> None:
-        """Take measurements in until it is to stop, and then wait until those are durable.
+    def stop(self) -> None:
+        """End `run` within a tenth of a second, or the wait for processes at the start of ``with``; from any thread."""
+        self._stopping.set()
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Receive measurements until `stop` is called, and then wait until they are durable.
 
         Parameters
         ----------
-        stop : callable or threading.Event
-            Looked at ten times a second.
         duration_s : float, optional
+            Longest time in seconds.
+
+        Raises
+        ------
+        ArgumentError
+            The central node is not open, or the time is not above zero.
         """
-        if not self._door.is_open:
+        if not self._door.is_open and not self._stopping.is_set():
             raise ArgumentError("a central node is not open; use it in a with statement")
-        ends = stop.is_set if isinstance(stop, threading.Event) else stop
         end_s = None if duration_s is None else time.monotonic() + checks.positive("duration", duration_s)
-        while not ends() and (end_s is None or time.monotonic() < end_s):
+        while not self._stopping.is_set() and (end_s is None or time.monotonic() < end_s):
             self._turn()
         self._condition.closing = True
         for peer_id in self._intake.peers:

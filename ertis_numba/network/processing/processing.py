@@ -1,7 +1,7 @@
 """What makes images of measurements and has them published, without ever holding up who takes them in."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -85,8 +85,13 @@ class Processing:
         """Messages and keys of applications that were refused, by reason."""
         return self._publisher.refused
 
-    def start(self) -> None:
+    def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
         """Start the processes; applications can subscribe when this returns.
+
+        Parameters
+        ----------
+        stopping : callable, optional
+            Polled five times a second; once it returns True, this returns without waiting for the processes.
 
         Raises
         ------
@@ -95,7 +100,7 @@ class Processing:
         """
         try:
             self._runner = _runner(self._options, self._log)
-            self._publisher.start()
+            self._publisher.start(stopping)
             if self._options.expected is not None:
                 self._sensors.expect(self._options.expected)
             if self._options.quarantine is not None:

@@ -1,7 +1,7 @@
 """The publisher as the central node sees it: a process that is started, told, watched and started again."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import NetworkError
@@ -73,8 +73,8 @@ class Publisher:
         self._keys_note = ""
         self._reports_sent = self._reports_taken = 0
 
-    def start(self) -> None:
-        """Start the process, and wait until it listens.
+    def start(self, stopping: Callable[[], bool]) -> None:
+        """Start the process, and wait until it listens or ``stopping`` returns True.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Publisher:
         """
         self._begin()
         end_s = time.monotonic() + _STARTED_S
-        while self._child is not None and not self._serves:
+        while self._child is not None and not self._serves and not stopping():
             if time.monotonic() > end_s or self._child.pipe.closed:
                 raise NetworkError(f"{self.address} is not listened at: its process ended or hangs; try again")
             self._child.pipe.wait(0.2)
