@@ -143,6 +143,16 @@ def test_update_refuses_a_file_without_a_place(tmp_path):
     assert target.read_text("utf-8") == MARKED.format("scaling").replace("old", "| new |")
 
 
+def test_a_table_of_some_parts_never_replaces_the_table_of_all(tmp_path):
+    target = tmp_path / "a.md"
+    target.write_text(MARKED.format("reliability"), "utf-8")
+    assert tables.place(target, "reliability") == ("reliability", "reliability")
+    with pytest.raises(ArgumentError, match=r"for this table; .* <!-- ertis bench reliability --only flips -->"):
+        tables.place(target, "reliability", ["flips"])
+    target.write_text(MARKED.format("reliability --only flips"), "utf-8")
+    assert tables.place(target, "reliability", ["flips"]) == ("reliability", "reliability --only flips")
+
+
 def test_command_refuses_a_file_without_a_place_before_it_measures(tmp_path):
     target = tmp_path / "a.md"
     target.write_text("nothing", "utf-8")

@@ -1,6 +1,6 @@
 """Reports as Markdown, and where they go."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -83,21 +83,25 @@ def around(path: Path, name: str) -> tuple[str, str]:
     return head + begin, end + tail
 
 
-def place(path: Path, command: str) -> str:
-    """Return which form of a command's table a file has a place for: one of `FORMS`.
+def place(path: Path, command: str, parts: Sequence[str] = ()) -> tuple[str, str]:
+    """Return the form of a command's table that a file has markers for, and the name in these markers.
+
+    Some parts of a benchmark have markers of their own, ``ertis bench NAME --only PART``, so that they never replace
+    the table of all parts.
 
     Raises
     ------
     ArgumentError
         As in `around`.
     """
-    first, *others = FORMS[command]
-    for name in others:
+    markers = {form: " ".join([form, *(f"--only {part}" for part in parts)]) for form in FORMS[command]}
+    first, *others = markers
+    for form in others:
         with suppress(ArgumentError):
-            around(path, name)
-            return name
-    around(path, first)
-    return first
+            around(path, markers[form])
+            return form, markers[form]
+    around(path, markers[first])
+    return first, markers[first]
 
 
 def paper(report: dict[str, Any]) -> str:

@@ -331,10 +331,11 @@ def _run(
 ) -> dict[str, Any]:
     from ertis_bench import tables
 
-    places = [(target, tables.place(target, name)) for target in targets]  # refused now rather than after minutes
+    parts = given.get("only", ())
+    places = [(target, *tables.place(target, name, parts)) for target in targets]  # refused before minutes of work
     report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)
-    for target, place in places:
-        tables.update(target, place, tables.FORMS[name][place](report))
+    for target, form, marker in places:
+        tables.update(target, marker, tables.FORMS[name][form](report))
     if as_json:
         options.print_json(report)
     elif not targets:
