@@ -15,7 +15,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli import _signals, options
+from ertis_cli import options
 from ertis_cli.main import COMMANDS, cli
 
 from ertis_numba import kernels
@@ -343,18 +343,20 @@ def test_a_signal_in_a_callback_is_obeyed(number, code):
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
-def test_interrupt_waits_for_the_compiler():
-    done = []
-
-    def work():
-        with _signals.interrupt_later():
-            signal.raise_signal(signal.SIGINT)
-            done.append(True)
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert done
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_error_of_a_library_that_swallowed_a_signal_is_no_traceback(number, code):
+    program = (
+        "import click, ctypes, signal; from ertis_cli import _signals, main; _signals.obey_signals()\n"
+        "@click.command\n"
+        "def compile():\n"
+        f"    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal({number.value}))()\n"
+        "    raise RuntimeError('no compiled object yet')\n"
+        "main.COMMANDS['compile'] = ('__main__:compile', '')\n"
+        "main.cli.main(['compile'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert done.stderr == ("ertis: error: interrupted\n" if number == signal.SIGINT else "")
 
 
 @pytest.mark.parametrize("command", ["import", "simulate"])

@@ -15,7 +15,6 @@ __all__ = [
     "Interruption",
     "Signals",
     "broken_off_by_signals",
-    "interrupt_later",
     "interruption",
     "is_detached",
     "leave",
@@ -217,16 +216,3 @@ def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
 def is_detached(number: int) -> bool:
     """Return True if the process outlives its terminal, because ``nohup`` has set SIGHUP to be ignored."""
     return number == getattr(signal, "SIGHUP", None) and signal.getsignal(number) is signal.SIG_IGN
-
-
-@contextmanager
-def interrupt_later() -> Iterator[None]:
-    """Delay Ctrl-C until the block ends: the compiler's callbacks would swallow the exception or fail."""
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
-        raise KeyboardInterrupt

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
-from ertis_cli._signals import broken_off_by_signals, interrupt_later, stopped_by_signals
+from ertis_cli._signals import broken_off_by_signals, stopped_by_signals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -196,7 +196,7 @@ def _renderer(
         limits.require_clear(shot)
         for note in limits.notes(shot):
             options.say(f"note: {note}", quiet=quiet)
-    with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.simulation.render import compile_kernels
 
         compile_kernels()

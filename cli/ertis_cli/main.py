@@ -92,10 +92,20 @@ class _Commands(click.Group):
         except Exception as error:
             if not standalone_mode:
                 raise
-            if interruption.caused(error) and interruption.code != _INTERRUPTED:
+            if not _is_interruption(error):
+                _leave(*_told(error))
+            if interruption.code != _INTERRUPTED:
                 sys.exit(interruption.code)
-            _leave(*_told(error))
+            _leave(_INTERRUPTED, "interrupted")
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def _is_interruption(error: Exception) -> bool:
+    """Return True if a signal caused an error, directly or in a library.
+
+    LLVM's callbacks swallow the exception of a signal. Numba then fails with an error that has no link to it.
+    """
+    return interruption.caused(error) or (interruption.code is not None and not _is_expected(error))
 
 
 def _told(error: Exception) -> tuple[int, str]:
@@ -105,7 +115,7 @@ def _told(error: Exception) -> tuple[int, str]:
         return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
     if isinstance(error, click.ClickException):
         return _FAILED, error.format_message()
-    if isinstance(error, click.Abort) or interruption.caused(error):
+    if isinstance(error, click.Abort):
         return _INTERRUPTED, "interrupted"
     if _is_expected(error):
         return _FAILED, _of_system(error) or str(error) or type(error).__name__

@@ -12,7 +12,6 @@ import click
 from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
-from ertis_cli._signals import interrupt_later
 
 if TYPE_CHECKING:
     from ertis_numba.pipeline import Pipeline
@@ -239,7 +238,7 @@ def settings_with(
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
     """Return a pipeline, and tell who waits for it why."""
-    with note_when_slow(PREPARING, quiet=quiet), interrupt_later():
+    with note_when_slow(PREPARING, quiet=quiet):
         from ertis_numba.pipeline import Pipeline
 
         return Pipeline(settings, device=device, threads=threads, predict=False)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
-from ertis_cli._signals import interrupt_later
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -74,7 +73,7 @@ def simulate(
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
     _require_room(target, scene, names)
-    with options.note_when_slow(options.PREPARING, quiet=quiet), interrupt_later():
+    with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.simulation.plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 

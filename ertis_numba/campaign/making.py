@@ -178,7 +178,8 @@ def _begin_checks(
     stack: ExitStack, recordings: Sequence[RecordingReader], settings: Sequence[Settings]
 ) -> list[Future[_Checks]]:
     """Begin the checks of all sensors' signals in a thread, beside the planning and loading of pipelines."""
-    thread = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="ertis-checks"))
+    thread = ThreadPoolExecutor(1, thread_name_prefix="ertis-checks")
+    stack.callback(thread.shutdown, cancel_futures=True)  # an interruption does not wait for other sensors
     return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
 
 
