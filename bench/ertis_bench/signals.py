@@ -140,7 +140,7 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
         number = rng.choice(_SIGNALS)
         at_s = rng.uniform(begins_s, max(lasts_s, begins_s))
         _, took_s, code, errors = _one(command, paths, out, number, at_s)
-        if not took_s:
+        if not took_s or _in_interpreter(errors):
             continue
         found["signals"] += 1
         documented = {128 + number, -number, 0}
@@ -156,6 +156,14 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
         found["slowest_s"] = max(found["slowest_s"], took_s)
     found["slowest_s"] = round(found["slowest_s"], 3)
     return found | ({"examples": list(examples)[:5]} if examples else {})
+
+
+def _in_interpreter(errors: str) -> bool:
+    """Return True if a signal arrived before Python ran the first line of the command.
+
+    Python may take longer to start than `_interpreter_s` says. No frame of its traceback is then in our code.
+    """
+    return "Traceback" in errors and "ertis_cli" not in errors
 
 
 def _interpreter_s() -> float:
