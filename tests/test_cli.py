@@ -359,6 +359,24 @@ def test_an_error_of_a_library_that_swallowed_a_signal_is_no_traceback(number, c
     assert done.stderr == ("ertis: error: interrupted\n" if number == signal.SIGINT else "")
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_an_import_turns_into_another_error_is_no_traceback(number, code):
+    program = (
+        "import signal, sys\n"
+        "class Name:\n"
+        f"    def __set_name__(self, *_): signal.raise_signal({number.value})\n"
+        "class Loading:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'ertis_cli.main': type('Made', (), {'name': Name()})\n"
+        "sys.meta_path.insert(0, Loading())\n"
+        "from ertis_cli.__main__ import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert done.stderr == ("ertis: error: interrupted\n" if number == signal.SIGINT else "")
+
+
 @pytest.mark.parametrize("command", ["import", "simulate"])
 def test_input_is_never_overwritten(tmp_path, command):
     path = tmp_path / "input.toml"

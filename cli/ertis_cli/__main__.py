@@ -2,15 +2,23 @@
 
 import sys
 
+_INTERRUPTED = 130
+
 
 def main() -> None:
     """Install the signal handlers, then load and run the command line; by default, Ctrl-C would print a traceback."""
+    try:
+        code = _run()
+    except KeyboardInterrupt:  # before the handlers are installed
+        code = _interrupted()
+    sys.exit(code)
+
+
+def _run() -> str | int | None:
     import gc
     import signal
 
-    gc.set_threshold(
-        50_000
-    )  # imports make hundreds of thousands of objects that stay; looking through them takes 60 ms
+    gc.set_threshold(50_000)  # imports make hundreds of thousands of objects that stay; a search of them takes 60 ms
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are installed, after some imports
     from ertis_cli._signals import interruption, leave, obey_signals
@@ -22,15 +30,24 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
-        sys.stderr.write("ertis: error: interrupted\n")
-        code = 130
+        code = _interrupted()
     except SystemExit as error:
         code = error.code
+    except Exception as error:
+        if not interruption.caused(error):
+            raise
+        # Python turns the exception of a signal into a RuntimeError where a class is made.
+        code = _interrupted() if interruption.code == _INTERRUPTED else interruption.code
     finally:
         interruption.end()
     if interruption.asked and isinstance(code, int | None):
         leave(code or 0)
-    sys.exit(code)
+    return code
+
+
+def _interrupted() -> int:
+    sys.stderr.write("ertis: error: interrupted\n")
+    return _INTERRUPTED
 
 
 if __name__ == "__main__":
