@@ -12,8 +12,11 @@ from ertis_numba.stages.detect import find_peaks
 from ertis_numba.waveform import matched_filter
 
 
-def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0):
-    """The image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude)."""
+def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0):
+    """The image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude).
+
+    Microphones are off their places by ``errors_m``, a standard deviation.
+    """
     settings = Settings(processing=Processing(directions=directions, range_m=range_m))
     grid = direction_grid(settings.processing)
     looks = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
@@ -26,7 +29,8 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0):
     beams = np.zeros((len(grid), len(ranges_m)), dtype=complex)
     for azimuth_deg, elevation_deg, reflector_m, amplitude in reflectors:
         source = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))
-        paths_m = (looks - source) @ positions_m.T  # (direction, mic)
+        actual_m = positions_m + errors_m * np.random.default_rng(2).standard_normal(positions_m.shape)
+        paths_m = looks @ positions_m.T - source @ actual_m.T  # (direction, mic)
         pattern = np.stack([np.exp(-1j * k * paths_m).mean(axis=1) for k in wave_1_m], axis=1)
         shape = np.exp(2j * wave_1_m[:, None] * (ranges_m - reflector_m)) * power[:, None]
         beams += amplitude * pattern @ shape
@@ -67,6 +71,16 @@ def test_two_reflectors_a_beam_width_and_a_half_apart_are_two():
     peaks = find_peaks(image_of([(0, 0, 1.2, 1.0), (12, 0, 1.2, 0.9)]), min_level_db=-6)
     # Each pulls at the other's main lobe with its first side lobe.
     assert [peak.azimuth_deg for peak in peaks] == pytest.approx([0, 12], abs=1.5)
+
+
+@pytest.mark.parametrize("errors_m", [0.0, 5e-4, 8e-4])
+def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
+    """Microphones half a millimetre off their places raise side lobes above their prediction."""
+    strong, other = (12.0, 20.0, 1.2, 1.0), (-35.0, -10.0, 1.21, 0.5)
+    image = image_of([strong], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4, errors_m=errors_m)
+    assert len(find_peaks(image, min_level_db=-20)) == 1
+    both = image_of([strong, other], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4, errors_m=errors_m)
+    assert [peak.azimuth_deg for peak in find_peaks(both, min_level_db=-20)] == pytest.approx([12.0, -35.0], abs=1.5)
 
 
 @pytest.mark.parametrize(("directions", "azimuth_deg"), [("2d:91", 97.0), ("1850", 50.0)])

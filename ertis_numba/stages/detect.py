@@ -12,12 +12,11 @@ from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.stages.noise import threshold_of
 from ertis_numba.stages.peak_interpolation import PeakInterpolator
-from ertis_numba.stages.point_spread import PointSpread
+from ertis_numba.stages.side_lobes import SideLobes
 
 __all__ = ["SIDE_LOBE_DB", "find_peaks", "neighbours_of", "spacing_of"]
 
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
-_MARGIN_DB = 3.0  # by which a reflector must rise above the side lobes of stronger ones
 SIDE_LOBE_DB = 10.0
 """Below the strongest of the same range, from which on side lobes are expected.
 
@@ -35,10 +34,10 @@ def find_peaks(
 ) -> list[Peak]:
     """Return the reflectors of an image, strongest first.
 
-    A reflector is a local maximum over directions and ranges that rises above what the side lobes of
-    all stronger reflectors add up to there, as predicted from array and call. So each gives one
-    entry, not one per bin of its main lobe nor one per side lobe. Direction, range and level are
-    interpolated: see `ertis_numba.stages.peak_interpolation.PeakInterpolator`.
+    A reflector is a local maximum over directions and ranges that exceeds the side lobes of all stronger reflectors
+    there, see `ertis_numba.stages.side_lobes.SideLobes`. So each gives one entry, not one per bin of its main lobe nor
+    one per side lobe. Direction, range and level are interpolated: see
+    `ertis_numba.stages.peak_interpolation.PeakInterpolator`.
 
     Parameters
     ----------
@@ -76,23 +75,19 @@ def find_peaks(
         checks.shape("where", where.shape, image.energy.shape)
     places = _local_maxima(image.energy, neighbours, floor, where)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
-    spread = PointSpread(image.settings)
+    side_lobes = SideLobes(image, directions)
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
     for k in np.argsort(-levels, kind="stable"):
         if len(found) == top:
             break
-        direction, range_m = directions[places[k, 0]], image.range_m[places[k, 1]]
         # Only what comes next in order is compared with what was found, which is few of many candidates, and
         # with where that really lies: a side lobe is several decibels off when its reflector is half a bin off.
-        near = [entry for entry in found if abs(range_m - entry[1]) < spread.reach_m]
-        if near:
-            sources, ranges_m, amplitudes = (np.array(column) for column in zip(*near, strict=True))
-            masked = float(amplitudes @ spread(direction - sources, range_m - ranges_m))
-            if levels[k] <= masked * 10 ** (_MARGIN_DB / 20):
-                continue
+        if side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
+            continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
+        side_lobes.add(*found[-1])
     found.sort(key=lambda entry: -entry[2])
     return [
         Peak(

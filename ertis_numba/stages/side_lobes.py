@@ -1,0 +1,114 @@
+"""Side lobes of the reflectors in an image: predicted where the array is as designed, and bounded where it is not."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.frames import Energyscape
+from ertis_numba.stages.point_spread import PULSE_M, PointSpread
+
+__all__ = ["SideLobes"]
+
+_MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predicted side lobes of stronger ones
+_FALSE_ALARM: Final = 0.01
+_N_DIRECTIONS: Final = 64  # in which prediction and image are compared
+_N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
+# Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
+# main lobes of reflectors take less than a quarter of the directions.
+_QUARTILE: Final = 0.75
+_QUARTILE_OF_MAGNITUDE: Final = math.sqrt(math.log(4))
+_QUARTILE_OF_COMPONENT: Final = 0.8134
+
+
+class SideLobes:
+    """Test of maxima of an image: each is a reflector, or may be a side lobe of stronger reflectors.
+
+    `PointSpread` predicts side lobes for an array as designed and for reflectors that are points. Real microphones,
+    transducers and surfaces change the pattern of the side lobes, but hardly their mean power. So the limit is the sum
+    of what is predicted and of what may deviate from it. The deviation is a sum of many phasors, so its amplitude
+    follows a Rayleigh distribution [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of
+    1 - p. The image itself tells σ: its deviation from the prediction at the range in question, but at most the mean
+    of all side lobes that reach this range.
+
+    Parameters
+    ----------
+    image : Energyscape
+    directions : (direction, axis) float64
+        Unit vectors of the image's directions.
+
+    References
+    ----------
+    .. [1] J. W. Goodman, *Speckle Phenomena in Optics*, 2nd edition, chapter 3.
+    """
+
+    def __init__(self, image: Energyscape, directions: NDArray[np.float64]) -> None:
+        self._image, self._spread = image, PointSpread(image.settings)
+        count = len(directions)
+        self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
+        self._sampled = directions[self._samples]
+        self._factor = math.sqrt(math.log(count / _FALSE_ALARM))
+        self._offsets_m = np.linspace(0.0, self._spread.reach_m, _N_OFFSETS)
+        self._mean = np.zeros(_N_OFFSETS)  # of the side lobes of a reflector of amplitude 1, by range offset
+        self._sources: list[tuple[NDArray[np.float64], float, float]] = []
+        self._deviations: dict[int, float] = {}  # by range bin
+
+    def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
+        """Add a reflector, strongest first.
+
+        Parameters
+        ----------
+        direction : (axis,) float64
+        range_m, amplitude : float
+        """
+        if not self._sources:
+            self._mean = self._mean_around(direction)
+        self._sources.append((direction, range_m, amplitude))
+        self._deviations.clear()
+
+    def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
+        """Return True if a maximum of this amplitude may be a side lobe of the reflectors added so far.
+
+        Parameters
+        ----------
+        direction : (axis,) float64
+        range_bin : int
+        level : float
+        """
+        range_m = float(self._image.range_m[range_bin])
+        near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.reach_m]
+        if not near:
+            return False
+        sources, ranges_m, amplitudes = (np.array(each) for each in zip(*near, strict=True))
+        offsets_m = range_m - ranges_m
+        predicted = float(amplitudes @ self._spread(direction - sources, offsets_m))
+        if level <= _MARGIN * predicted:
+            return True
+        # Echoes of real surfaces are longer than the pulse.
+        means = amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
+        most = self._factor * math.hypot(*means)
+        return level <= predicted + most and level <= predicted + self._factor * self._deviation(range_bin)
+
+    def _deviation(self, range_bin: int) -> float:
+        """Return the standard deviation of the image from the prediction at a range."""
+        if range_bin not in self._deviations:
+            n_samples = len(self._samples)
+            sources, ranges_m, amplitudes = (np.array(each) for each in zip(*self._sources, strict=True))
+            offsets_m = float(self._image.range_m[range_bin]) - ranges_m
+            near = np.abs(offsets_m) < self._spread.reach_m
+            sources, offsets_m, amplitudes = sources[near], offsets_m[near], amplitudes[near]
+            directions = (self._sampled - sources[:, None]).reshape(-1, 3)
+            levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
+            predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
+            measured = self._image.energy[self._samples, range_bin]
+            deviation = float(np.quantile(np.abs(measured - predicted), _QUARTILE))
+            self._deviations[range_bin] = deviation / _QUARTILE_OF_COMPONENT
+        return self._deviations[range_bin]
+
+    def _mean_around(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the root mean square of the side lobes of a reflector of amplitude 1: (offset,) float64."""
+        n_samples = len(self._samples)
+        offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
+        levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
+        return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
