@@ -91,6 +91,20 @@ def test_process_warns_of_another_call_on_stderr_and_in_the_file(tmp_path):
     assert "opposite direction" in CliRunner().invoke(cli, ["info", str(tmp_path / "rec.energy.h5")]).stdout
 
 
+def test_process_of_a_folder_names_the_recordings_of_another_call(tmp_path):
+    runs, images = tmp_path / "runs", tmp_path / "images"
+    runs.mkdir()
+    for name, call in {"same": CALL, "other": REVERSED}.items():
+        write_recording(runs / f"{name}.h5", [heard(call)])
+    done = CliRunner().invoke(cli, ["process", str(runs), "-o", f"{images}/", "--workers", "1"])
+    assert done.exit_code == 0, done.stderr
+    (warning,) = (line for line in done.stderr.splitlines() if line.startswith("ertis: warning"))
+    assert "other.h5" in warning
+    with open_energyscapes(images / "other.energy.h5") as other, open_energyscapes(images / "same.energy.h5") as same:
+        assert other.call_warning in warning
+        assert not same.call_warning
+
+
 def test_process_stores_no_warning_if_echoes_match(tmp_path):
     write_recording(tmp_path / "rec.h5", [heard(CALL)])
     done = CliRunner().invoke(cli, ["process", str(tmp_path / "rec.h5")])

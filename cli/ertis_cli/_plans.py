@@ -10,7 +10,7 @@ from ertis_cli import options
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
 
-__all__ = ["require_plan", "said_of"]
+__all__ = ["require_plan", "said_of", "wavefront_note"]
 
 _INTERPOLATIONS = {
     "fitted": "made of {n} of them by weights that err least",
@@ -37,12 +37,25 @@ def said_of(sensor: str, told: dict[str, Any]) -> Iterator[str]:
     if "plan" in told:
         yield from _explained(sensor, told["plan"])
     if "wavefront_error_db" in told:
-        yield (
-            f"{sensor}: the error of plane wavefronts is up to {told['wavefront_error_db']:.1f} dB at "
-            f"{told['wavefront_error_range_m']:g} m, in addition to the error budget; --wavefront auto corrects it"
-        )
+        yield wavefront_note(sensor, told["wavefront_error_db"], told["wavefront_error_range_m"])
     if "verified" in told:
         yield from _checked(sensor, told["verified"])
+
+
+def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
+    """Return a line on the error of plane wavefronts.
+
+    Parameters
+    ----------
+    whose : str
+        Sensor, or recordings.
+    error_db, range_m : float
+        Largest error, and the range of it.
+    """
+    return (
+        f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to the error "
+        "budget; --wavefront auto corrects it"
+    )
 
 
 def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["are_meant", "process_many", "summary"]
 
 _MOST_ROWS = 20  # of a table that has all recordings
+_WAVEFRONT = ("wavefront_error_db", "wavefront_error_range_m")
 _MOST_FAILED = 50  # of them are told again at the end
 
 
@@ -125,6 +126,7 @@ class _Report:
         self._begun_s = time.monotonic()
         self._totals = dict.fromkeys(("made", "there", "passed over", "failed"), 0)
         self._measurements = 0
+        self._wavefronts: list[tuple[float, float]] = []  # error in dB and its range in metres, of each recording
         self._failed: list[str] = []
 
     def follow(self, event: "Event", shown: _Hidden) -> None:
@@ -136,6 +138,8 @@ class _Report:
         error = _named(event)
         self._totals[event.outcome] += 1
         self._measurements += event.made.get("measurements", 0)
+        found = [_plane_error(row) for row in event.made.get("sensors", ())]
+        self._wavefronts += sorted(filter(None, found))[-1:]
         for line in _lines(event, told=not self._as_json):
             if not self._quiet:
                 shown.say(line)
@@ -159,6 +163,7 @@ class _Report:
         """
         took_s = time.monotonic() - self._begun_s
         if not self._quiet:
+            self._print_wavefronts()
             self._print_table(took_s)
         if self._as_json:
             totals = {name.replace(" ", "_"): count for name, count in self._totals.items()}
@@ -169,6 +174,11 @@ class _Report:
                 f"{len(self._failed)} of {options.counted(self._count, 'recording')} failed; mend what is told above "
                 "and process again: what is made stays"
             )
+
+    def _print_wavefronts(self) -> None:
+        if self._wavefronts and not self._as_json:
+            whose = f"{len(self._wavefronts)} of {options.counted(self._count, 'recording')}"
+            click.echo(_plans.wavefront_note(whose, *max(self._wavefronts)), err=True)
 
     def _print_table(self, took_s: float) -> None:
         if self._count <= _MOST_ROWS:
@@ -205,7 +215,15 @@ def _lines(event: "Ended", *, told: bool) -> Iterator[str]:
 def _plan_lines(event: "Ended", *, told: bool) -> Iterator[str]:
     for row in event.made.get("sensors", ()):
         if told:
-            yield from _plans.said_of(row["sensor"], row)
+            kept = row if "plan" in row else {name: value for name, value in row.items() if name not in _WAVEFRONT}
+            yield from _plans.said_of(row["sensor"], kept)
+
+
+def _plane_error(row: dict[str, Any]) -> tuple[float, float] | None:
+    """Return the error of a sensor's plane wavefronts and its range, if no explained plan tells them."""
+    if "plan" in row or _WAVEFRONT[0] not in row:
+        return None
+    return row[_WAVEFRONT[0]], row[_WAVEFRONT[1]]
 
 
 def _object(event: "Ended") -> dict[str, Any]:
