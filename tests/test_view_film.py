@@ -16,7 +16,7 @@ from ertis_numba.frames import Stamp
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_recording, write_energyscapes, write_recording
-from ertis_numba.viewer import Choices, Film, Scene, View
+from ertis_numba.viewer import Choices, Film, Pose, Scene, View
 from ertis_numba.viewer._page import Order
 from tests.files import SMALL, noise
 from tests.test_view import TURNED
@@ -235,6 +235,17 @@ def test_files_know_where_their_sensors_are(tmp_path, kind):
         scene = Scene()
         for each in film.at(0):
             assert each.pose == places[each.image.stamp.sensor]
+            scene.take(each)
+        assert scene.draw(Choices()).fused is not None
+
+
+def test_a_given_mounting_places_sensors_whose_own_is_unknown(tmp_path):
+    path = write_energyscapes(tmp_path / "img.h5", stamped(1, sensors=("front", "left")))
+    mounting = {"front": (TURNED.translation_m, TURNED.rotation_xyzw), "left": ([0, 1, 0], [0, 0, 0, 1])}
+    with Film(path, mounting=mounting) as film:
+        scene = Scene()
+        for each in film.at(0):
+            assert each.pose == Pose.of(*mounting[each.image.stamp.sensor])
             scene.take(each)
         assert scene.draw(Choices()).fused is not None
 

@@ -23,8 +23,8 @@ mounting: "Decorator" = click.option(
 )
 
 
-def mountings(path: Path | None, sensors: Iterable[str]) -> dict[str, Mounting] | None:
-    """Return the mountings of sensors, in a scene those at its start; None without a file.
+def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mounting] | None:
+    """Return the mountings of some sensors or all, in a scene those at its start; None without a file.
 
     Raises
     ------
@@ -36,14 +36,15 @@ def mountings(path: Path | None, sensors: Iterable[str]) -> dict[str, Mounting] 
     from ertis_numba.errors import ArgumentError
 
     known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
-    for name in sensors:
+    wanted = [*known] if sensors is None else [*sensors]
+    for name in wanted:
         if name not in known:
             raise ArgumentError(
                 f"{path} does not hold sensor {name!r}; add it, or choose one of {', '.join(known)} by --name"
                 if known
                 else f"{path} does not hold the mounting of any sensor; give a scene, or its [[sensors]]"
             )
-    return {name: known[name] for name in sensors}
+    return {name: known[name] for name in wanted}
 
 
 def note_unknown(sensors: Sequence[str], remedy: str, *, quiet: bool) -> None:

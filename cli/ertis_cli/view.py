@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ertis_cli import _network, options
+from ertis_cli import _mountings, _network, options
 from ertis_cli._signals import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ _ONLY = {
     help="Write what is shown as a page that needs no server: all of a file at once, or a live view at its end; "
     "at most 256 MB.",
 )
+@_mountings.mounting
 @_network.key
 @_network.server_key
 @options.device
@@ -98,6 +99,7 @@ def view(
     loop: bool,
     duration: float | None,
     html: Path | None,
+    mounting: Path | None,
     key: str | None,
     server_key: str | None,
     device: Any,
@@ -128,7 +130,9 @@ def view(
     at_once = html is not None and not live
     with (
         stopped_by_signals() as signals,
-        _source(what, sensors, live=live, keys=(key, server_key), device=device, loop=loop) as source,
+        _source(
+            what, sensors, live=live, keys=(key, server_key), device=device, loop=loop, mounting=mounting
+        ) as source,
         nullcontext() if live else _ended(source, signals, quiet=quiet),
         View(
             source,
@@ -180,15 +184,25 @@ def _require_use(kind: str) -> None:
 
 
 def _source(
-    what: str, sensors: tuple[str, ...], *, live: bool, keys: tuple[str | None, str | None], device: Any, loop: bool
+    what: str,
+    sensors: tuple[str, ...],
+    *,
+    live: bool,
+    keys: tuple[str | None, str | None],
+    device: Any,
+    loop: bool,
+    mounting: Path | None,
 ) -> "Live | Film":
     if live:
         from ertis_numba.viewer import Live
 
-        return Live(what, sensors=sensors or None, keys=_network.client_keys(*keys))
+        given = _mountings.mountings(mounting, sensors or None)
+        return Live(what, sensors=sensors or None, keys=_network.client_keys(*keys), mounting=given)
+    from ertis_numba.storage import sensor_names
     from ertis_numba.viewer import Film
 
-    return Film(what, sensors=sensors or None, device=device, loop=loop)
+    given = None if mounting is None else _mountings.mountings(mounting, sensors or sensor_names(what))
+    return Film(what, sensors=sensors or None, device=device, loop=loop, mounting=given)
 
 
 @contextmanager

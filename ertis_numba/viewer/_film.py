@@ -3,7 +3,7 @@
 import atexit
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, Literal, Self
@@ -21,7 +21,7 @@ from ertis_numba.storage import (
     sensor_names,
 )
 from ertis_numba.viewer._moments import UNTIMED_S, Moment, Track, moments_of
-from ertis_numba.viewer._shapes import Pose, Taken
+from ertis_numba.viewer._shapes import Mounting, Pose, Taken
 
 __all__ = ["Film", "Moment"]
 
@@ -40,6 +40,8 @@ class Film:
         What processes recordings.
     loop : bool
         Begin anew at the end.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Poses of sensors on their platform, in place of those in the file.
 
     Attributes
     ----------
@@ -75,7 +77,9 @@ class Film:
         sensors: Sequence[str] | None = None,
         device: Literal["auto", "cpu", "cuda", "numpy"] = "auto",
         loop: bool = False,
+        mounting: Mapping[str, Mounting] | None = None,
     ) -> None:
+        self._given = {sensor: Pose.of(*place) for sensor, place in (mounting or {}).items()}
         self.path = Path(path)
         self.title = self.path.name
         self._device, self._loop = device, loop
@@ -259,11 +263,7 @@ class Film:
         reader = self._readers[name]
         item = reader[number]
         image = item if isinstance(item, Energyscape) else self._processed(name, item)
-        pose = None
-        if reader.translation_m is not None and reader.rotation_xyzw is not None:
-            x, y, z = reader.translation_m.tolist()
-            i, j, k, w = reader.rotation_xyzw.tolist()
-            pose = Pose((x, y, z), (i, j, k, w))
+        pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         return Taken(image, pose, self.moments[place].time_s, self._tracks[name].interval_s)
 
     def _processed(self, name: str, measurement: Measurement) -> Energyscape:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Literal, Self
 
 from ertis_numba.frames import Energyscape
@@ -11,7 +11,7 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.viewer._moments import usual_s
-from ertis_numba.viewer._shapes import Pose, Taken
+from ertis_numba.viewer._shapes import Mounting, Pose, Taken
 
 if TYPE_CHECKING:
     from ertis_numba.network.messages import Product
@@ -35,6 +35,8 @@ class Live:
     sensors : str or sequence of str, optional
         All by default.
     keys : ClientKeys, optional
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Poses of sensors on their platform, in place of those that the central node sends.
 
     Attributes
     ----------
@@ -49,7 +51,15 @@ class Live:
 
     is_film: Literal[False] = False
 
-    def __init__(self, address: str, *, sensors: Sequence[str] | None = None, keys: ClientKeys | None = None) -> None:
+    def __init__(
+        self,
+        address: str,
+        *,
+        sensors: Sequence[str] | None = None,
+        keys: ClientKeys | None = None,
+        mounting: Mapping[str, Mounting] | None = None,
+    ) -> None:
+        self._given = {sensor: Pose.of(*place) for sensor, place in (mounting or {}).items()}
         self.title = address
         self.received = 0
         self._notes: deque[str] = deque(maxlen=16)
@@ -136,7 +146,7 @@ class Live:
         return [
             Taken(
                 arrival.item,
-                Pose.of(arrival.translation_m, arrival.rotation_xyzw),
+                self._given.get(arrival.item.stamp.sensor) or Pose.of(arrival.translation_m, arrival.rotation_xyzw),
                 arrival.arrived_ns / 1e9,
                 between_s[arrival.item.stamp.sensor],
             )

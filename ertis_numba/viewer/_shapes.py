@@ -1,6 +1,7 @@
 """What is taken from a source, and what is drawn of it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -10,11 +11,16 @@ from numpy.typing import NDArray
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
-__all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Pose", "Sector", "Taken"]
+__all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Mounting", "Pose", "Sector", "Taken"]
 
 _OVERDUE_S: Final = 1.0  # at least, as images come in bursts where a network or a computer is busy
 _UNKNOWN_S: Final = 10.0  # without an image, where a single one has come and nobody knows when the next is due
 _OVERDUE: Final = 3.0  # intervals without an image, after which a sensor is overdue
+
+
+_Numbers = Sequence[float] | NDArray[np.float64]
+Mounting = tuple[_Numbers, _Numbers]
+"""Translation in metres, and rotation as a unit quaternion (x, y, z, w), of a sensor on its platform."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +38,13 @@ class Pose:
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
     @classmethod
-    def of(
-        cls,
-        translation_m: tuple[float, float, float] | None,
-        rotation_xyzw: tuple[float, float, float, float] | None,
-    ) -> Self | None:
+    def of(cls, translation_m: _Numbers | None, rotation_xyzw: _Numbers | None) -> Self | None:
         """Return a pose, or None if the mounting is unknown."""
-        return None if translation_m is None or rotation_xyzw is None else cls(translation_m, rotation_xyzw)
+        if translation_m is None or rotation_xyzw is None:
+            return None
+        x, y, z = map(float, translation_m)
+        i, j, k, w = map(float, rotation_xyzw)
+        return cls((x, y, z), (i, j, k, w))
 
     def placed(self, position_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return places of the sensor's frame in that of the platform: (point, axis) float32."""
