@@ -9,6 +9,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.stages.detect import find_peaks
+from ertis_numba.stages.side_lobes import without_side_lobes
 from ertis_numba.waveform import matched_filter
 
 
@@ -81,6 +82,17 @@ def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
     assert len(find_peaks(image, min_level_db=-20)) == 1
     both = image_of([strong, other], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4, errors_m=errors_m)
     assert [peak.azimuth_deg for peak in find_peaks(both, min_level_db=-20)] == pytest.approx([12.0, -35.0], abs=1.5)
+
+
+def test_an_image_without_side_lobes_is_dark_but_for_main_lobes():
+    image = image_of([(12.0, 20.0, 1.2, 1.0)], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4)
+    dark = without_side_lobes(image)
+    bright = dark.energy.max(axis=1) > 0.02
+    source = unit_vectors(np.radians([12.0]), np.radians([20.0]))
+    apart_deg = np.degrees(np.arccos(unit_vectors(image.azimuth_rad, image.elevation_rad) @ source[0]))
+    assert apart_deg[bright].max() < 20
+    assert apart_deg[image.energy.max(axis=1) > 0.02].max() > 60
+    assert dark.energy.max() == image.energy.max()
 
 
 @pytest.mark.parametrize(("directions", "azimuth_deg"), [("2d:91", 97.0), ("1850", 50.0)])

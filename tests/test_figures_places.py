@@ -1,5 +1,7 @@
 """What pictures show is where it is: reflectors, echoes, sweeps, microphones and beams."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from ertis_numba.figures._signals import spectrogram
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Array, Call, Settings
+from ertis_numba.storage import open_recording
 from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image
@@ -135,6 +138,18 @@ def test_signals_and_their_picture():
     across_ms, _ = brightest(spectra)
     assert 9.0 <= across_ms <= 11.6
     assert len(figures.signals(measurement, microphone=5).axes[0].collections[0].get_segments()) == 1
+
+
+def test_signals_show_echoes_beside_a_louder_direct_sound():
+    with open_recording(Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5") as recording:
+        measurement = recording[0]
+    traces, spectra = figures.signals(measurement).axes[:2]
+    for row, segment in enumerate(traces.collections[0].get_segments()):
+        time_ms, height = segment[:, 0], np.abs(segment[:, 1] - row)
+        direct, echo, noise = ((time_ms > low) & (time_ms < high) for low, high in ((0.5, 2), (7.5, 8.5), (31, 36)))
+        assert height[echo].mean() > 0.3 * height[direct].mean()
+        assert height[noise].mean() < 0.4 * height[echo].mean()
+    assert spectra.get_ylim()[1] == pytest.approx(measurement.settings.signal_rate_hz / 2e3, rel=0.01)
 
 
 def test_matched_filter_puts_the_echo_at_its_range():

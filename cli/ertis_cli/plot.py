@@ -9,6 +9,8 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from matplotlib.figure import Figure
 
     from ertis_numba.frames import Energyscape, Measurement, Peak
@@ -32,6 +34,7 @@ _ONLY = {
     "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, "array"),
     "measurement": (*_OF_IMAGES, *_OF_RECORDINGS),
     "peaks": _OF_IMAGES,
+    "side-lobes": ("image", "polar", "projection"),
     "height": ("slices",),
     "left": ("slices",),
     "microphone": _OF_RECORDINGS,
@@ -66,6 +69,12 @@ _ONLY = {
 @click.option("--columns", type=click.IntRange(1, 2), help="Width of paper: 85 mm for 1, 170 mm for 2, the default.")
 @click.option("--font", type=click.Choice(["sans", "serif"]), default="sans", show_default=True, help="Letters.")
 @click.option("--peaks", "top", type=click.IntRange(min=0), metavar="N", help="Reflectors to mark; 5 by default.")
+@click.option(
+    "--side-lobes",
+    is_flag=True,
+    default=None,
+    help="Show the side lobes of images with elevations: levels 10 dB and more below the strongest of their range.",
+)
 @click.option("--height", type=float, metavar="M", help="Of the level plane of slices; 0 by default.")
 @click.option("--left", type=float, metavar="M", help="Where the upright plane of slices is; 0 by default.")
 @click.option("--microphone", type=int, metavar="BIT", help="One only, of signals and of the matched filter's output.")
@@ -88,6 +97,7 @@ def plot(
     columns: Literal[1, 2] | None,
     font: Literal["sans", "serif"],
     top: int | None,
+    side_lobes: bool | None,
     height: float | None,
     left: float | None,
     microphone: int | None,
@@ -109,6 +119,7 @@ def plot(
         "sensor": sensor,
         "measurement": measurement,
         "peaks": top,
+        "side-lobes": side_lobes,
         "height": height,
         "left": left,
     }
@@ -151,7 +162,7 @@ def plot(
             figure, name = draw(heard, microphone=microphone, **look), heard.stamp.sensor
         else:
             image = _image(path, sensor, index, quiet=quiet)
-            places = {"height_m": height, "left_m": left}
+            places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
             look |= {name: value for name, value in places.items() if value is not None}
             figure, name = _drawn(kind, image, _reflectors(image, 5 if top is None else top), look), image.stamp.sensor
         report |= {"sensor": name, "measurement": index}
@@ -166,6 +177,7 @@ def plot(
 def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak]", look: dict[str, Any]) -> "Figure":
     from ertis_numba import figures
 
+    draw: dict[str, Callable[..., Figure]]
     draw = {"image": figures.plot, "polar": figures.polar, "projection": figures.projection, "slices": figures.slices}
     return draw[kind](image, peaks=peaks, **look)
 

@@ -44,6 +44,7 @@ def plot(
     *,
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
     **look: Unpack[Look],
 ) -> Figure:
     """Draw an energyscape.
@@ -59,6 +60,10 @@ def plot(
         What lies further below the strongest has the colour of silence.
     peaks : sequence of Peak, optional
         Reflectors to mark and list, as `find_peaks` returns them.
+    side_lobes : bool
+        Show the side lobes of an image with elevations, too. By default, what lies
+        `ertis_numba.stages.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a maximum
+        over directions would otherwise show an arc at the range of each echo.
     **look
         ``theme``, ``columns`` and ``font``: see `Look`.
 
@@ -76,8 +81,8 @@ def plot(
     if len(image.azimuth_rad) == 1:
         return _curve.draw(canvas, image)
     if image.is_planar:
-        return _sector.draw(canvas, image)
-    return _sphere.draw(canvas, image)
+        return _sector.draw(canvas, image, side_lobes=side_lobes)
+    return _sphere.draw(canvas, image, side_lobes=side_lobes)
 
 
 def polar(
@@ -85,10 +90,11 @@ def polar(
     *,
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
     **look: Unpack[Look],
 ) -> Figure:
     """Draw an energyscape as a sector in metres, of several elevations the strongest; arguments are those of `plot`."""
-    return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image)
+    return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
 
 
 def projection(
@@ -96,10 +102,11 @@ def projection(
     *,
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
     **look: Unpack[Look],
 ) -> Figure:
     """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
-    return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image)
+    return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
 
 
 def slices(

@@ -18,6 +18,7 @@ from ertis_numba.figures._sampling import PIXELS, centres, flattened, join_range
 from ertis_numba.figures._style import text_width_pt
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import ALONE_RAD
+from ertis_numba.stages.side_lobes import without_side_lobes
 
 __all__ = ["draw", "draw_into", "height_of"]
 
@@ -25,13 +26,15 @@ _SIDE_EMS, _ROOF_EMS, _FLOOR_EMS = 3.6, 3.0, 2.0  # what names take around the s
 _LEAST_RATIO, _MOST_RATIO = 0.3, 0.95  # of height to width
 
 
-def draw(canvas: Canvas, image: Energyscape) -> Figure:
+def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw an image; of several elevations the strongest."""
+    hidden = not (image.is_planar or side_lobes)
+    image = without_side_lobes(image) if hidden else image
     azimuth_rad, level_db = flattened(image, canvas.level_db(image.energy))
     page, (box,), side = canvas.lay_out(
         _words.of_image(image), [height_of(canvas, azimuth_rad, image.range_m)], width_pt=720.0
     )
-    title = "" if image.is_planar else "strongest over elevation"
+    title = "" if image.is_planar else _words.highest_over("elevation", hidden=hidden)
     shown = draw_into(canvas, page, box, azimuth_rad, image.range_m, level_db, title=title)
     return canvas.side(page, side, shown)
 

@@ -26,6 +26,7 @@ _MOST_TRACES = 64
 _COLUMNS = 1200  # of a trace: the least and the greatest of each are drawn
 _MOST_SPECTRA = 600  # columns of a spectrogram: of the spectra in each the greatest is drawn
 _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
+_COMPRESSED = 10 ** (-40 / 20)  # of the loudest; below that, amplitudes are linear
 _LOUDEST = 0.999  # share of the samples that stay within their row
 
 
@@ -62,7 +63,8 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         for box in boxes
     ]
     loudest = float(np.quantile(np.abs(heard.values), _LOUDEST)) or 1.0
-    page.caption(inner[0], f"a row is ±{_words.number(loudest, 2)} of full scale", above_pt=_ROOF_EMS * em_pt)
+    row = f"a row is ±{_words.number(loudest, 2)} of full scale, compressed"
+    page.caption(inner[0], row, above_pt=_ROOF_EMS * em_pt)
     axes = page.axes(inner[0], x="time (ms)", y="microphone (channel)")
     _traces(canvas, axes, heard, loudest)
     whose = f"mean of {rows} microphones" if rows > 1 else f"microphone {heard.channels[0]}"
@@ -119,24 +121,27 @@ def spectrogram(
     columns = starts.reshape(-1, joined)
     window = np.hanning(size + 2)[1:-1].astype(np.float32)
     frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
-    inside = frequency_hz <= min(rate_hz / 2, 1.3 * call.high_frequency_hz)
-    power = np.empty((len(columns), int(inside.sum())), dtype=np.float32)
+    power = np.empty((len(columns), len(frequency_hz)), dtype=np.float32)
     step = max(1, _CHUNK // (joined * n_fft))
     for first in range(0, len(columns), step):
         some = columns[first : first + step]
         summed = np.zeros((some.size, power.shape[1]), dtype=np.float32)
         for values in heard.values:
             pieces = np.lib.stride_tricks.sliding_window_view(values, size)[some.ravel()] * window
-            summed += np.abs(scipy.fft.rfft(pieces, n_fft)[:, inside]) ** 2
+            summed += np.abs(scipy.fft.rfft(pieces, n_fft)) ** 2
         power[first : first + step] = summed.reshape(*some.shape, -1).max(axis=1)
     times_s = heard.axis[columns].mean(axis=1) + (size - 1) / 2 / rate_hz
-    return power.T / np.float32(len(heard.values)), frequency_hz[inside], times_s
+    return power.T / np.float32(len(heard.values)), frequency_hz, times_s
 
 
 def _traces(canvas: Canvas, axes: Axes, heard: Heard, loudest: float) -> None:
-    """Draw a row for each trace, the first on top; what is louder than its row is cut off."""
-    values = heard.values
-    time_ms, low, high = _ends(heard.axis * 1e3, np.clip(values / (2 * loudest), -0.5, 0.5))
+    """Draw a row for each trace, the first on top; what is louder than its row is cut off.
+
+    Amplitudes are compressed, so that echoes are seen beside the direct sound, which is 20 to 40 dB louder.
+    """
+    linear = max(_COMPRESSED * loudest, 2 * float(np.median(np.abs(heard.values))))  # noise is not enlarged
+    values = np.arcsinh(heard.values / linear) / math.asinh(loudest / linear)
+    time_ms, low, high = _ends(heard.axis * 1e3, np.clip(values / 2, -0.5, 0.5))
     rows = np.arange(len(values))[:, None]
     xs = np.broadcast_to(np.repeat(time_ms, 2), (len(values), 2 * len(time_ms)))
     # Least and greatest in turn are a line that covers all between them.

@@ -15,6 +15,7 @@ from ertis_numba.figures._page import Box, Page
 from ertis_numba.figures._sampling import PIXELS, flattened, sphere_raster
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import spacing_rad, unit_vectors, unrolled_rad
+from ertis_numba.stages.side_lobes import without_side_lobes
 
 __all__ = ["draw", "draw_map"]
 
@@ -22,24 +23,29 @@ _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8  # what ticks 
 _LEAST_RATIO, _MOST_RATIO = 0.1, 1.05
 
 
-def draw(canvas: Canvas, image: Energyscape) -> Figure:
+def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw the maximum over range as a map, and the maximum over elevation as a sector."""
+    image = image if side_lobes else without_side_lobes(image)
     level_db = canvas.level_db(image.energy)
     azimuth_rad, highest_db = flattened(image, level_db)
     panels = [_Map(canvas, image).height, _sector.height_of(canvas, azimuth_rad, image.range_m)]
     page, boxes, side = canvas.lay_out(_words.of_image(image), panels, width_pt=1008.0)
-    _Map(canvas, image).draw_into(page, boxes[0], level_db.max(axis=1))
-    shown = _sector.draw_into(
-        canvas, page, boxes[1], azimuth_rad, image.range_m, highest_db, title="strongest over elevation"
+    _Map(canvas, image).draw_into(
+        page, boxes[0], level_db.max(axis=1), _words.highest_over("range", hidden=not side_lobes)
     )
+    title = _words.highest_over("elevation", hidden=not side_lobes)
+    shown = _sector.draw_into(canvas, page, boxes[1], azimuth_rad, image.range_m, highest_db, title=title)
     return canvas.side(page, side, shown)
 
 
-def draw_map(canvas: Canvas, image: Energyscape) -> Figure:
+def draw_map(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw the maximum over range as a map."""
+    hidden = not (image.is_planar or side_lobes)
+    image = without_side_lobes(image) if hidden else image
     projection = _Map(canvas, image)
     page, (box,), side = canvas.lay_out(_words.of_image(image), [projection.height], width_pt=720.0)
-    shown = projection.draw_into(page, box, canvas.level_db(image.energy).max(axis=1))
+    title = _words.highest_over("range", hidden=hidden)
+    shown = projection.draw_into(page, box, canvas.level_db(image.energy).max(axis=1), title)
     return canvas.side(page, side, shown)
 
 
@@ -65,13 +71,13 @@ class _Map:
         across_pt = width_pt - (_LEFT_EMS + _RIGHT_EMS) * self._em_pt
         return across_pt * self._ratio + (_FLOOR_EMS + _ROOF_EMS) * self._em_pt
 
-    def draw_into(self, page: Page, box: Box, level_db: NDArray[np.float32]) -> AxesImage:
+    def draw_into(self, page: Page, box: Box, level_db: NDArray[np.float32], title: str) -> AxesImage:
         """Draw the level of each direction."""
         em_pt, canvas = self._em_pt, self._canvas
         inner = box.inset(
             left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
         )
-        page.caption(Box(inner.left, box.bottom, inner.width, box.height), "strongest over range")
+        page.caption(Box(inner.left, box.bottom, inner.width, box.height), title)
         axes = page.axes(inner.fitted(self._ratio), x="azimuth (°)", y="elevation (°)")
         west, east, low, high = self._west, self._east, self._low, self._high
         step_deg = max(west - east, high - low) / (PIXELS / 2)

@@ -10,7 +10,18 @@ from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["Heading", "angle", "khz", "minus", "number", "of_array", "of_image", "of_measurement", "span"]
+__all__ = [
+    "Heading",
+    "angle",
+    "highest_over",
+    "khz",
+    "minus",
+    "number",
+    "of_array",
+    "of_image",
+    "of_measurement",
+    "span",
+]
 
 
 _FAINT_DB = -100.0
@@ -94,6 +105,11 @@ def _of_sensor(settings: Settings) -> tuple[str, str]:
         settings.array.layout,
         f"call {khz(call.low_frequency_hz)}–{khz(call.high_frequency_hz)} kHz, {number(1e3 * call.duration_s, 6)} ms",
     )
+
+
+def highest_over(what: str, *, hidden: bool) -> str:
+    """Return the caption of a panel that shows maxima, and whether side lobes are ``hidden``."""
+    return f"strongest over {what}" + (", side lobes hidden" if hidden else "")
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -12,7 +12,8 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.settings import Settings
-from ertis_numba.stages.detect import SIDE_LOBE_DB, find_peaks
+from ertis_numba.stages.detect import find_peaks
+from ertis_numba.stages.side_lobes import SIDE_LOBE_DB
 
 __all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "clean", "threshold_factor"]
 

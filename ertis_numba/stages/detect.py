@@ -14,14 +14,9 @@ from ertis_numba.stages.noise import threshold_of
 from ertis_numba.stages.peak_interpolation import PeakInterpolator
 from ertis_numba.stages.side_lobes import SideLobes
 
-__all__ = ["SIDE_LOBE_DB", "find_peaks", "neighbours_of", "spacing_of"]
+__all__ = ["find_peaks", "neighbours_of", "spacing_of"]
 
 _NEIGHBOURS = 8  # directions around one in the plane of a dense grid
-SIDE_LOBE_DB = 10.0
-"""Below the strongest of the same range, from which on side lobes are expected.
-
-Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `point_spread.PULSE_M`.
-"""
 
 
 def find_peaks(

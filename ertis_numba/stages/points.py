@@ -1,16 +1,15 @@
 """From energyscapes to point clouds, fast enough to do so with every image."""
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.settings import Settings
-from ertis_numba.stages.detect import SIDE_LOBE_DB, neighbours_of, spacing_of
+from ertis_numba.stages.detect import neighbours_of, spacing_of
 from ertis_numba.stages.peak_interpolation import PeakInterpolator
-from ertis_numba.stages.point_spread import PULSE_M
+from ertis_numba.stages.side_lobes import side_lobe_floor
 from ertis_numba.stages.uncertainty import PositionUncertainty
 
 __all__ = ["PointExtractor"]
@@ -95,9 +94,7 @@ class PointExtractor:
         profile = energy.max(axis=0)
         if n_ranges < 3 or not profile.max() > 0:
             return none, none
-        reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
-        highest = scipy.ndimage.maximum_filter1d(profile, 2 * reach + 1, mode="nearest")
-        floor = np.maximum(highest * np.float32(10 ** (-SIDE_LOBE_DB / 20)), profile.max() * np.float32(self._least))
+        floor = np.maximum(side_lobe_floor(profile, range_m), profile.max() * np.float32(self._least))
         floor[[0, -1]] = np.inf
         # Two passes over all of the image, this and the profile, are what takes the time; few bins are left.
         above = energy >= floor

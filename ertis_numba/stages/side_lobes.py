@@ -4,12 +4,19 @@ import math
 from typing import Final
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Energyscape
 from ertis_numba.stages.point_spread import PULSE_M, PointSpread
 
-__all__ = ["SideLobes"]
+__all__ = ["SIDE_LOBE_DB", "SideLobes", "side_lobe_floor", "without_side_lobes"]
+
+SIDE_LOBE_DB = 10.0
+"""Below the strongest of the same range, from which on side lobes are expected.
+
+Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `point_spread.PULSE_M`.
+"""
 
 _MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predicted side lobes of stronger ones
 _FALSE_ALARM: Final = 0.01
@@ -112,3 +119,28 @@ class SideLobes:
         offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
         levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
         return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
+
+
+def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the amplitude below which side lobes are expected, for each range: (range,) float32.
+
+    It is `SIDE_LOBE_DB` below the strongest of all ranges within a pulse. This is coarser than `SideLobes`, and quick.
+
+    Parameters
+    ----------
+    highest : (range,) float32
+        Maximum of the image over all directions.
+    range_m : (range,) float64
+        At least two, evenly spaced.
+    """
+    reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
+    around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")
+    return np.asarray(around * np.float32(10 ** (-SIDE_LOBE_DB / 20)))
+
+
+def without_side_lobes(image: Energyscape) -> Energyscape:
+    """Return an image whose values below `side_lobe_floor` are 0."""
+    if len(image.range_m) < 2:
+        return image
+    floor = side_lobe_floor(image.energy.max(axis=0, initial=0.0), image.range_m)
+    return image.replace(energy=np.where(image.energy >= floor, image.energy, np.float32(0)))

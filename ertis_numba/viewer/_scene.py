@@ -12,6 +12,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.stages.finder import PointFinder, same_directions
 from ertis_numba.stages.levels import below_strongest_db
+from ertis_numba.stages.side_lobes import without_side_lobes
 from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, Choices, colour_table
 from ertis_numba.viewer._fusion import Fusion, is_level
 from ertis_numba.viewer._polar import Polar, cropped, is_within
@@ -152,7 +153,7 @@ class Scene:
             kept.polar = Polar(image, dynamic_range_db=choices.dynamic_range_db, width_px=self._width_px)
             kept.polar_for = polar_for
         if kept.levels_for != (kept.latest, kept.polar):
-            kept.levels, kept.levels_for = kept.polar.levels(image.energy), (kept.latest, kept.polar)
+            kept.levels, kept.levels_for = kept.polar.levels(_echoes(image).energy), (kept.latest, kept.polar)
 
     def _fusion_of(self, several: list[_Sensor]) -> Fusion:
         """Return what joins the images of several sensors, made anew where one has moved or has other axes."""
@@ -218,7 +219,7 @@ def _drawn(kept: _Sensor, choices: Choices, now_s: float, pose: Pose | None, *, 
         if alone and not kept.outside and taken.image.is_planar:
             kept.shape = Sector(polar.sector(kept.levels, table), polar.extent_m)
         elif alone and not kept.outside:
-            kept.shape = _dome(cropped(taken.image, choices.range_m), choices, table)
+            kept.shape = _dome(cropped(_echoes(taken.image), choices.range_m), choices, table)
     position_m, colours, share_left, n_points = _points(kept.clouds, choices, now_s, table)
     if pose is None:  # points of sensors that have no frame in common have no place beside each other
         position_m, colours, share_left = position_m[:0], colours[:0], share_left[:0]
@@ -255,13 +256,20 @@ def _points(
     return np.concatenate(places), np.concatenate(colours), np.concatenate(left).astype(np.float32), n_points
 
 
+def _echoes(image: Energyscape) -> Energyscape:
+    """Return an image without side lobes if it has elevations: their maximum would show an arc at each range."""
+    return image if image.is_planar else without_side_lobes(image)
+
+
 def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
+    """Return the directions with echoes, without side lobes."""
     shade = 1 + below_strongest_db(image.energy.max(axis=1), choices.dynamic_range_db) / choices.dynamic_range_db
     radius_m = _FARTHEST_DOME * float(image.range_m[-1])
     # Directions that are spread evenly over half a sphere have a square of this side each.
     size_m = radius_m * math.sqrt(2 * math.pi / len(shade))
+    seen = shade > 0
     return Dome(
-        np.asarray(radius_m * unit_vectors(image.azimuth_rad, image.elevation_rad), dtype=np.float32),
-        table[np.rint(255 * shade).astype(np.uint8)],
+        np.asarray(radius_m * unit_vectors(image.azimuth_rad[seen], image.elevation_rad[seen]), dtype=np.float32),
+        table[np.rint(255 * shade[seen]).astype(np.uint8)],
         size_m,
     )

@@ -102,7 +102,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dome:
-    """The strongest over range of each direction, on a sphere around the sensor.
+    """The strongest over range of each direction with an echo, on a sphere around the sensor.
 
     Attributes
     ----------

@@ -197,9 +197,9 @@ class _Nodes:
         self._shape = _plan(self._scene, f"/sensors/{self._name}/image", sector, under_m)
 
     def _show_dome(self, dome: Dome) -> None:
-        made_for = (Dome, len(dome.position_m), dome.size_m)
+        made_for = (Dome, dome.size_m)
         if self._made_for == made_for:
-            self._shape.colors = dome.colours
+            self._shape.points, self._shape.colors = dome.position_m, dome.colours
             return
         self._made_for = made_for
         self._shape = self._scene.add_point_cloud(
