@@ -1,6 +1,7 @@
 """Files along their time: what is shown at once, what is played, sought and skipped."""
 
 import atexit
+import re
 import threading
 import time
 from dataclasses import replace
@@ -237,6 +238,18 @@ def test_files_know_where_their_sensors_are(tmp_path, kind):
             assert each.pose == places[each.image.stamp.sensor]
             scene.take(each)
         assert scene.draw(Choices()).fused is not None
+
+
+def test_a_saved_page_has_a_title_and_the_picture_of_each_sensor(tmp_path):
+    path = write_energyscapes(tmp_path / "a <b>.h5", stamped(1, sensors=("front", "left")))
+    with Film(path) as film, View(film, port=0) as view:
+        view.record(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert page.count("<title>a &lt;b&gt;.h5</title>") == 1
+    assert re.findall(r"<div>(\w+), latest image: dB re strongest</div><img[^>]*data:image/png;base64,", page) == [
+        "front",
+        "left",
+    ]
 
 
 def test_a_given_mounting_places_sensors_whose_own_is_unknown(tmp_path):

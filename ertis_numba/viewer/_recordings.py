@@ -122,6 +122,7 @@ class _Recording:
     n_bytes: int = 0
     n_messages: int = 0
     n_buffers: int = 0
+    finished: Callable[[str], str] = str
 
     def pass_to(self, now_s: float) -> None:
         """Note how long what was drawn last has been shown."""
@@ -139,7 +140,7 @@ class _Recording:
     def finish(self) -> None:
         """Make the page and deliver it."""
         try:
-            self.receiver.deliver(str(self.serializer.as_html(dark_mode=True)), self.n_frames)
+            self.receiver.deliver(self.finished(str(self.serializer.as_html(dark_mode=True))), self.n_frames)
         except Exception as error:  # noqa: BLE001  the receiver is to know
             self.receiver.failed(error)
 
@@ -156,10 +157,14 @@ class Recordings:
     ----------
     serializer : callable
         Returns what viser keeps from now on.
+    finished : callable
+        Returns the function that completes a page whose recording ends now.
     """
 
-    def __init__(self, serializer: Callable[[], Any]) -> None:
-        self._serializer = serializer
+    def __init__(
+        self, serializer: Callable[[], Any], finished: Callable[[], Callable[[str], str]] = lambda: str
+    ) -> None:
+        self._serializer, self._finished = serializer, finished
         self._made: dict[Hashable, _Recording] = {}
         self._threads: list[threading.Thread] = []
 
@@ -179,6 +184,7 @@ class Recordings:
         recording = self._made.pop(key, None)
         if recording is not None:
             recording.pass_to(now_s)
+            recording.finished = self._finished()
             thread = threading.Thread(target=recording.finish, name="ertis-html", daemon=True)
             thread.start()
             self._threads.append(thread)

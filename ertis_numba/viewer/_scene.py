@@ -211,7 +211,8 @@ def _drawn(kept: _Sensor, choices: Choices, now_s: float, pose: Pose | None, *, 
     taken, polar = kept.latest, kept.polar
     assert polar is not None  # noqa: S101  it was prepared
     table = _table(choices, dim=overdue)
-    drawn_for = (*kept.levels_for, choices.colours, overdue, alone, kept.outside and choices.range_m)
+    shape = choices.threshold_db, kept.outside and choices.range_m
+    drawn_for = (*kept.levels_for, choices.colours, overdue, alone, *shape)
     if kept.drawn_for != drawn_for:
         kept.drawn_for = drawn_for
         kept.shape = None
@@ -262,12 +263,13 @@ def _echoes(image: Energyscape) -> Energyscape:
 
 
 def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
-    """Return the directions with echoes, without side lobes."""
-    shade = 1 + below_strongest_db(image.energy.max(axis=1), choices.dynamic_range_db) / choices.dynamic_range_db
+    """Return the directions with echoes as loud as the points that are shown."""
+    level_db = below_strongest_db(image.energy.max(axis=1), choices.dynamic_range_db)
+    shade = 1 + level_db / choices.dynamic_range_db
     radius_m = _FARTHEST_DOME * float(image.range_m[-1])
     # Directions that are spread evenly over half a sphere have a square of this side each.
     size_m = radius_m * math.sqrt(2 * math.pi / len(shade))
-    seen = shade > 0
+    seen = (shade > 0) & (level_db >= choices.threshold_db)
     return Dome(
         np.asarray(radius_m * unit_vectors(image.azimuth_rad[seen], image.elevation_rad[seen]), dtype=np.float32),
         table[np.rint(255 * shade[seen]).astype(np.uint8)],

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.viewer._choices import Choices
+from ertis_numba.viewer._legend import with_legend
 from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import Order, Page
 from ertis_numba.viewer._pause import Pause
@@ -87,7 +88,7 @@ class View:
             choices=self.choices,
             n_moments=None if self._film is None else len(self._film.moments),
         )
-        self._recordings = Recordings(self._page.serializer)
+        self._recordings = Recordings(self._page.serializer, self._completion)
         self._file: ToFile | None = None
         self._pause = Pause()  # of a live view
         self._changed, self._ended = False, False
@@ -215,6 +216,11 @@ class View:
     def _note_all(self) -> None:
         for note in self._source.notes():
             self._note(note)
+
+    def _completion(self) -> Callable[[str], str]:
+        """Return the function that adds the legend of what is shown now to a saved page."""
+        title, frame = self._source.title, self._frame
+        return lambda page: with_legend(page, title, frame)
 
     def _begin(self, html: Path, *, overwrite: bool) -> None:
         sources = () if self._film is None else (self._film.path,)
