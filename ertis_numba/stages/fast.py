@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
@@ -120,7 +120,7 @@ class FastChain:
                 * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
             ),
         )
-        amplitudes = 1 / (layout.gain[layout.enabled] * len(own_s))
+        amplitudes = array_weights(settings) / (layout.gain[layout.enabled] * len(own_s))
         zones = [
             Zone(
                 first,
