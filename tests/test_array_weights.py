@@ -154,8 +154,7 @@ def test_weight_of_zero_is_a_disabled_microphone(method):
     found, expected = (
         Pipeline(each, predict=False).process(noise(each)).energy for each in (weighted(settings, weights), disabled)
     )
-    # The fast method spreads its errors of delays over microphones in another way if there are fewer.
-    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
+    assert np.linalg.norm(found - expected) < 1e-6 * np.linalg.norm(expected)
 
 
 def test_weights_keep_the_level_of_an_echo_and_lower_its_side_lobes():

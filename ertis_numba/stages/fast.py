@@ -82,7 +82,8 @@ class FastChain:
         nodes = nodes_of(settings, aperture, spectrum)
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
-        ahead_s = ahead_of(fit, len(own_s), step_s)
+        array_weight = array_weights(settings)
+        ahead_s = ahead_of(fit, array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
@@ -120,7 +121,7 @@ class FastChain:
                 * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
             ),
         )
-        amplitudes = array_weights(settings) / (layout.gain[layout.enabled] * len(own_s))
+        amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
         zones = [
             Zone(
                 first,

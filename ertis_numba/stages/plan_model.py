@@ -96,10 +96,10 @@ class PlanModel:
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._own_s = layout.delay_s[layout.enabled]
         self.aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
-        weights = array_weights(settings)
-        amplitudes = weights / layout.gain[layout.enabled]
+        self._weights = array_weights(settings)
+        amplitudes = self._weights / layout.gain[layout.enabled]
         self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
-        self._n_effective = effective_count(weights)
+        self._n_effective = effective_count(self._weights)
         self.n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
@@ -186,7 +186,7 @@ class PlanModel:
             return None
         delays_s = (
             self._own_s
-            - ahead_of(fit, self.n_mics, step_s)
+            - ahead_of(fit, self._weights, step_s)
             + self.aperture.delays_s(self.aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
         )
         return fit.split(delays_s)[1].ravel()
