@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import direction_grid, received_settings
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.settings import Array, Processing, Settings
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from tests.cases import SHORT, noise
 
@@ -66,6 +66,20 @@ def test_longest_list_of_directions_fits_into_a_recording_and_a_message(tmp_path
     write_recording(tmp_path / "rec.h5", [noise(settings)])
     with open_recording(tmp_path / "rec.h5") as recording:
         assert recording.settings.processing == settings.processing
+
+
+def test_longest_lists_of_the_largest_array_fit_into_settings():
+    rng = np.random.default_rng(1)
+    array = Array(
+        layout="large",
+        positions_m=rng.uniform(-1, 1, (1024, 3)),
+        enabled=(True,) * 1024,
+        gain=rng.uniform(0.5, 2, 1024),
+        delay_s=rng.uniform(-1e-6, 1e-6, 1024),
+    )
+    settings = listed(rng.uniform(-90, 90, (1000, 2))).replace(array=array)
+    settings = settings.replace(processing=settings.processing.replace(array_weights=rng.uniform(0, 1, 1024)))
+    assert Settings.from_toml(settings.to_toml()) == settings
 
 
 def test_settings_file_may_list_directions(tmp_path):
