@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ertis_numba import kernels, verification
 from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _words
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
@@ -262,3 +263,8 @@ def test_adaptive_beamformers_support_uniform_weights_only(beamformer, weights):
 def test_every_window_has_an_error_free_name():
     for name in WINDOWS:
         assert taper_of(name).window == name.partition(":")[0]
+
+
+@pytest.mark.parametrize(("weights", "name"), [("uniform", "uniform"), ("hann", "hann"), ((1.0,) * 32, "listed")])
+def test_picture_of_an_array_names_its_weights(weights, name):
+    assert f"{name} weights, plane waves" in _words.of_array(weighted(SHORT, weights)).settings
