@@ -36,6 +36,12 @@ CASES = {
             layout="line", positions_m=LINE_8, gain=(2.0, 1.0) * 4, delay_s=(0.0, 1e-6, -2e-6, 3e-6) * 2, word_bits=8
         )
     ),
+    "array weights": SHORT.replace(
+        array=Array(
+            layout="line", positions_m=LINE_8, enabled=(True, True, False, True) * 2, gain=(2.0, 1.0) * 4, word_bits=8
+        ),
+        processing=SHORT.processing.replace(array_weights=(0.0, 1.0, 9.0, 2.0, 3.0, 0.5, 9.0, 1.0)),
+    ),
     "PCM of 16 bits": SHORT.replace(
         recording=Recording(sample_rate_hz=192_000.0, n_samples=1_748, encoding="int16"),
         processing=SHORT.processing.replace(range_decimation=4),

@@ -15,7 +15,7 @@ from ertis_bench import referee
 from ertis_bench.referee import signals_of
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import call_at
 
@@ -41,6 +41,7 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
     given = [np.ascontiguousarray(values) for values in (words, directions, range_m)]
     # Devices and plans share the exact image of their words: plans are about how it is approximated.
     sensor = settings.array, settings.call, settings.recording, settings.air
+    given.append(array_weights(settings))
     return _exact(*map(_Same, given), *sensor, spherical, delay_rate_hz)
 
 
@@ -59,9 +60,10 @@ class _Same:
 
 
 @functools.lru_cache(maxsize=32)
-def _exact(words, directions, range_m, array, call, recording, air, spherical, delay_rate_hz):
+def _exact(words, directions, range_m, weights, array, call, recording, air, spherical, delay_rate_hz):
     words, directions, range_m = words.values, directions.values, range_m.values
     spectra, frequency_hz = referee.calibrated_spectra(words, array, call, recording, None)
+    spectra = spectra * weights.values[:, None]
     positions_m, speed_m_s = microphones(array).enabled_positions_m, sound_speed_m_s(air)
     at_range = np.exp(2j * np.pi * frequency_hz * (2 * range_m / speed_m_s)[:, None])  # (range, bin)
     image = np.empty((len(directions), len(range_m)))
@@ -88,6 +90,7 @@ def paper(words, settings: Settings, directions):
     signals = (
         signals_of(words, np.flatnonzero(layout.enabled), settings.recording) / layout.gain[layout.enabled][:, None]
     )
+    signals = signals * array_weights(settings)[:, None]
     padded_s = settings.call.duration_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
     emitted = call_at(
         settings.call, np.arange(int(padded_s * settings.recording.sample_rate_hz)) / settings.recording.sample_rate_hz

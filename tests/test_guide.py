@@ -25,6 +25,7 @@ RUN_BY = {
     ("applications", "python"): ["test_applications_page::test_loop"],
     ("beamformers", "$"): ["test_guide::test_commands_of_a_page"],
     ("command-line", "$"): ["test_config::test_the_page_says_how", "test_config::test_completion_for_each_shell"],
+    ("concepts", "python"): ["test_guide::test_python_on_concepts"],
     ("cuda", "$"): ["test_guide::test_commands_on_cuda"],
     ("cuda", "python"): ["test_guide::test_python_on_cuda"],
     ("devices", "$"): ["test_readme::test_page_on_devices"],
@@ -127,6 +128,13 @@ def test_commands_of_a_page(place, name):
     for command in commands_in(page(name)):
         run_here(place, command)
     assert (place / "REC.energy.h5").exists()
+
+
+def test_python_on_concepts(place):
+    run_here(place, "example reflectors")
+    (code,) = python_in(page("concepts"))
+    told = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.energy.shape[0])")
+    assert told.stdout.strip() == "81"
 
 
 def test_commands_on_cuda():

@@ -12,7 +12,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.waveform import call_at
 
@@ -35,6 +35,7 @@ def exact(words: NDArray[Any], settings: Settings, directions: Floats, range_m: 
     """
     spherical, edges_hz = settings.processing.wavefront == "spherical", settings.processing.band_edges_hz
     spectra, frequency_hz = calibrated_spectra(words, settings.array, settings.call, settings.recording, edges_hz)
+    spectra = spectra * array_weights(settings)[:, None]
     positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
     at_range = np.exp(2j * np.pi * frequency_hz * (2 * range_m / speed_m_s)[:, None])  # (range, bin)
     image = np.empty((len(directions), len(range_m)))

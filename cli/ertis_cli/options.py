@@ -219,8 +219,13 @@ def settings_with(
         settings = settings.replace(array=settings.array.replace(disabled=disabled))
     given = {name: value for name, value in options.items() if value is not None}
     directions = given.get("directions", settings.processing.directions)
-    kind = directions.partition(":")[0]
     limits = {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys()
+    if limits and not isinstance(directions, str):
+        raise click.UsageError(
+            f"directions are a list of {len(directions)}; give --directions 2d:N or 3d:N with limits",
+            ctx=click.get_current_context(),
+        )
+    kind = str(directions).partition(":")[0]
     if kind == "2d" and "elevation_limits_deg" in limits:
         raise click.UsageError(
             f"directions {directions} lie at elevation 0; give 3d:N with --elevation", ctx=click.get_current_context()

@@ -49,6 +49,11 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     help="How microphones are combined; the recording's own choice by default.",
 )
 @click.option(
+    "--array-weights",
+    metavar="WINDOW",
+    help="Window that weights the microphones, such as uniform, hann or taylor:35; the recording's own by default.",
+)
+@click.option(
     "--wavefront",
     type=click.Choice(["plane", "spherical", "auto"]),
     help="What an echo looks like to the array; the recording's own choice by default.",
@@ -118,6 +123,7 @@ def process(
     range_m: tuple[float, float] | None,
     method: str | None,
     beamformer: str | None,
+    array_weights: str | None,
     wavefront: str | None,
     max_error_db: float | None,
     explain: bool,
@@ -159,6 +165,7 @@ def process(
             range_m=range_m,
             method=method,
             beamformer=beamformer,
+            array_weights=array_weights,
             wavefront=wavefront,
             max_error_db=max_error_db,
         )

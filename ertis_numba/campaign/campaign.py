@@ -264,6 +264,6 @@ class Campaign:
 def _absolute(settings: Settings) -> Settings:
     """Return settings whose directions can be found from any folder."""
     directions = settings.processing.directions
-    if not directions.lower().endswith(".csv"):
+    if not isinstance(directions, str) or not directions.lower().endswith(".csv"):
         return settings
     return settings.replace(processing=settings.processing.replace(directions=str(Path(directions).absolute())))

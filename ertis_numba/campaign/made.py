@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ertis_numba.errors import DamagedError, ErtisError
-from ertis_numba.geometry import direction_grid, self_contained
+from ertis_numba.geometry import direction_grid, grid_count, self_contained
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
 from ertis_numba.storage.schema import software_versions
@@ -96,7 +96,7 @@ def difference(made: dict[str, Any], wanted: dict[str, Settings]) -> str:
     for name, settings in wanted.items():
         held = made["sensors"][name]
         found = _changed(Settings.from_toml(held["settings"], "settings"), self_contained(settings))
-        if not found and settings.processing.directions.lower().endswith(".csv"):  # whose content may be another one
+        if not found and grid_count(settings.processing.directions) is None:  # a file, whose content may be another one
             grid = direction_grid(settings.processing)
             found = "" if _digest(grid.azimuth_rad.tobytes(), grid.elevation_rad.tobytes()) == held["axes"] else "grid"
         if found:

@@ -17,7 +17,7 @@ from ertis_numba.figures import _words
 from ertis_numba.figures._marks import name_points
 from ertis_numba.figures._page import lay_out
 from ertis_numba.figures._style import LINES, Style
-from ertis_numba.geometry import Layout, microphones, unit_vectors
+from ertis_numba.geometry import Layout, array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
 
 __all__ = ["Cut", "draw", "pattern_db", "width_deg"]
@@ -113,16 +113,17 @@ def pattern_db(
 ) -> NDArray[np.float64]:
     """Return the level of plane waves from each direction in the beam to one, 0 dB there: (direction,) float64.
 
-    ``mean over f of |Σ_m exp(jk p_m·(u − u₀)) / M|²``, as delay-and-sum has it.
+    ``mean over f of |Σ_m w_m exp(jk p_m·(u − u₀)) / M|²``, as delay-and-sum with the array weights w has it.
     """
     positions_m = microphones(settings.array).enabled_positions_m
     looks = unit_vectors(np.radians(to_azimuth_deg), np.radians(to_elevation_deg))
     beam = unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg))
     paths_m = ((looks - beam) @ positions_m.T).astype(np.float32)  # exact to 1e-5 of a period, and twice as fast
+    weights = array_weights(settings).astype(np.float32)
     power = np.zeros(len(looks))
     for frequency_hz in frequencies_hz:
         wave_1_m = 2 * math.pi * frequency_hz / sound_speed_m_s(settings.air)
-        power += np.abs(np.exp(np.complex64(1j * wave_1_m) * paths_m).mean(axis=1)) ** 2
+        power += np.abs((np.exp(np.complex64(1j * wave_1_m) * paths_m) * weights).mean(axis=1)) ** 2
     return np.asarray(10 * np.log10(np.maximum(power / len(frequencies_hz), 1e-20)))
 
 

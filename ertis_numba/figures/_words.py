@@ -93,10 +93,15 @@ def of_array(settings: Settings, *parts: str) -> Heading:
         (
             f"{some} microphone{'s' if total > 1 else ''}",
             *parts,
-            "uniform weights, plane waves",
+            f"{_weights(settings)} weights, plane waves",
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
         ),
     )
+
+
+def _weights(settings: Settings) -> str:
+    given = settings.processing.array_weights
+    return given if isinstance(given, str) else "listed"
 
 
 def _of_sensor(settings: Settings) -> tuple[str, str]:

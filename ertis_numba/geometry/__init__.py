@@ -20,6 +20,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.received import received_settings
+from ertis_numba.geometry.weights import array_weights, effective_count
 
 __all__ = [
     "ALONE_RAD",
@@ -28,8 +29,10 @@ __all__ = [
     "PAPER_GRIDS",
     "Grid",
     "Layout",
+    "array_weights",
     "azimuth_columns",
     "direction_grid",
+    "effective_count",
     "far_field_delays",
     "grid_count",
     "is_closed",

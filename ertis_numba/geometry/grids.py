@@ -42,12 +42,12 @@ class Grid:
         return len(self.azimuth_rad)
 
 
-def grid_count(name: str) -> int | None:
-    """Return the number of directions of a named grid; None if the name is the path of a file.
+def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
+    """Return the number of directions of a named grid or of a list; None if the name is the path of a file.
 
     Parameters
     ----------
-    name : str
+    name : str or tuple of (azimuth, elevation)
         As `Processing.directions`.
 
     Raises
@@ -55,6 +55,8 @@ def grid_count(name: str) -> int | None:
     ArgumentError
         The count is missing or out of range.
     """
+    if not isinstance(name, str):
+        return len(name)
     head, colon, count = PAPER_GRIDS.get(name, (name,))[0].partition(":")
     if head not in {"2d", "3d"} or not colon:
         return None
@@ -68,7 +70,7 @@ def grid_count(name: str) -> int | None:
 
 
 def direction_grid(processing: Processing) -> Grid:
-    """Return the directions that ``processing.directions`` names.
+    """Return the directions that ``processing.directions`` names or lists.
 
     ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal
     plane, both limits included. ``3d:N`` is N cells of equal area between the limits, in rows of
@@ -88,6 +90,9 @@ def direction_grid(processing: Processing) -> Grid:
         The name is no grid and no readable file, or the grid is empty.
     """
     name = processing.directions
+    if not isinstance(name, str):
+        angles_rad = np.radians(np.asarray(name, dtype=np.float64))
+        return Grid(angles_rad[:, 0].copy(), angles_rad[:, 1].copy())
     kind, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
         name, (name, processing.azimuth_limits_deg, processing.elevation_limits_deg)
     )

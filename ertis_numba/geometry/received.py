@@ -38,7 +38,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
             raise SettingsError(f"{source} are not text ({error}); give TOML in UTF-8") from error
     settings = Settings.from_toml(text, source, find_line=False)
     layout, directions = settings.array.layout, settings.processing.directions
-    if not layout.isprintable() or not directions.isprintable():
+    if not layout.isprintable() or not str(directions).isprintable():
         raise SettingsError(f"{source} have names with characters that cannot be printed; give printable characters")
     if settings.array.positions_m is None and layout not in layout_names():
         raise SettingsError(
@@ -53,7 +53,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
         count = None if are_applied else grid_count(directions)
     except ArgumentError as error:
         raise SettingsError(f"{source}: {error}") from error
-    if count is None and not are_applied:
+    if isinstance(directions, str) and count is None and not are_applied:
         raise SettingsError(
             f"{source}: processing.directions is {directions[:80]!r}, a file; name a grid instead, such as 2d:181"
         )

@@ -12,6 +12,7 @@ from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import suit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import PRESETS, Settings
+from ertis_numba.settings.tapers import Taper, taper_of
 from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 
 __all__ = [
@@ -29,5 +30,7 @@ __all__ = [
     "Processing",
     "Recording",
     "Settings",
+    "Taper",
     "suit_ranges",
+    "taper_of",
 ]

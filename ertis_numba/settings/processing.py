@@ -1,13 +1,17 @@
 """How a measurement becomes an energyscape."""
 
-from typing import Literal
+from typing import Final, Literal
 
 from ertis_numba import checks
-from ertis_numba.constants import MAX_NAME_LENGTH
+from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import Table
 from ertis_numba.errors import ArgumentError
+from ertis_numba.settings.tapers import taper_of
 
-__all__ = ["Processing"]
+__all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
+
+MAX_LISTED_DIRECTIONS: Final = 1000
+"""Limit on the directions in the settings themselves, which recordings and messages hold as text."""
 
 
 class Processing(Table, frozen=True, kw_only=True):
@@ -18,8 +22,9 @@ class Processing(Table, frozen=True, kw_only=True):
     method : {"fast", "paper"}
         ``fast``: analytic signals, beams at the output ranges only. ``paper``: the algorithm of the
         2019 paper, for comparison.
-    directions : str
-        A grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file.
+    directions : str or list of (azimuth, elevation)
+        A grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file. Or up to 1000 directions in
+        degrees; in Python also as an array of shape (n, 2).
     azimuth_limits_deg, elevation_limits_deg : (low, high)
         Limits of the grids that are named by a count (``2d:N`` and ``3d:N``).
     range_m : (first, last)
@@ -43,13 +48,18 @@ class Processing(Table, frozen=True, kw_only=True):
         How many microphones ``dmas`` multiplies at a time, 2 to 8.
     snapshots : int
         Ranges from which ``capon`` learns what else is heard, 1 to 32.
+    array_weights : str or list of float
+        Weights of microphones, scaled to a mean of 1: ``uniform``; a window of the distance from the centre of the
+        array, ``cosine``, ``hann``, ``hamming``, ``blackman``, ``taylor:DB`` (20 to 80 dB, 30 by default) or
+        ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
+        ``docs/beamformers.md``.
     loading : float
         White noise that ``capon`` reckons with, by the mean power of a microphone; the more, the more it is
         like delay-and-sum.
     """
 
     method: Literal["fast", "paper"] = "fast"
-    directions: str = "90"
+    directions: str | tuple[tuple[float, float], ...] = "90"
     azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
     elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
     range_m: tuple[float, float] = (0.5, 5.0)
@@ -61,11 +71,17 @@ class Processing(Table, frozen=True, kw_only=True):
     dmas_order: int = 2
     snapshots: int = 5
     loading: float = 1.0
+    array_weights: str | tuple[float, ...] = "uniform"
 
     def __post_init__(self) -> None:
+        shape = getattr(self.directions, "shape", None)  # of an array, before its rows become tuples
+        if shape is not None and shape[1:] != (2,):
+            raise ArgumentError(
+                f"processing.directions has shape {shape}; give azimuth and elevation in degrees, of shape (n, 2)"
+            )
         super().__post_init__()
         checks.choice("processing.method", self.method, ("fast", "paper"))
-        checks.length("processing.directions", self.directions, MAX_NAME_LENGTH)
+        self._check_directions()
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
@@ -90,6 +106,37 @@ class Processing(Table, frozen=True, kw_only=True):
                 f"processing.wavefront is {self.wavefront!r}, which the paper's method knows nothing of; give 'plane'"
             )
         self._check_beamformer()
+        self._check_array_weights()
+
+    def _check_directions(self) -> None:
+        given = self.directions
+        if isinstance(given, str):
+            checks.length("processing.directions", given, MAX_NAME_LENGTH)
+            return
+        if not 1 <= len(given) <= MAX_LISTED_DIRECTIONS:
+            raise ArgumentError(
+                f"processing.directions lists {len(given)} directions; give 1 to {MAX_LISTED_DIRECTIONS}, or more of "
+                "them in a CSV file"
+            )
+        for row, (azimuth_deg, elevation_deg) in enumerate(given):
+            checks.between(f"azimuth of processing.directions[{row}] in degrees", azimuth_deg, -360.0, 360.0)
+            checks.between(f"elevation of processing.directions[{row}] in degrees", elevation_deg, -90.0, 90.0)
+
+    def _check_array_weights(self) -> None:
+        """Refuse weights that are negative, and any but uniform ones for adaptive beamformers."""
+        given = self.array_weights
+        if isinstance(given, str):
+            taper_of(given)
+        elif not 1 <= len(given) <= MAX_MICROPHONES:
+            raise ArgumentError(f"processing.array_weights has {len(given)} numbers; give one for each channel")
+        else:
+            for channel, weight in enumerate(given):
+                checks.between(f"processing.array_weights[{channel}]", weight, 0.0, 1e6)
+        if given != "uniform" and self.beamformer != "delay_and_sum":
+            raise ArgumentError(
+                f"processing.array_weights is {_shortened(given)}, but processing.beamformer {self.beamformer!r} "
+                "supports only 'uniform'; leave array_weights out, or give processing.beamformer 'delay_and_sum'"
+            )
 
     def _check_beamformer(self) -> None:
         """Refuse what no beamformer can do, and what delay-and-sum alone can."""
@@ -105,3 +152,7 @@ class Processing(Table, frozen=True, kw_only=True):
                     f"processing.{name} is {value!r}, which can delay_and_sum only; give {remedy} with "
                     f"processing.beamformer {self.beamformer!r}"
                 )
+
+
+def _shortened(weights: str | tuple[float, ...]) -> str:
+    return repr(weights) if isinstance(weights, str) else f"a list of {len(weights)} numbers"

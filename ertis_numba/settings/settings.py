@@ -156,8 +156,9 @@ class Settings(Document, frozen=True, kw_only=True):
         array, processing = self.array, self.processing
         if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
             array = array.replace(layout=str(folder / array.layout))
-        if Path(processing.directions).suffix.lower() == ".csv":
-            processing = processing.replace(directions=str(folder / processing.directions))
+        directions = processing.directions
+        if isinstance(directions, str) and Path(directions).suffix.lower() == ".csv":
+            processing = processing.replace(directions=str(folder / directions))
         return self.replace(array=array, processing=processing, call=self.call.beside(folder))
 
     @classmethod

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit
@@ -107,7 +107,7 @@ class Texture:
         return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
 
     @classmethod
-    def echo(cls, settings: Settings, n_mics: int) -> "Texture":
+    def echo(cls, settings: Settings, n_mics: float) -> "Texture":
         """Return the texture of a single echo, to which all microphones contribute in phase."""
         _, shares = matched_spectrum(settings, n_waves=WAVES)
         power = shares**2  # that of the echo, beside that of the filter
@@ -128,8 +128,9 @@ class ErrorModel:
         self._settings = settings
         self.texture = texture or Texture.unknown(settings)
         self.frequency_hz, _ = matched_spectrum(settings, n_waves=WAVES)
+        self._weights = array_weights(settings)
 
-    def delays(self, fit: DelayFit, *, n_mics: int, fractions: NDArray[np.float64] | None = None) -> float:
+    def delays(self, fit: DelayFit, *, n_mics: float, fractions: NDArray[np.float64] | None = None) -> float:
         """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
 
         What samples are wrong by on average is a filter of the image itself, however coherent echoes are; the
@@ -140,7 +141,8 @@ class ErrorModel:
         Parameters
         ----------
         fit : DelayFit
-        n_mics : int
+        n_mics : float
+            Effective number of microphones: see `ertis_numba.geometry.effective_count`.
         fractions : (delay,) float64, optional
             Fractions of a step in the delays, if the delays are too few to spread evenly.
         """
@@ -193,11 +195,13 @@ class ErrorModel:
         """
         along_m = aperture.directions @ aperture.positions_m.T
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
-        spread_m4 = float(np.mean(np.var(across_m2, axis=1)))
+        weights, power = self._weights, self._weights**2 / np.mean(self._weights**2)
+        middle_m2 = np.mean(weights * across_m2, axis=1)
+        spread_m4 = float(np.mean(np.mean(power * (across_m2 - middle_m2[:, None]) ** 2, axis=1)))
         turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
         shares = self.texture.shares
         centre_hz = float(self.frequency_hz @ shares)
-        shared_m4 = float(np.mean(np.mean(across_m2, axis=1) ** 2))
+        shared_m4 = float(np.mean(middle_m2**2))
         shift_2 = (2 * math.pi * (self.frequency_hz - centre_hz) / (2 * sound_speed_m_s)) ** 2 * shared_m4
         return self._of(float(turn_2 @ shares) * bend_2) + float(shift_2 @ shares) * bend_2
 
@@ -271,7 +275,7 @@ class ErrorModel:
         """
         if self._settings.recording.is_pdm:
             return _ARITHMETIC / self.texture.gain
-        alike = int(microphones(self._settings.array).enabled.sum())
+        alike = effective_count(self._weights)
         return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain
 
     def _of(self, power: float) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, Peak, Reflector
-from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry import array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.stages.detect import find_peaks
 from ertis_numba.waveform import matched_filter
@@ -170,7 +170,7 @@ class _Lobe:
     """How far the main lobe of an array reaches.
 
     Near a reflector its amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``: Δu is the difference of the unit
-    vectors, C the covariance of the microphones' positions and k the wave number at the centre of the
+    vectors, C the weighted covariance of the microphones' positions and k the wave number at the centre of the
     call. For the shipped layouts this gives the width at half amplitude within a tenth.
 
     Attributes
@@ -186,7 +186,8 @@ class _Lobe:
         n_fft = math.ceil(settings.call.duration_s * rate_hz) + 1
         centre_hz = matched_filter(settings, n_fft=n_fft).centre_hz
         wave_1_m = 2 * math.pi * centre_hz / sound_speed_m_s(settings.air)
-        self._reach = wave_1_m / _HALF_AMPLITUDE / math.sqrt(len(positions_m)) * positions_m
+        scale = wave_1_m / _HALF_AMPLITUDE / math.sqrt(len(positions_m))
+        self._reach = scale * positions_m * np.sqrt(array_weights(settings))[:, None]
         largest = float(np.linalg.norm(self._reach, ord=2))
         self.half_deg = math.degrees(1 / largest) if largest else math.inf
 

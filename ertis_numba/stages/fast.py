@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
@@ -82,7 +82,8 @@ class FastChain:
         nodes = nodes_of(settings, aperture, spectrum)
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
-        ahead_s = ahead_of(fit, len(own_s), step_s)
+        array_weight = array_weights(settings)
+        ahead_s = ahead_of(fit, array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
@@ -120,7 +121,7 @@ class FastChain:
                 * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
             ),
         )
-        amplitudes = 1 / (layout.gain[layout.enabled] * len(own_s))
+        amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
         zones = [
             Zone(
                 first,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import Grid, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, direction_grid, far_field_delays, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import call_at
 
@@ -61,7 +61,8 @@ class PaperChain:
         self._is_pdm, self._scale = settings.recording.is_pdm, np.float32(0.5 / settings.recording.full_scale)
         self._demodulate = _Demodulate(settings)
         self._low_pass = _LowPass(settings)
-        self._make_matched_filter(settings, lead, 1 / (layout.gain[layout.enabled] * len(self._channels)))
+        weights = array_weights(settings) / (layout.gain[layout.enabled] * len(self._channels))
+        self._make_matched_filter(settings, lead, weights)
 
     def _make_matched_filter(self, settings: Settings, lead: int, weights: NDArray[np.float64]) -> None:
         """Make the spectrum that correlates with the call and delays by ``lead``.

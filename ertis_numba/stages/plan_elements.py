@@ -82,13 +82,18 @@ def ringing_db(settings: Settings) -> float:
     return max(60.0, 1.2 * (settings.accuracy.stop_band_db or 60.0) - 12.0)
 
 
-def ahead_of(fit: DelayFit, n_mics: int, step_s: float) -> NDArray[np.float64]:
+def ahead_of(fit: DelayFit, weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
 
     Without offsets, microphones with equal delays, as straight ahead, would have equal interpolation errors. Multiples
-    of the golden ratio spread the offsets of any few consecutive microphones evenly.
+    of the golden ratio spread the offsets of any few consecutive microphones evenly, in the order of falling array
+    weights, so that those of a few dominant microphones are spread evenly, too.
     """
-    return np.arange(n_mics) * (math.sqrt(5) - 1) / 2 % 1.0 * step_s if fit.is_fitted else np.zeros(1)
+    if not fit.is_fitted:
+        return np.zeros(1)
+    rank = np.empty(len(weights), dtype=np.intp)
+    rank[np.argsort(-weights, kind="stable")] = np.arange(len(weights))
+    return np.asarray(rank * (math.sqrt(5) - 1) / 2 % 1.0 * step_s)
 
 
 def zones_of(settings: Settings) -> list[tuple[int, int, float]]:

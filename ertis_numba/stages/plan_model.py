@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture
 from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
@@ -96,8 +96,10 @@ class PlanModel:
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._own_s = layout.delay_s[layout.enabled]
         self.aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
-        amplitudes = 1 / layout.gain[layout.enabled]
+        self._weights = array_weights(settings)
+        amplitudes = self._weights / layout.gain[layout.enabled]
         self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
+        self._n_effective = effective_count(self._weights)
         self.n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
@@ -173,7 +175,7 @@ class PlanModel:
         fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
         return Delays(
             n_taps=fit.n_taps,
-            error=self.errors.delays(fit, n_mics=self.n_mics, fractions=self._few_fractions(fit, step_s)),
+            error=self.errors.delays(fit, n_mics=self._n_effective, fractions=self._few_fractions(fit, step_s)),
             sum_of_weights=float(np.max(weights.sum(axis=1))),
             squares=float(np.mean(np.sum(weights**2, axis=1))),
         )
@@ -184,7 +186,7 @@ class PlanModel:
             return None
         delays_s = (
             self._own_s
-            - ahead_of(fit, self.n_mics, step_s)
+            - ahead_of(fit, self._weights, step_s)
             + self.aperture.delays_s(self.aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
         )
         return fit.split(delays_s)[1].ravel()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
 from ertis_numba.stages.fitting import one_thread
@@ -80,7 +80,7 @@ def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation 
     points = aperture.directions if nodes is None else nodes.points
     delays_s = aperture.delays_s(points, sound_speed_m_s=speed_m_s)
     fit, step_s = delay_fit(settings, spectrum)
-    ahead_s = ahead_of(fit, delays_s.shape[1], step_s)
+    ahead_s = ahead_of(fit, array_weights(settings), step_s)
     taken_s = layout.delay_s[layout.enabled] - ahead_s + delays_s
     first, fractions = fit.split(taken_s)
     weights = fit.weights(fractions)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Air, Settings
 from ertis_numba.stages.plan_response import Deviation
 from ertis_numba.waveform import matched_filter
@@ -23,7 +23,8 @@ _STEPS_PER_WAVE = 512  # of the table, per wavelength at the edge of the band: l
 class PointSpread:
     """Amplitude of a reflector's image at other directions and ranges: delay-and-sum of plane waves.
 
-    ``|Σ_f P(f) Σ_mic exp(j k(f) (2 Δr − p·Δu))| / n_mics``, where P is the power of the call.
+    ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| / n_mics``, where P is the power of the call and w are the array
+    weights, whose mean is 1.
 
     Parameters
     ----------
@@ -39,6 +40,7 @@ class PointSpread:
     def __init__(self, settings: Settings) -> None:
         self._speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
         self._positions_m = microphones(settings.array).enabled_positions_m
+        self._weights = array_weights(settings)
         self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
         # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
         spacing_hz = self._speed_m_s / (6 * self.reach_m)
@@ -85,7 +87,7 @@ class PointSpread:
             carrier_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi)
             pulse = pulse * (1 + deviation.mean + deviation.slope_s * (carrier_hz - deviation.centre_hz))
             pulse += deviation.slope_s * self._at(path_m, self._tilted_hz)
-        return np.asarray(np.abs((pulse * np.exp(1j * self._carrier_1_m * path_m)).mean(axis=1)))
+        return np.asarray(np.abs((pulse * np.exp(1j * self._carrier_1_m * path_m) * self._weights).mean(axis=1)))
 
     @functools.cached_property
     def _tilted_hz(self) -> NDArray[np.complex128]:

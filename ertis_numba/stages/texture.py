@@ -8,7 +8,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import Texture
@@ -85,7 +85,7 @@ def texture_of(
     gain = microphones(settings.array).gain[microphones(settings.array).enabled, None]
     series = np.moveaxis(analytic, 1, 2)[:, : len(chain.range_m)].reshape(n_mics, -1)
     undivided = float(np.mean(np.abs(series) ** 2)) or 1e-30  # as tiles have it
-    series = (series / gain).astype(np.complex64)
+    series = (series / gain * array_weights(settings)[:, None]).astype(np.complex64)
     power = float(np.mean(np.abs(series) ** 2)) or 1e-30
     image_power = float(np.mean(np.square(image, dtype=np.float64)))
     # A tile reaches as far over its ranges as delays do.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import Texture
 from ertis_numba.stages.noise import noise_of
@@ -52,6 +52,9 @@ class PositionUncertainty:
       Information Theory, 1953, for the range ``cτ / 2``), and k is the root mean square of its wave numbers.
     - λ is the least variance of the microphones' positions along any direction across the line of sight (H. L. Van
       Trees, Optimum Array Processing, 2002, section 8.4). For an image of one elevation, that direction is the azimuth.
+      Array weights w other than uniform replace the covariance C of the positions by ``C(w) C(w²)⁻¹ C(w)``, where the
+      covariances have the weights in brackets. It is the inverse of the covariance of the maximum of a weighted beam,
+      at the same power of noise in the image.
 
     The noise is estimated from medians of blocks of ranges; the median of a Rayleigh variable is √ln 2 of its root mean
     square. The lower tercile of these estimates counts, as side lobes of strong echoes raise the others. If echoes
@@ -81,7 +84,7 @@ class PositionUncertainty:
         self._settings, self._is_planar = settings, is_planar
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
-        self._covariance_m2 = positions_m.T @ positions_m / len(positions_m)
+        self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(
         self,
@@ -122,8 +125,7 @@ class PositionUncertainty:
         plan = (accuracy.oversampling, accuracy.delay_taps, accuracy.beam_taps)
         if self._settings.processing.method != "fast" or None in plan or accuracy.precision == "auto":
             return _PlanError(0.0, 0.0)
-        n_mics = int(microphones(self._settings.array).enabled.sum())
-        echo = Texture.echo(self._settings, n_mics)
+        echo = Texture.echo(self._settings, effective_count(array_weights(self._settings)))
         parts = Planner(self._settings, kernels.load("numpy"), threads=1, texture=echo).parts(accuracy)
         # Half of an error's power changes a magnitude, and so does half of the noise's.
         delays, beams = (math.sqrt(2 * parts[name]) for name in ("delays", "beams"))
@@ -147,3 +149,13 @@ class PositionUncertainty:
         least = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
         # What is left of rounding is no aperture.
         return np.asarray(np.where(least > _FLAT * (aa + bb), least, 0.0))
+
+
+def _effective_covariance_m2(positions_m: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of the positions of a uniform array whose maxima are as uncertain: (axis, axis) float64."""
+    if np.all(weights == 1.0):
+        return np.asarray(positions_m.T @ positions_m / len(positions_m))
+    offset_m = positions_m - weights @ positions_m / len(positions_m)
+    signal = (offset_m.T * weights) @ offset_m / np.sum(weights)
+    noise = (offset_m.T * weights**2) @ offset_m / np.sum(weights**2)
+    return np.asarray(signal @ np.linalg.pinv(noise, rcond=_FLAT, hermitian=True) @ signal)

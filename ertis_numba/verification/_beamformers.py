@@ -21,7 +21,8 @@ def combine(y: Delayed, processing: Processing) -> NDArray[np.float64]:
     Parameters
     ----------
     y : (mic, range) complex128
-        Analytic signals delayed for the direction and divided by the gains of their microphones.
+        Analytic signals delayed for the direction, multiplied by the array weights and divided by the gains of their
+        microphones.
     processing : Processing
     """
     return _BEAMFORMERS[processing.beamformer](y, processing)

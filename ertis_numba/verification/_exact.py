@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, far_field_delays, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.verification._beamformers import combine
 from ertis_numba.waveform import call_samples, matched_band_hz
@@ -64,7 +64,8 @@ class ExactImage:
             for channel in np.flatnonzero(layout.enabled).tolist()
         ]
         calibration = np.exp(1j * self._wave_rad_s * layout.delay_s[layout.enabled][:, None])
-        self._spectra = np.stack(spectra) * calibration / layout.gain[layout.enabled][:, None]
+        weighted = np.stack(spectra) * array_weights(settings)[:, None]
+        self._spectra = weighted * calibration / layout.gain[layout.enabled][:, None]
 
     @property
     def operations_per_direction(self) -> int:

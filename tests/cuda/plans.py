@@ -34,6 +34,13 @@ PLANS = {
         ),
         -120,
     ),
+    "array weights": (
+        TINY.replace(
+            processing=TINY.processing.replace(directions="2d:3", array_weights=(1.0, 0.25)),
+            accuracy=DIRECT,
+        ),
+        -120,
+    ),
 }
 for _beamformer in ("coherence_factor", "dmas", "capon"):
     PLANS[_beamformer] = (

@@ -208,10 +208,11 @@ def _about(came: Air, used: Air) -> Air:
 def _require_size(settings: Settings) -> None:
     """Refuse images that nobody has the memory for, before anything is made for them."""
     processing = settings.processing
-    grid, count = processing.directions, grid_count(processing.directions)
+    count = grid_count(processing.directions)
     if count is None:  # a list of directions, which is as long as somebody has written it here
         return
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
+    grid = processing.directions if isinstance(processing.directions, str) else f"{count} directions"
     n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
     if n_bytes > _MOST_BYTES:
         raise ArgumentError(
