@@ -13,6 +13,7 @@ from PIL import Image
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Call, Processing
+from ertis_numba.stages.side_lobes import without_side_lobes
 from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, Scene, Sector, Taken, _axes
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._choices import colour_table
@@ -167,18 +168,23 @@ def test_what_two_sensors_see_becomes_one_image():
     assert all(isinstance(drawn.shape, Sector) for drawn in tilted.sensors.values())
 
 
-def test_an_image_with_elevations_is_a_dome():
+@pytest.mark.parametrize("threshold_db", [-20.0, -3.0])
+def test_an_image_with_elevations_is_a_dome_of_echoes(threshold_db):
     scene = Scene()
-    made = solid()
+    speckle = solid()
+    made = speckle.replace(energy=speckle.energy + np.float32(0.1))
     scene.take(taken(made))
-    frame = scene.draw(Choices(colours="viridis"))
+    frame = scene.draw(Choices(colours="viridis", threshold_db=threshold_db))
     (drawn,) = frame.sensors.values()
     assert isinstance(drawn.shape, Dome)
-    strongest = int(made.energy.max(axis=1).argmax())
-    np.testing.assert_array_equal(drawn.shape.colours[strongest], colour_table("viridis")[255])
-    np.testing.assert_allclose(np.linalg.norm(drawn.shape.position_m, axis=1), 5.0 / 4, rtol=1e-6)
+    highest = without_side_lobes(made).energy.max(axis=1)
+    seen = highest >= highest.max() * 10 ** (threshold_db / 20)
+    assert 0 < np.count_nonzero(seen) <= len(seen)
     azimuth_rad = np.arctan2(drawn.shape.position_m[:, 1], drawn.shape.position_m[:, 0])
-    np.testing.assert_allclose(azimuth_rad, made.azimuth_rad, atol=1e-5)
+    np.testing.assert_allclose(azimuth_rad, made.azimuth_rad[seen], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(drawn.shape.position_m, axis=1), 5.0 / 4, rtol=1e-6)
+    strongest = int(highest[seen].argmax())
+    np.testing.assert_array_equal(drawn.shape.colours[strongest], colour_table("viridis")[255])
 
 
 def test_maps_of_colours_rise_in_brightness():
