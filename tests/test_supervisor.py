@@ -134,3 +134,19 @@ def test_restarted_process_runs_for_the_rest_of_the_duration():
     assert Life().remaining_s(None) is None
     assert Life(elapsed_s=4.0).remaining_s(10.0) == 6.0
     assert Life(elapsed_s=40.0).remaining_s(10.0) > 0.0
+
+
+def test_nodes_of_a_demo_end_if_it_is_killed(tmp_path):
+    program = (
+        "import pathlib, sys, time; from ertis_cli.demo import _Run\n"
+        f"run = _Run({ENVIRONMENT!r}, quiet=True)\n"
+        "output = pathlib.Path('started.jsonl')\n"
+        "with run.node('record', '--listen', 'tcp://127.0.0.1:0', '-o', 'out', '--json', output=output) as node:\n"
+        "    print(node['pid'], flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True) as process:
+        pid = int(process.stdout.readline())
+        process.kill()
+    until(lambda: is_gone(pid))

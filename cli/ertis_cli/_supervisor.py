@@ -16,7 +16,7 @@ import click
 
 from ertis_cli._signals import is_detached
 
-__all__ = ["Life", "allow", "supervised"]
+__all__ = ["Life", "allow", "end_with", "supervised"]
 
 RETRY_INTERVALS_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Pause before each restart; the last is repeated."""
@@ -117,7 +117,7 @@ class _Supervisor:
             os.close(report_fd)
             return None
         os.close(self._reports)
-        _die_with(parent)
+        end_with(parent, signal.SIGKILL)
         for each, handler in self._handlers_before.items():
             signal.signal(each, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, self._mask_before)
@@ -167,11 +167,11 @@ class _Supervisor:
         self._restarts += 1
 
 
-def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends for any reason."""
+def end_with(parent: int, number: signal.Signals) -> None:
+    """Have Linux send this process a signal when its parent ends for any reason."""
     import ctypes
 
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent:
         os._exit(1)
 

@@ -1,9 +1,11 @@
 """``ertis demo``: the whole system without hardware."""
 
+import functools
 import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -14,7 +16,7 @@ from typing import Any, Final
 
 import click
 
-from ertis_cli import _examples, options
+from ertis_cli import _examples, _supervisor, options
 
 __all__ = ["demo"]
 
@@ -131,6 +133,9 @@ class _Run:
 
     def __init__(self, environment: Mapping[str, str], *, quiet: bool) -> None:
         self._environment, self._quiet = environment, quiet
+        # No node outlives this process, even if it is killed.
+        ends = functools.partial(_supervisor.end_with, os.getpid(), signal.SIGTERM)
+        self._bind = ends if sys.platform == "linux" else None
 
     def __call__(self, *words: object, allowed: Sequence[int] = ()) -> None:
         """Run a command to its end.
@@ -141,7 +146,8 @@ class _Run:
             The command has failed.
         """
         typed = self._printed(words)
-        done = subprocess.run([*_NODE, *map(str, words)], env=self._environment, check=False)  # noqa: S603  our own
+        command = [*_NODE, *map(str, words)]
+        done = subprocess.run(command, env=self._environment, preexec_fn=self._bind, check=False)  # noqa: S603
         if done.returncode not in {0, *allowed}:
             raise click.ClickException(f"'{typed}' ended with {done.returncode}; its error is above")
 
@@ -156,7 +162,12 @@ class _Run:
         """
         typed = self._printed(words)
         with output.open("wb") as file:
-            process = subprocess.Popen([*_NODE, *map(str, words)], env=self._environment, stdout=file)  # noqa: S603
+            process = subprocess.Popen(  # noqa: S603
+                [*_NODE, *map(str, words)],
+                env=self._environment,
+                stdout=file,
+                preexec_fn=self._bind,  # noqa: PLW1509
+            )
         try:
             while not (text := output.read_text("utf-8")).endswith("\n"):
                 if process.poll() is not None:
