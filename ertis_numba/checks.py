@@ -3,7 +3,8 @@
 import difflib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ __all__ = [
     "finite",
     "finite_array",
     "gap",
+    "instance",
     "interval",
+    "items",
     "length",
     "positive",
     "sensor_name",
@@ -24,6 +27,7 @@ __all__ = [
     "whole",
 ]
 
+_Item = TypeVar("_Item")
 _REASON_BYTES = 64
 _SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 
@@ -100,6 +104,21 @@ def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
     """Refuse an array whose shape is not ``wanted``."""
     if actual != wanted:
         raise ArgumentError(f"{name} has shape {actual}; give shape {wanted}")
+
+
+def instance(name: str, value: object, wanted: type, source: str) -> None:
+    """Refuse a value of another type; ``source`` says where to get one, such as "Pipeline.process returns"."""
+    if not isinstance(value, wanted):
+        raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")
+
+
+def items(name: str, values: Iterable[_Item], wanted: type, source: str) -> Iterator[_Item]:
+    """Yield values that are all of one type; refuse a single one, and what cannot be iterated."""
+    if not isinstance(values, Iterable):
+        raise ArgumentError(f"{name} is of type {type(values).__name__}; give a list of {wanted.__name__}")
+    for index, value in enumerate(values):
+        instance(f"{name}[{index}]", value, wanted, source)
+        yield value
 
 
 def sensor_name(name: str) -> str:

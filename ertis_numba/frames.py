@@ -81,6 +81,10 @@ class Measurement:
     settings: Settings
     stamp: Stamp = Stamp()
 
+    def __post_init__(self) -> None:
+        checks.instance("words", self.words, np.ndarray, "a recording holds, or numpy.asarray makes")
+        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Energyscape:
@@ -105,6 +109,13 @@ class Energyscape:
     settings: Settings
     stamp: Stamp = Stamp()
 
+    def __post_init__(self) -> None:
+        for name in ("energy", "azimuth_rad", "elevation_rad", "range_m"):
+            checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
+        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.shape("elevation_rad", self.elevation_rad.shape, self.azimuth_rad.shape)
+        checks.shape("energy", self.energy.shape, (*self.azimuth_rad.shape, *self.range_m.shape))
+
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:  # noqa: FBT001  NumPy's
         """Return the energies for NumPy functions: (direction, range)."""
         return np.array(self.energy, dtype=dtype, copy=copy)
@@ -117,14 +128,8 @@ class Energyscape:
         ArgumentError
             There is no such field, or the shapes do not agree.
         """
-        known = [each.name for each in fields(self)]
-        for name in changes.keys() - set(known):
-            raise ArgumentError(f"an image has no field {name!r}; give some of {', '.join(known)}")
-        made = replace(self, **changes)
-        n_directions = len(made.azimuth_rad)
-        checks.shape("elevation_rad", np.shape(made.elevation_rad), (n_directions,))
-        checks.shape("energy", np.shape(made.energy), (n_directions, len(made.range_m)))
-        return made
+        _require_fields("an image", self, changes)
+        return replace(self, **changes)
 
     @property
     def is_planar(self) -> bool:
@@ -161,11 +166,27 @@ class PointCloud:
     rotation_xyzw: tuple[float, float, float, float] | None = None
     uncertainty_m: NDArray[np.float32] | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("position_m", "energy"):
+            checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
+        n_points = len(self.energy) if self.energy.ndim else 1
+        checks.shape("energy", self.energy.shape, (n_points,))
+        checks.shape("position_m", self.position_m.shape, (n_points, 3))
+        if self.uncertainty_m is not None:
+            checks.shape("uncertainty_m", np.shape(self.uncertainty_m), (n_points, 2))
+
     def __len__(self) -> int:
         return len(self.energy)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed."""
+        """Return a copy with some fields changed.
+
+        Raises
+        ------
+        ArgumentError
+            There is no such field, or the shapes do not agree.
+        """
+        _require_fields("a point cloud", self, changes)
         return replace(self, **changes)
 
     def on_platform_m(self) -> NDArray[np.float32]:
@@ -234,3 +255,9 @@ class Peak:
     range_m: float
     level_db: float
     level_dbfs: float = field(default=math.nan, compare=False)
+
+
+def _require_fields(what: str, given: Energyscape | PointCloud, changes: dict[str, Any]) -> None:
+    known = [each.name for each in fields(given)]
+    for name in changes.keys() - set(known):
+        raise ArgumentError(f"{what} has no field {name!r}; give some of {', '.join(known)}")

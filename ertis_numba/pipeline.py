@@ -150,6 +150,7 @@ class Pipeline:
         ArgumentError
             ``out`` has another shape or type, or there are fewer threads.
         """
+        checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
         energy = self._chain.new_image() if out is None else self._checked_out(out)
         self._chain.process(words, energy, threads=threads)
@@ -175,7 +176,7 @@ class Pipeline:
             As for `process`; then nothing is processed.
         """
         self._require_open()
-        batch = list(measurements)
+        batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
         words = [self._words_of(measurement) for measurement in batch]
         energies = [self._chain.new_image() for _ in batch]
         self._chain.process_batch([each for each, _ in words], energies)

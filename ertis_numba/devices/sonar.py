@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
 from ertis_numba.devices.commands import Command, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
@@ -40,6 +41,7 @@ class Sonar:
     """
 
     def __init__(self, port: Port, *, timeout_s: float = 1.0, passive: bool = False) -> None:
+        checks.instance("port", port, Port, "find_ports or resolve of ertis_numba.devices.ports returns")
         self.firmware = ""
         self._port = port
         self._timeout_s = timeout_s

@@ -168,7 +168,7 @@ def signals(
     ArgumentError
         An argument cannot be used, or there is no such microphone.
     """
-    _require("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording holds")
     return _signals.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
@@ -183,7 +183,7 @@ def matched_filter(
 
     Arguments are those of `signals`.
     """
-    _require("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording holds")
     return _echoes.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
@@ -217,7 +217,7 @@ def array(
     checks.positive("dynamic_range_db", dynamic_range_db)
     if isinstance(settings, str):
         settings = Settings(array=Array(layout=settings))
-    _require("settings", settings, Settings, "Settings.load reads, or the name of a layout")
+    checks.instance("settings", settings, Settings, "Settings.load reads, or the name of a layout")
     return _array.draw(
         style_of(**look),
         settings,
@@ -281,15 +281,11 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
 
 
 def _canvas_of(image: Energyscape, dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None) -> Canvas:
-    _require("image", image, Energyscape, "Pipeline.process returns")
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
     return _canvas(dynamic_range_db, look, peaks)
 
 
 def _canvas(dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None = None) -> Canvas:
     checks.positive("dynamic_range_db", dynamic_range_db)
-    return Canvas(style_of(**look), dynamic_range_db, tuple(peaks or ()))
-
-
-def _require(name: str, value: object, wanted: type, source: str) -> None:
-    if not isinstance(value, wanted):
-        raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")
+    marked = tuple(checks.items("peaks", peaks or (), Peak, "find_peaks returns"))
+    return Canvas(style_of(**look), dynamic_range_db, marked)

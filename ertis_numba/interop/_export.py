@@ -149,6 +149,8 @@ def export(
     DataError
         The disk is full or cannot be written.
     """
+    if not isinstance(items, Iterable):
+        raise ArgumentError(f"items is of type {type(items).__name__}; give a list of Energyscape")
     name = format_of(path, file_format)
     finding = {"top": top, "min_level_db": min_level_db}
     _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding})

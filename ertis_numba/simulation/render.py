@@ -1,5 +1,6 @@
 """From a scene to the words that its sensors would record."""
 
+from ertis_numba import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Processing, Recording
 from ertis_numba.simulation.engine import Engine
@@ -33,6 +34,7 @@ class Simulator(Engine):
     def __init__(
         self, scene: Scene, *, sensor: str | None = None, plan: Plan | None = None, threads: int | None = None
     ) -> None:
+        checks.instance("scene", scene, Scene, "load_scene returns")
         self.plan = make_plan(scene) if plan is None else plan
         super().__init__(scene, scene.sensor(sensor), self.plan.active, threads=threads)
 

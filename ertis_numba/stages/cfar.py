@@ -62,6 +62,7 @@ def cfar(
     ArgumentError
         An argument cannot be used, or the image has too few ranges.
     """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
     factor = threshold_factor(method, n_reference, false_alarm)
     places = _reference(image, n_reference)
     energy = image.energy
@@ -186,6 +187,7 @@ def clean(image: Energyscape, *, within_db: float = 6.0, above_mean_db: float | 
     ArgumentError
         A level cannot be used.
     """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
     energy = image.energy
     checks.between("within_db", within_db, 0.0, 1000.0)
     least = energy.max(axis=0, initial=0.0) * np.float32(10 ** (-within_db / 20))

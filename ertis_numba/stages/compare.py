@@ -115,6 +115,8 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     ArgumentError
         ``min_level_db`` is above 0.
     """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))
     checks.between("min_level_db", min_level_db, _LEAST_DB, 0.0)
     lobe = _Lobe(image.settings)
     in_view = _in_view(image, reflectors, lobe)

@@ -54,20 +54,20 @@ def find_peaks(
         ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
         ``false_alarm`` is not between 0 and 1.
     """
-    if not isinstance(image, Energyscape):
-        raise ArgumentError(
-            f"image is of type {type(image).__name__}; give an Energyscape, as of Pipeline.process, because places "
-            "need its directions and ranges"
-        )
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
     top = image.energy.size if top is None else checks.whole("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
-    floor = float(np.max(image.energy, initial=0.0)) * 10 ** (min_level_db / 20)
+    highest = float(np.max(image.energy, initial=0.0))
+    floor = checks.finite("the maximum of the image", highest) * 10 ** (min_level_db / 20)
     if false_alarm is not None:
         floor = max(floor, threshold_of(image, false_alarm))
     if where is not None:
+        where = np.asarray(where)
         checks.shape("where", where.shape, image.energy.shape)
+        if where.dtype != np.bool_:
+            raise ArgumentError(f"where holds {where.dtype}; give bool, such as image.energy > 0.01")
     places = _local_maxima(image.energy, neighbours, floor, where)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
     side_lobes = SideLobes(image, directions)

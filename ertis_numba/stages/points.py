@@ -50,6 +50,7 @@ class PointExtractor:
     def __init__(
         self, settings: Settings, grid: Grid | None = None, *, top: int = 256, min_level_db: float = -20.0
     ) -> None:
+        checks.instance("settings", settings, Settings, "an image or a recording holds")
         self._top = checks.whole("top", top, 1)
         self._least = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)
         grid = grid or direction_grid(settings.processing)
@@ -67,6 +68,7 @@ class PointExtractor:
         ArgumentError
             The image has not the directions of this grid.
         """
+        checks.instance("image", image, Energyscape, "Pipeline.process returns")
         energy = image.energy
         checks.shape("energy", energy.shape, (len(self._directions), len(image.range_m)))
         directions, ranges = self._maxima(energy, image.range_m)

@@ -330,6 +330,6 @@ def write_energyscapes(
     with EnergyscapeWriter(
         path, recording=recording, truth=truth, mounting=mounting, dtype=dtype, overwrite=overwrite
     ) as writer:
-        for image in images:
+        for image in checks.items("images", images, Energyscape, "Pipeline.process returns"):
             writer.write(image)
     return writer.path

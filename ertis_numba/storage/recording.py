@@ -359,6 +359,6 @@ def write_recording(
     with RecordingWriter(
         path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting
     ) as writer:
-        for measurement in measurements:
+        for measurement in checks.items("measurements", measurements, Measurement, "a recording holds"):
             writer.write(measurement)
     return writer.path

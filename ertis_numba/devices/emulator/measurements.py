@@ -47,6 +47,7 @@ class Measurements:
         log: TextIO | None,
     ) -> None:
         self._words = {True: words, False: words if passive is None else passive}
+        checks.instance("words", words, Sequence, "has the words of each measurement")
         for given in self._words.values():
             checks.whole("number of measurements to emulate", len(given), 1)
             if given[0].dtype != np.uint32 or given[0].ndim != 1:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
@@ -61,6 +62,7 @@ def health(measurement: Measurement) -> Health:
     DataError
         The words are not those of the settings.
     """
+    checks.instance("measurement", measurement, Measurement, "a recording holds")
     settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
     words = word_format(settings).checked(measurement.words, any_length=True)[:MAX_SAMPLES]
     if len(words) < MIN_SAMPLES:
