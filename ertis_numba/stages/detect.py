@@ -70,10 +70,11 @@ def find_peaks(
             raise ArgumentError(f"where holds {where.dtype}; give bool, such as image.energy > 0.01")
     places = _local_maxima(image.energy, neighbours, floor, where)
     levels = image.energy[places[:, 0], places[:, 1]].astype(np.float64)
-    side_lobes = SideLobes(image, directions)
+    order = np.argsort(-levels, kind="stable")
+    side_lobes = SideLobes(image, directions, places[order])
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
-    for k in np.argsort(-levels, kind="stable"):
+    for k in order:
         if len(found) == top:
             break
         # Only what comes next in order is compared with what was found, which is few of many candidates, and

@@ -21,6 +21,11 @@ Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that dif
 _MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predicted side lobes of stronger ones
 _FALSE_ALARM: Final = 0.01
 _N_DIRECTIONS: Final = 64  # in which prediction and image are compared
+_N_COMPARED: Final = 8  # reflectors by which the prediction is judged
+_TRUSTED: Final = (
+    0.25,
+    0.4,
+)  # deviations relative to the mean, up to which a pattern is known, and from which it is not
 _N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
 # Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
 # main lobes of reflectors take less than a quarter of the directions.
@@ -37,20 +42,23 @@ class SideLobes:
     of what is predicted and of what may deviate from it. The deviation is a sum of many phasors, so its amplitude
     follows a Rayleigh distribution [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of
     1 - p. The image itself tells σ: its deviation from the prediction at the range in question, but at most the mean
-    of all side lobes that reach this range.
+    of all side lobes that reach this range. Echoes that interfere deviate as well, so the image is first judged by the
+    reflector that it fits best: if the pattern around that one is as predicted, the array is as designed, and σ is 0.
 
     Parameters
     ----------
     image : Energyscape
     directions : (direction, axis) float64
         Unit vectors of the image's directions.
+    candidates : (candidate, [direction, range]) int64
+        Places of local maxima, the strongest first.
 
     References
     ----------
     .. [1] J. W. Goodman, *Speckle Phenomena in Optics*, 2nd edition, chapter 3.
     """
 
-    def __init__(self, image: Energyscape, directions: NDArray[np.float64]) -> None:
+    def __init__(self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> None:
         self._image, self._spread = image, PointSpread(image.settings)
         count = len(directions)
         self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
@@ -60,6 +68,7 @@ class SideLobes:
         self._mean = np.zeros(_N_OFFSETS)  # of the side lobes of a reflector of amplitude 1, by range offset
         self._sources: list[tuple[NDArray[np.float64], float, float]] = []
         self._deviations: dict[int, float] = {}  # by range bin
+        self._doubt = self._doubt_of(directions, candidates)
 
     def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
         """Add a reflector, strongest first.
@@ -93,9 +102,33 @@ class SideLobes:
         if level <= _MARGIN * predicted:
             return True
         # Echoes of real surfaces are longer than the pulse.
-        means = amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
+        means = self._doubt * amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
         most = self._factor * math.hypot(*means)
         return level <= predicted + most and level <= predicted + self._factor * self._deviation(range_bin)
+
+    def _doubt_of(self, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> float:
+        """Return how far the pattern of side lobes is unknown, from 0 to 1, by the reflector whose pattern fits best.
+
+        Only the strongest maxima of ranges apart from each other are compared: one of them may have no other
+        reflector at its range.
+        """
+        ratios: list[float] = []
+        ranges_m: list[float] = []
+        for direction, range_bin in candidates:
+            range_m = float(self._image.range_m[range_bin])
+            if any(abs(range_m - other_m) < self._spread.reach_m for other_m in ranges_m):
+                continue
+            ranges_m.append(range_m)
+            amplitude = float(self._image.energy[direction, range_bin])
+            levels = amplitude * self._spread(self._sampled - directions[direction], np.zeros(len(self._samples)))
+            measured = self._image.energy[self._samples, range_bin]
+            deviation = np.quantile(np.abs(measured - levels), _QUARTILE) / _QUARTILE_OF_COMPONENT
+            mean = np.quantile(levels, _QUARTILE) / _QUARTILE_OF_MAGNITUDE
+            ratios.append(float(deviation / mean))
+            if len(ratios) == _N_COMPARED:
+                break
+        low, high = _TRUSTED
+        return min(1.0, max(0.0, (min(ratios, default=high) - low) / (high - low)))
 
     def _deviation(self, range_bin: int) -> float:
         """Return the standard deviation of the image from the prediction at a range."""
