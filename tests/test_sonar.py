@@ -454,6 +454,20 @@ def test_listening_stops_at_once(armed):
     timer.join()
 
 
+def test_a_stopped_dialogue_fails_and_can_be_repeated(device):
+    setup = Setup.of(SETTINGS)
+    with pytest.raises(SonarError):
+        Sonar.open(device.port, stop=lambda: True)
+    polls = itertools.count()
+    with Sonar.open(device.port) as sonar:
+        with pytest.raises(SonarError):
+            sonar.configure(setup, stop=lambda: next(polls) > 20)
+        assert sonar.call_hash() != call_hash(setup.codes)
+        sonar.configure(setup)
+        assert sonar.call_hash() == call_hash(setup.codes)
+        assert sonar.measure().words.shape == WORDS[0].shape
+
+
 def test_closing_ends_listening_and_disarms(armed, device):
     timer = threading.Timer(0.1, armed.close)
     timer.start()

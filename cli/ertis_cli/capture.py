@@ -4,7 +4,7 @@ import errno
 import re
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,7 +18,7 @@ from ertis_cli._signals import Signals, stopped_by_signals
 from ertis_cli._watch import Watch, report
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ertis_numba.capture import Session
     from ertis_numba.devices.bits import BitCheck
@@ -191,7 +191,9 @@ def capture(
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
         _wait_for(ports, wait_s, signals, quiet=quiet)
-        sonars = _named(ports, names, [stack.enter_context(Sonar.open(port, passive=listen_only)) for port in ports])
+        with _interruptible(signals) as asked:
+            opened = [stack.enter_context(Sonar.open(port, passive=listen_only, stop=asked)) for port in ports]
+        sonars = _named(ports, names, opened)
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
@@ -209,7 +211,8 @@ def capture(
             on_back=watch.back,
             on_tick=watch.tick,
         )
-        checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices)
+        with _interruptible(signals) as asked:
+            checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices, stop=asked)
         _note_mounting(mounting, list(sonars), quiet=quiet)
         signals.obey(session.stop)
         made.clear()
@@ -304,8 +307,27 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
                 time.sleep(_LOOK_S)
 
 
+@contextmanager
+def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
+    """Yield a function that returns True once a signal has arrived; a dialogue that fails then ends the command."""
+    from ertis_numba.errors import SonarError
+
+    try:
+        yield lambda: bool(signals.came)
+    except SonarError:
+        if signals.came:
+            signals.end()
+        raise
+
+
 def _configured(
-    sonars: "dict[str, Sonar]", setup: "Setup", settings: "Settings", *, check_bits: bool, splices: bool
+    sonars: "dict[str, Sonar]",
+    setup: "Setup",
+    settings: "Settings",
+    *,
+    check_bits: bool,
+    splices: bool,
+    stop: "Callable[[], bool]",
 ) -> "dict[str, BitCheck]":
     """Tell sensors how to measure, and return what looks at the words of each."""
     import numpy as np
@@ -322,7 +344,7 @@ def _configured(
             name: BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=splices) for name in sonars
         }
     for name, sonar in sonars.items():
-        sonar.configure(setup, bits=checks[name].check if check_bits else None)
+        sonar.configure(setup, bits=checks[name].check if check_bits else None, stop=stop)
     return checks
 
 

@@ -40,7 +40,9 @@ class Sonar:
         Such as ``1.2.3``; empty where the sensor was opened to listen only.
     """
 
-    def __init__(self, port: Port, *, timeout_s: float = 1.0, passive: bool = False) -> None:
+    def __init__(
+        self, port: Port, *, timeout_s: float = 1.0, passive: bool = False, stop: Callable[[], bool] = lambda: False
+    ) -> None:
         checks.instance("port", port, Port, "find_ports or resolve of ertis_numba.devices.ports returns")
         self.firmware = ""
         self._port = port
@@ -52,10 +54,13 @@ class Sonar:
         self._is_armed = False
         self._is_late = False  # a measurement was given up and may still come
         self._dropped = 0
-        self._line = self._opened(port, self._closing.is_set)
+        self._line = self._opened(port, lambda: self._closing.is_set() or stop())
+        self._line.stop = self._closing.is_set
 
     @classmethod
-    def open(cls, port: str, *, timeout_s: float = 1.0, passive: bool = False) -> Self:
+    def open(
+        cls, port: str, *, timeout_s: float = 1.0, passive: bool = False, stop: Callable[[], bool] = lambda: False
+    ) -> Self:
         """Open a sensor, end what an earlier program has left running, and ask for its firmware.
 
         Parameters
@@ -66,6 +71,8 @@ class Sonar:
             How long an answer may take.
         passive : bool
             Send nothing, ever: listen to a sensor that somebody else has set up.
+        stop : callable
+            Polled during the dialogue; once it returns True, opening fails.
 
         Raises
         ------
@@ -74,7 +81,7 @@ class Sonar:
             EBUSY, EACCES, ETIMEDOUT where nothing sensible is answered, or EINVAL where ``port`` is no serial port or
             several.
         """
-        return cls(resolve(port), timeout_s=timeout_s, passive=passive)
+        return cls(resolve(port), timeout_s=timeout_s, passive=passive, stop=stop)
 
     def __enter__(self) -> Self:
         return self
@@ -122,7 +129,12 @@ class Sonar:
         return self._line.ask(Command("L"))
 
     def configure(
-        self, setup: Setup, *, counter: int = 0, bits: Callable[[NDArray[np.uint32]], str | None] | None = None
+        self,
+        setup: Setup,
+        *,
+        counter: int = 0,
+        bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Tell the sensor all that it has to know; the trigger stays off.
 
@@ -136,11 +148,13 @@ class Sonar:
             Number of the next measurement.
         bits : callable, optional
             Says of words why they cannot be true, as `bits.BitCheck.check` does.
+        stop : callable
+            Polled during the dialogue; once it returns True, this fails.
 
         Raises
         ------
         SonarError
-            The sensor does not answer, or holds another call than it was sent.
+            The sensor does not answer, holds another call than it was sent, or ``stop`` returned True.
         """
         receiver = Receiver(
             setup.n_samples,
@@ -150,8 +164,13 @@ class Sonar:
         )
         self._configured, self._next = (setup, receiver), counter
         self._is_armed = self._is_late = False
-        if not self._passive:
+        if self._passive:
+            return
+        self._line.stop = lambda: self._closing.is_set() or stop()
+        try:
             self._line.tell(setup, counter=counter)
+        finally:
+            self._line.stop = self._closing.is_set
 
     def measure(self, *, active: bool | None = None) -> Block:
         """Measure now.
