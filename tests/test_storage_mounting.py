@@ -232,3 +232,29 @@ def test_processing_refuses_to_write_a_picture(tmp_path):
     assert "x.png is a picture" in done.stderr
     assert "'ertis plot'" in done.stderr
     assert not (tmp_path / "x.png").exists()
+
+
+def test_process_takes_mountings_that_the_recording_lacks(tmp_path):
+    both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
+    given = write_recording(tmp_path / "given.h5", both, mounting=PLACES)
+    unknown = write_recording(tmp_path / "rec.h5", both)
+    run("process", unknown, "-o", tmp_path / "img.h5", "--mounting", given)
+    run("process", unknown, "-o", f"{tmp_path / 'many'}/", "--mounting", given, "--workers", "1")
+    for path in (tmp_path / "img.h5", tmp_path / "many" / "rec.energy.h5"):
+        for sensor, place in PLACES.items():
+            for held, wanted in zip(place_of(path, sensor), place, strict=True):
+                np.testing.assert_allclose(held, wanted)
+    bare = CliRunner().invoke(cli, ["process", str(unknown), "-o", str(tmp_path / "b.h5"), "--mounting", str(unknown)])
+    assert bare.exit_code == 1
+    assert "does not hold the mounting of any sensor" in bare.stderr
+
+
+def test_process_makes_images_anew_for_another_mounting(tmp_path):
+    moved = {"left": ((0.2, 0.3, -0.2), TURNED), "right": PLACES["right"]}
+    both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
+    unknown = write_recording(tmp_path / "rec.h5", both)
+    folder = f"{tmp_path / 'many'}/"
+    for name, mounting in {"first": PLACES, "other": moved}.items():
+        given = write_recording(tmp_path / f"{name}.h5", both, mounting=mounting)
+        run("process", unknown, "-o", folder, "--mounting", given, "--workers", "1", "--force")
+        np.testing.assert_allclose(place_of(tmp_path / "many" / "rec.energy.h5", "left")[0], mounting["left"][0])

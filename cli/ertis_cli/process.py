@@ -108,6 +108,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     metavar="tcp://HOST:PORT",
     help="Let the workers of this dask scheduler process several recordings.",
 )
+@_mountings.mounting
 @options.force
 @options.quiet
 @options.as_json
@@ -136,6 +137,7 @@ def process(
     batch: int,
     workers: int | None,
     scheduler: str | None,
+    mounting: Path | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -183,6 +185,7 @@ def process(
         batch=batch,
         strict=strict,
         overwrite=force,
+        mounting=_mountings.mountings(mounting, None if sensor is None else [sensor]),
         explain=explain,
         verify=verify,
     )
@@ -220,7 +223,9 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
         with open_energyscapes(path, sensor=name) as images:
             if images.translation_m is None:
                 unknown.append(name)
-    _mountings.note_unknown(unknown, "images are in the frame of their sensor, as the file states", quiet=quiet)
+    _mountings.note_unknown(
+        unknown, "images are in the frame of their sensor; give --mounting FILE for that of the platform", quiet=quiet
+    )
 
 
 def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as_json: bool) -> dict[str, Any]:

@@ -218,7 +218,7 @@ class Campaign:
                 case.wanted[name] = self_contained(_absolute(self._options.settings(recorded)))
             case.measurements = told["measurements"]
             made = told["made"]
-            differs = "" if made is None else difference(made, case.wanted)
+            differs = "" if made is None else difference(made, case.wanted, self._options.mounting)
         except (ErtisError, OSError) as error:
             yield case.ended("failed", error=" ".join(str(error).split()))
             return

@@ -1,9 +1,11 @@
 """Whether an energyscape file that is there already is what would be made."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ertis_numba.campaign.orders import Mounting
 from ertis_numba.errors import DamagedError, ErtisError
 from ertis_numba.geometry import direction_grid, grid_count, self_contained
 from ertis_numba.settings import Accuracy, Settings
@@ -27,6 +29,13 @@ class _Made(EnergyscapeReader):
     @property
     def axes(self) -> str:
         return _digest(self.azimuth_rad.tobytes(), self.elevation_rad.tobytes())
+
+    @property
+    def mounting(self) -> list[list[float]] | None:
+        """Translation and rotation of the sensor; None if its mounting is unknown."""
+        if self.translation_m is None or self.rotation_xyzw is None:
+            return None
+        return [self.translation_m.tolist(), self.rotation_xyzw.tolist()]
 
     def require_whole(self) -> None:
         """Refuse images that are not what was written."""
@@ -71,7 +80,12 @@ def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[st
                 return {"differs": differs}, None
             made.require_whole()
             made_of = made.attributes.get("recording_sha256")
-            sensors[name] = {"settings": made.settings.to_toml(), "axes": made.axes, "measurements": len(made)}
+            sensors[name] = {
+                "settings": made.settings.to_toml(),
+                "axes": made.axes,
+                "measurements": len(made),
+                "mounting": made.mounting,
+            }
     return {"differs": "", "sensors": sensors}, made_of
 
 
@@ -87,8 +101,13 @@ def _differs(made: _Made, recording: RecordingReader, dtype: str) -> str:
     return ""
 
 
-def difference(made: dict[str, Any], wanted: dict[str, Settings]) -> str:
-    """Return why a file is not what these settings would make of its sensors; empty if it is."""
+def difference(
+    made: dict[str, Any], wanted: dict[str, Settings], mounting: Mapping[str, Mounting] | None = None
+) -> str:
+    """Return why a file is not what these settings would make of its sensors; empty if it is.
+
+    Only a ``mounting`` that is given is compared; that of the recording is in the file already.
+    """
     if made["differs"]:
         return str(made["differs"])
     if list(made["sensors"]) != list(wanted):
@@ -101,6 +120,8 @@ def difference(made: dict[str, Any], wanted: dict[str, Settings]) -> str:
             found = "" if _digest(grid.azimuth_rad.tobytes(), grid.elevation_rad.tobytes()) == held["axes"] else "grid"
         if found:
             return f"was made with other settings ({found} of sensor {name})"
+        if mounting and name in mounting and held["mounting"] != [list(each) for each in mounting[name]]:
+            return f"was made with another mounting of sensor {name}"
     return ""
 
 

@@ -110,7 +110,10 @@ def making(
             options.settings(recording.settings) if settings is None else settings[recording.sensor]
             for recording in recordings
         ]
-        writer = EnergyscapeWriter(target, recording=recordings, dtype=options.dtype, overwrite=options.overwrite)
+        mounting = {name: place for name, place in (options.mounting or {}).items() if name in sensors}
+        writer = EnergyscapeWriter(
+            target, recording=recordings, mounting=mounting, dtype=options.dtype, overwrite=options.overwrite
+        )
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
             SensorRun(pipeline, batch=options.batch, most_bytes=most_bytes)

@@ -1,6 +1,6 @@
 """The options of a campaign, and what a worker is told to do, as JSON can hold it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
@@ -9,6 +9,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["HOW", "MOST_BYTES", "Crew", "Do", "News", "Options", "Order"]
 
+Mounting = tuple[Sequence[float], Sequence[float]]
 MOST_BYTES: Final = 256e6
 """Of images that wait to be written, of all workers together."""
 
@@ -34,6 +35,8 @@ class Options:
     overwrite : bool
         Replace energyscape files that were made otherwise or are damaged. What is whole, and was made of the same
         recording by the same settings and versions, stays as it is in any case.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Mountings of sensors by name, in place of those in the recording.
     explain : bool
         Tell the plan of each sensor, its predicted error and time, as ``plan`` of what was made.
     verify : bool
@@ -49,6 +52,7 @@ class Options:
     batch: int = 8
     strict: bool = False
     overwrite: bool = False
+    mounting: Mapping[str, Mounting] | None = None
     explain: bool = False
     verify: bool = False
 
@@ -63,7 +67,7 @@ class Options:
         return self.strict or self.explain or self.verify
 
 
-HOW: Final = ("dtype", "batch", "strict", "overwrite", "explain", "verify")
+HOW: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
 """What an order has of `Options` as it is."""
 
 
