@@ -84,6 +84,12 @@ def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
     assert [peak.azimuth_deg for peak in find_peaks(both, min_level_db=-20)] == pytest.approx([12.0, -35.0], abs=1.5)
 
 
+def test_rounding_errors_of_one_bit_microphones_are_no_reflectors():
+    image = image_of([(10.0, 0.0, 1.2, 1e-9)])
+    assert len(find_peaks(image)) == 1
+    assert find_peaks(image, false_alarm=1e-3) == []
+
+
 def test_an_image_without_side_lobes_is_dark_but_for_main_lobes():
     image = image_of([(12.0, 20.0, 1.2, 1.0)], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4)
     dark = without_side_lobes(image)

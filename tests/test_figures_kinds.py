@@ -170,6 +170,12 @@ def test_pictures_say_what_they_show(kind):
     assert any("dB" in text for text in texts)
 
 
+def test_a_picture_without_echoes_says_so():
+    silent = solid()
+    assert "no echo above the noise" in dict(texts_of(figures.plot(silent, peaks=[])))
+    assert "no echo above the noise" not in dict(texts_of(figures.plot(silent)))
+
+
 @pytest.mark.parametrize("timestamp_ns", [0, 50_000_000, 5 * 10**9, 946_684_800 * 10**9 - 1])
 def test_clocks_that_were_not_set_are_no_time(timestamp_ns):
     """Simulations count from 0, and a board without a clock from 1970."""

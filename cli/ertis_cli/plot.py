@@ -174,7 +174,7 @@ def plot(
         options.print_json(report)
 
 
-def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak]", look: dict[str, Any]) -> "Figure":
+def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak] | None", look: dict[str, Any]) -> "Figure":
     from ertis_numba import figures
 
     draw: dict[str, Callable[..., Figure]]
@@ -182,10 +182,10 @@ def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak]", look: dict[str,
     return draw[kind](image, peaks=peaks, **look)
 
 
-def _reflectors(image: "Energyscape", top: int) -> "list[Peak]":
+def _reflectors(image: "Energyscape", top: int) -> "list[Peak] | None":
     from ertis_numba.stages.detect import find_peaks
 
-    return find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else []
+    return find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":

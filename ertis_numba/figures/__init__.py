@@ -288,4 +288,4 @@ def _canvas_of(image: Energyscape, dynamic_range_db: float, look: Look, peaks: S
 def _canvas(dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None = None) -> Canvas:
     checks.positive("dynamic_range_db", dynamic_range_db)
     marked = tuple(checks.items("peaks", peaks or (), Peak, "find_peaks returns"))
-    return Canvas(style_of(**look), dynamic_range_db, marked)
+    return Canvas(style_of(**look), dynamic_range_db, marked, is_searched=peaks is not None)

@@ -36,6 +36,7 @@ class Canvas:
     style: Style
     dynamic_range_db: float
     peaks: tuple[Peak, ...] = ()
+    is_searched: bool = False  # for peaks, which may be none
 
     def lay_out(
         self, heading: Heading, panels: Sequence[Callable[[float], float]], *, width_pt: float
@@ -113,7 +114,7 @@ class Canvas:
     def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB re strongest") -> Figure:
         """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
         style, em_pt = self.style, self.style.em_pt
-        height_pt = min(16 * em_pt, (0.45 if self.peaks else _SHARE_ALONE) * box.height)
+        height_pt = min(16 * em_pt, (0.45 if self._rows() else _SHARE_ALONE) * box.height)
         upright = height_pt >= _LABEL_EMS * em_pt and box.width < 30 * em_pt
         if upright:
             bar = Box(box.left + em_pt, box.bottom + box.height - height_pt - 2 * em_pt, 1.3 * em_pt, height_pt)
@@ -132,14 +133,14 @@ class Canvas:
         rows = self._rows()
         if len(rows) > fitting:
             rows = [*rows[: max(fitting - 1, 0)], f"and {len(rows) - max(fitting - 1, 1)} more"]
-        if rows and fitting > 1:
+        if rows and fitting >= min(2, len(rows)):
             page.text("\n".join(rows), box.left + (em_pt if upright else 0), top_pt, style.list_pt, font=MONOSPACE)
         return page.figure
 
     def _rows(self) -> list[str]:
         """Return the list of reflectors, its heading first."""
         if not self.peaks:
-            return []
+            return ["no echo above the noise"] if self.is_searched else []
         spatial = any(abs(peak.elevation_deg) >= 0.05 for peak in self.peaks)
         farthest_m = max(peak.range_m for peak in self.peaks)
         decimals = 2 if farthest_m >= 1 else 2 - math.floor(math.log10(max(farthest_m, 1e-4)))  # three digits of it

@@ -9,6 +9,7 @@ from ertis_numba.frames import Energyscape
 
 __all__ = ["noise_of", "threshold_of"]
 
+_ROUNDING = 10 ** (-140 / 20)  # of one-bit microphones: their least noise is 40 dB above, arithmetic 10 dB below
 _SAMPLE = 32_768  # bins from which the noise is estimated, to a hundredth
 _BLOCKS = 16  # of ranges, the noise of each of which is estimated
 _QUIET = 1 / 3  # quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest
@@ -32,7 +33,8 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
     """Return the amplitude that noise reaches anywhere in an image with a given probability; 0 if noise is unknown.
 
     A bin of noise with root mean square s exceeds t with the probability ``exp(-t²/s²)``. All bins are taken as
-    independent, which makes the threshold slightly too high.
+    independent, which makes the threshold slightly too high. For one-bit microphones, it is at least -140 dB of full
+    scale, because bits that never change leave only rounding errors.
 
     Parameters
     ----------
@@ -46,4 +48,5 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
         ``false_alarm`` is not between 0 and 1.
     """
     checks.between("false_alarm", false_alarm, 1e-12, 1.0)
-    return noise_of(image) * math.sqrt(math.log(max(1, image.energy.size) / false_alarm))
+    least = _ROUNDING if image.settings.recording.is_pdm else 0.0
+    return max(least, noise_of(image) * math.sqrt(math.log(max(1, image.energy.size) / false_alarm)))
