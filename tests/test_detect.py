@@ -84,6 +84,13 @@ def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
     assert [peak.azimuth_deg for peak in find_peaks(both, min_level_db=-20)] == pytest.approx([12.0, -35.0], abs=1.5)
 
 
+def test_weak_side_lobes_of_other_beamformers_raise_no_limit():
+    linear = image_of([(0.0, 0.0, 1.2, 1.0), (40.0, 0.0, 1.2, 0.6)], range_m=(1.05, 1.35))
+    settings = linear.settings.replace(processing=linear.settings.processing.replace(beamformer="coherence_factor"))
+    image = linear.replace(energy=linear.energy**2, settings=settings)
+    assert [round(peak.azimuth_deg) for peak in find_peaks(image, min_level_db=-12)] == [0, 40]
+
+
 def test_rounding_errors_of_one_bit_microphones_are_no_reflectors():
     image = image_of([(10.0, 0.0, 1.2, 1e-9)])
     assert len(find_peaks(image)) == 1

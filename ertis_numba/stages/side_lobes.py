@@ -22,16 +22,14 @@ _MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predic
 _FALSE_ALARM: Final = 0.01
 _N_DIRECTIONS: Final = 64  # in which prediction and image are compared
 _N_COMPARED: Final = 8  # reflectors by which the prediction is judged
-_TRUSTED: Final = (
-    0.25,
-    0.4,
-)  # deviations relative to the mean, up to which a pattern is known, and from which it is not
+# Deviations relative to the mean: up to the first a pattern is as predicted, from the second on it is unknown.
+_TRUSTED: Final = (0.25, 0.4)
 _N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
-# Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
-# main lobes of reflectors take less than a quarter of the directions.
+# Upper quartiles of the magnitude of a complex normal variable of power 1, and of one component. The main lobes of
+# reflectors take less than a quarter of the directions.
 _QUARTILE: Final = 0.75
 _QUARTILE_OF_MAGNITUDE: Final = math.sqrt(math.log(4))
-_QUARTILE_OF_COMPONENT: Final = 0.8134
+_QUARTILE_OF_COMPONENT: Final = 0.477
 
 
 class SideLobes:
@@ -122,9 +120,8 @@ class SideLobes:
             amplitude = float(self._image.energy[direction, range_bin])
             levels = amplitude * self._spread(self._sampled - directions[direction], np.zeros(len(self._samples)))
             measured = self._image.energy[self._samples, range_bin]
-            deviation = np.quantile(np.abs(measured - levels), _QUARTILE) / _QUARTILE_OF_COMPONENT
-            mean = np.quantile(levels, _QUARTILE) / _QUARTILE_OF_MAGNITUDE
-            ratios.append(float(deviation / mean))
+            mean = float(np.quantile(levels, _QUARTILE)) / _QUARTILE_OF_MAGNITUDE
+            ratios.append(_excess(measured, levels) / mean)
             if len(ratios) == _N_COMPARED:
                 break
         low, high = _TRUSTED
@@ -142,8 +139,7 @@ class SideLobes:
             levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
             predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
             measured = self._image.energy[self._samples, range_bin]
-            deviation = float(np.quantile(np.abs(measured - predicted), _QUARTILE))
-            self._deviations[range_bin] = deviation / _QUARTILE_OF_COMPONENT
+            self._deviations[range_bin] = _excess(measured, predicted)
         return self._deviations[range_bin]
 
     def _mean_around(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,6 +148,14 @@ class SideLobes:
         offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
         levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
         return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
+
+
+def _excess(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
+    """Return the standard deviation of amplitudes that exceed their prediction; 0 for images of adaptive beamformers.
+
+    Their side lobes are weaker than those of delay-and-sum, for which the prediction holds.
+    """
+    return max(0.0, float(np.quantile(measured - predicted, _QUARTILE))) / _QUARTILE_OF_COMPONENT
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
