@@ -99,7 +99,7 @@ def test_listed_weights_have_a_mean_of_1_whatever_their_scale(weights, scale):
     found = array_weights(weighted(settings, tuple(weights)))
     scaled = array_weights(weighted(settings, tuple(scale * weight for weight in weights)))
     assert found.mean() == pytest.approx(1.0)
-    np.testing.assert_allclose(found, scaled, rtol=1e-9)
+    np.testing.assert_allclose(found, scaled, rtol=1e-9, atol=1e-12)
     assert 1 - 1e-9 <= effective_count(found) <= 8 + 1e-9
 
 

@@ -26,7 +26,9 @@ def _short(monkeypatch):
 
 def test_images_of_a_cluster_are_measured_and_written(tmp_path):
     target = tmp_path / "page.md"
-    target.write_text("<!-- ertis bench network -->\nold\n<!-- /ertis bench network -->\n", "utf-8")
+    target.write_text(
+        "<!-- ertis bench network --only cluster -->\nold\n<!-- /ertis bench network --only cluster -->\n", "utf-8"
+    )
     options = ["--duration", "1", "--json", "--quiet", "--folder", str(tmp_path), "--update", str(target)]
     done = CliRunner().invoke(cli, ["bench", "network", "--only", "cluster", *options])
     assert done.exit_code == 0, (done.stderr, done.exception)

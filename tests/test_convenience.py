@@ -46,7 +46,7 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         (lambda _: ertis.Pipeline(7), "settings is of type int; give Settings"),
         (lambda _: ertis.Pipeline(None), "settings is of type NoneType; give Settings"),
         (lambda _: ertis.Pipeline("missing.toml"), "missing.toml"),
-        (lambda shown: ertis.find_peaks(shown.energy), "image is of type ndarray; give an Energyscape"),
+        (lambda shown: ertis.find_peaks(shown.energy), "image is of type ndarray; give Energyscape"),
         (lambda shown: ertis.find_peaks(shown, false_alarm=2), "false_alarm is 2"),
         (lambda shown: shown.replace(energy=shown.energy[:, 1:]), r"energy has shape \(91, \d+\); give shape"),
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),

@@ -25,11 +25,11 @@ _N_COMPARED: Final = 8  # reflectors by which the prediction is judged
 # Deviations relative to the mean: up to the first a pattern is as predicted, from the second on it is unknown.
 _TRUSTED: Final = (0.25, 0.4)
 _N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
-# Upper quartiles of the magnitude of a complex normal variable of power 1, and of one component. The main lobes of
-# reflectors take less than a quarter of the directions.
+# Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
+# main lobes of reflectors take less than a quarter of the directions.
 _QUARTILE: Final = 0.75
 _QUARTILE_OF_MAGNITUDE: Final = math.sqrt(math.log(4))
-_QUARTILE_OF_COMPONENT: Final = 0.477
+_QUARTILE_OF_COMPONENT: Final = 0.8134
 
 
 class SideLobes:
@@ -108,8 +108,10 @@ class SideLobes:
         """Return how far the pattern of side lobes is unknown, from 0 to 1, by the reflector whose pattern fits best.
 
         Only the strongest maxima of ranges apart from each other are compared: one of them may have no other
-        reflector at its range.
+        reflector at its range. Adaptive beamformers have weaker side lobes than predicted, so the limit stays.
         """
+        if self._image.settings.processing.beamformer != "delay_and_sum":
+            return 0.0
         ratios: list[float] = []
         ranges_m: list[float] = []
         for direction, range_bin in candidates:
@@ -120,8 +122,9 @@ class SideLobes:
             amplitude = float(self._image.energy[direction, range_bin])
             levels = amplitude * self._spread(self._sampled - directions[direction], np.zeros(len(self._samples)))
             measured = self._image.energy[self._samples, range_bin]
-            mean = float(np.quantile(levels, _QUARTILE)) / _QUARTILE_OF_MAGNITUDE
-            ratios.append(_excess(measured, levels) / mean)
+            deviation = np.quantile(np.abs(measured - levels), _QUARTILE) / _QUARTILE_OF_COMPONENT
+            mean = np.quantile(levels, _QUARTILE) / _QUARTILE_OF_MAGNITUDE
+            ratios.append(float(deviation / mean))
             if len(ratios) == _N_COMPARED:
                 break
         low, high = _TRUSTED
@@ -139,7 +142,8 @@ class SideLobes:
             levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
             predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
             measured = self._image.energy[self._samples, range_bin]
-            self._deviations[range_bin] = _excess(measured, predicted)
+            deviation = float(np.quantile(np.abs(measured - predicted), _QUARTILE))
+            self._deviations[range_bin] = deviation / _QUARTILE_OF_COMPONENT
         return self._deviations[range_bin]
 
     def _mean_around(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,14 +152,6 @@ class SideLobes:
         offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
         levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
         return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
-
-
-def _excess(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
-    """Return the standard deviation of amplitudes that exceed their prediction; 0 for images of adaptive beamformers.
-
-    Their side lobes are weaker than those of delay-and-sum, for which the prediction holds.
-    """
-    return max(0.0, float(np.quantile(measured - predicted, _QUARTILE))) / _QUARTILE_OF_COMPONENT
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -5,7 +5,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
@@ -47,7 +47,7 @@ class Measurements:
         log: TextIO | None,
     ) -> None:
         self._words = {True: words, False: words if passive is None else passive}
-        checks.instance("words", words, Sequence, "has the words of each measurement")
+        checks.instance("words", words, Sized, "has the words of each measurement")
         for given in self._words.values():
             checks.whole("number of measurements to emulate", len(given), 1)
             if given[0].dtype != np.uint32 or given[0].ndim != 1:

@@ -73,7 +73,7 @@ class Publisher:
         self._keys_note = ""
         self._reports_sent = self._reports_taken = 0
 
-    def start(self, stopping: Callable[[], bool]) -> None:
+    def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
         """Start the process, and wait until it listens or ``stopping`` returns True.
 
         Raises
