@@ -17,9 +17,10 @@ from ertis_numba import cluster
 from ertis_numba.campaign import Advanced, Begun, Campaign, Options, find, members
 from ertis_numba.campaign.orders import Order
 from ertis_numba.errors import NetworkError
-from ertis_numba.storage import write_recording
+from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
 from tests.files import noise
+from tests.test_call_match import CALL, REVERSED, heard
 
 LONG = 150
 PATIENCE_S = 60.0
@@ -67,6 +68,18 @@ def test_files_are_those_of_this_process(scheduler, runs, tmp_path, monkeypatch)
     assert [name for name in here if here[name] != there[name]] == []
     again = ended(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
     assert set(outcomes(again).values()) == {"there", "failed"}
+
+
+def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_path):
+    (tmp_path / "runs").mkdir()
+    for name, call in {"same": CALL, "other": REVERSED}.items():
+        write_recording(tmp_path / "runs" / f"{name}.h5", [heard(call)])
+    found = ended(list(Campaign(find([tmp_path / "runs"]), tmp_path / "out", scheduler=scheduler).run()))
+    (warning,) = found["other.h5"].made["warnings"]
+    assert not found["same.h5"].made["warnings"]
+    with open_energyscapes(tmp_path / "out" / "other.energy.h5") as images:
+        assert images.call_warning
+        assert images.call_warning in warning
 
 
 def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
