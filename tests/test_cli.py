@@ -343,36 +343,33 @@ def test_a_signal_in_a_callback_is_obeyed(number, code):
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_error_of_a_library_that_swallowed_a_signal_is_no_traceback(number, code):
-    program = (
-        "import click, ctypes, signal; from ertis_cli import _signals, main; _signals.obey_signals()\n"
-        "@click.command\n"
-        "def compile():\n"
-        f"    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal({number.value}))()\n"
-        "    raise RuntimeError('no compiled object yet')\n"
-        "main.COMMANDS['compile'] = ('__main__:compile', '')\n"
-        "main.cli.main(['compile'])\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (code, ""), done.stderr
-    assert done.stderr == ("ertis: error: interrupted\n" if number == signal.SIGINT else "")
+SWALLOWED = (
+    "import click, ctypes, signal; from ertis_cli import _signals, main; _signals.obey_signals()\n"
+    "@click.command\n"
+    "def compile():\n"
+    "    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal({}))()\n"
+    "    raise RuntimeError('no compiled object yet')\n"
+    "main.COMMANDS['compile'] = ('__main__:compile', '')\n"
+    "main.cli.main(['compile'])\n"
+)
+WHILE_IMPORTING = (
+    "import signal, sys\n"
+    "class Name:\n"
+    "    def __set_name__(self, *_): signal.raise_signal({})\n"
+    "class Loading:\n"
+    "    def find_spec(self, name, *_):\n"
+    "        if name == 'ertis_cli.main': type('Made', (), dict(name=Name()))\n"
+    "sys.meta_path.insert(0, Loading())\n"
+    "from ertis_cli.__main__ import main\n"
+    "main()\n"
+)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_that_an_import_turns_into_another_error_is_no_traceback(number, code):
-    program = (
-        "import signal, sys\n"
-        "class Name:\n"
-        f"    def __set_name__(self, *_): signal.raise_signal({number.value})\n"
-        "class Loading:\n"
-        "    def find_spec(self, name, *_):\n"
-        "        if name == 'ertis_cli.main': type('Made', (), {'name': Name()})\n"
-        "sys.meta_path.insert(0, Loading())\n"
-        "from ertis_cli.__main__ import main\n"
-        "main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("program", [SWALLOWED, WHILE_IMPORTING], ids=["swallowed by a library", "while importing"])
+def test_a_signal_that_becomes_another_error_is_no_traceback(program, number, code):
+    command = [sys.executable, "-c", program.format(number.value)]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (code, ""), done.stderr
     assert done.stderr == ("ertis: error: interrupted\n" if number == signal.SIGINT else "")
 

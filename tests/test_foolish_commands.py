@@ -100,7 +100,7 @@ simulate other.toml
 simulate scene.toml -o scene.toml
 simulate scene.toml -o s.h5 --count 0
 simulate scene.toml -o s.h5 --count 99999999999
-simulate scene.toml -o s.h5 --sensor nobody
+simulate scene.toml -o s.h5 --sensor unknown
 simulate scene.toml -o s.h5 --tolerance-db -3
 simulate scene.toml -o no/s.h5
 import odd.bin -o o.h5 --layout eRTIS_v3D1 --preset default_25_50

@@ -174,7 +174,7 @@ def run(
     """
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
-        signals.obey(node.stop)  # before anybody is told that it listens, and may want it to end
+        signals.obey(node.stop)  # before the central node reports that it listens
         stack.enter_context(node)
         if metrics is not None:
             stack.enter_context(metrics)

@@ -177,7 +177,6 @@ def capture(
     _network.require_duration(duration)
     from ertis_numba.atomic import check_target
     from ertis_numba.capture import Session
-    from ertis_numba.devices.sonar import Sonar
 
     if target is not None:
         check_target(target, overwrite=force)
@@ -191,9 +190,7 @@ def capture(
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
         _wait_for(ports, wait_s, signals, quiet=quiet)
-        with _interruptible(signals) as asked:
-            opened = [stack.enter_context(Sonar.open(port, passive=listen_only, stop=asked)) for port in ports]
-        sonars = _named(ports, names, opened)
+        sonars = _named(ports, names, _opened(ports, signals, stack, passive=listen_only))
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
@@ -211,8 +208,7 @@ def capture(
             on_back=watch.back,
             on_tick=watch.tick,
         )
-        with _interruptible(signals) as asked:
-            checks = _configured(sonars, setup, settings, check_bits=check_bits, splices=refuse_splices, stop=asked)
+        checks = _configured(sonars, setup, settings, signals, check_bits=check_bits, splices=refuse_splices)
         _note_mounting(mounting, list(sonars), quiet=quiet)
         signals.obey(session.stop)
         made.clear()
@@ -320,14 +316,21 @@ def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
         raise
 
 
+def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, passive: bool) -> "list[Sonar]":
+    from ertis_numba.devices.sonar import Sonar
+
+    with _interruptible(signals) as asked:
+        return [stack.enter_context(Sonar.open(port, passive=passive, stop=asked)) for port in ports]
+
+
 def _configured(
     sonars: "dict[str, Sonar]",
     setup: "Setup",
     settings: "Settings",
+    signals: Signals,
     *,
     check_bits: bool,
     splices: bool,
-    stop: "Callable[[], bool]",
 ) -> "dict[str, BitCheck]":
     """Tell sensors how to measure, and return what looks at the words of each."""
     import numpy as np
@@ -343,8 +346,9 @@ def _configured(
         checks = {
             name: BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=splices) for name in sonars
         }
-    for name, sonar in sonars.items():
-        sonar.configure(setup, bits=checks[name].check if check_bits else None, stop=stop)
+    with _interruptible(signals) as asked:
+        for name, sonar in sonars.items():
+            sonar.configure(setup, bits=checks[name].check if check_bits else None, stop=asked)
     return checks
 
 

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ertis_numba.campaign.orders import Mounting
 from ertis_numba.errors import DamagedError, ErtisError
 from ertis_numba.geometry import direction_grid, grid_count, self_contained
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
+from ertis_numba.storage.recording import Mounting
 from ertis_numba.storage.schema import software_versions
 
 __all__ = ["difference", "look_at"]

@@ -1,15 +1,15 @@
 """The options of a campaign, and what a worker is told to do, as JSON can hold it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 from ertis_numba import checks
 from ertis_numba.settings import Settings
+from ertis_numba.storage.recording import Mounting
 
 __all__ = ["HOW", "MOST_BYTES", "Crew", "Do", "News", "Options", "Order"]
 
-Mounting = tuple[Sequence[float], Sequence[float]]
 MOST_BYTES: Final = 256e6
 """Of images that wait to be written, of all workers together."""
 

@@ -122,9 +122,8 @@ class SideLobes:
             amplitude = float(self._image.energy[direction, range_bin])
             levels = amplitude * self._spread(self._sampled - directions[direction], np.zeros(len(self._samples)))
             measured = self._image.energy[self._samples, range_bin]
-            deviation = np.quantile(np.abs(measured - levels), _QUARTILE) / _QUARTILE_OF_COMPONENT
-            mean = np.quantile(levels, _QUARTILE) / _QUARTILE_OF_MAGNITUDE
-            ratios.append(float(deviation / mean))
+            mean = float(np.quantile(levels, _QUARTILE)) / _QUARTILE_OF_MAGNITUDE
+            ratios.append(_deviation_of(measured, levels) / mean)
             if len(ratios) == _N_COMPARED:
                 break
         low, high = _TRUSTED
@@ -142,8 +141,7 @@ class SideLobes:
             levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
             predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
             measured = self._image.energy[self._samples, range_bin]
-            deviation = float(np.quantile(np.abs(measured - predicted), _QUARTILE))
-            self._deviations[range_bin] = deviation / _QUARTILE_OF_COMPONENT
+            self._deviations[range_bin] = _deviation_of(measured, predicted)
         return self._deviations[range_bin]
 
     def _mean_around(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,6 +150,11 @@ class SideLobes:
         offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
         levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
         return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
+
+
+def _deviation_of(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
+    """Return the standard deviation of complex amplitudes, of which only magnitudes are known."""
+    return float(np.quantile(np.abs(measured - predicted), _QUARTILE)) / _QUARTILE_OF_COMPONENT
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:

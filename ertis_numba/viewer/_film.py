@@ -20,8 +20,9 @@ from ertis_numba.storage import (
     open_recording,
     sensor_names,
 )
+from ertis_numba.storage.recording import Mounting
 from ertis_numba.viewer._moments import UNTIMED_S, Moment, Track, moments_of
-from ertis_numba.viewer._shapes import Mounting, Pose, Taken
+from ertis_numba.viewer._shapes import Pose, Taken
 
 __all__ = ["Film", "Moment"]
 

@@ -10,8 +10,9 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
+from ertis_numba.storage.recording import Mounting
 from ertis_numba.viewer._moments import usual_s
-from ertis_numba.viewer._shapes import Mounting, Pose, Taken
+from ertis_numba.viewer._shapes import Pose, Taken
 
 if TYPE_CHECKING:
     from ertis_numba.network.messages import Product

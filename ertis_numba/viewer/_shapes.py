@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
-__all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Mounting", "Pose", "Sector", "Taken"]
+__all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Pose", "Sector", "Taken"]
 
 _OVERDUE_S: Final = 1.0  # at least, as images come in bursts where a network or a computer is busy
 _UNKNOWN_S: Final = 10.0  # without an image, where a single one has come and nobody knows when the next is due
@@ -19,8 +19,6 @@ _OVERDUE: Final = 3.0  # intervals without an image, after which a sensor is ove
 
 
 _Numbers = Sequence[float] | NDArray[np.float64]
-Mounting = tuple[_Numbers, _Numbers]
-"""Translation in metres, and rotation as a unit quaternion (x, y, z, w), of a sensor on its platform."""
 
 
 @dataclass(frozen=True, slots=True)

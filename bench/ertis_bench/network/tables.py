@@ -101,14 +101,14 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
     "hellos": (
         "{hellos:,} hostile hellos: sizes, names, lines, depth, numbers",
         "refused within 1 s, memory + < 200 MB; acks of others < 200 ms",
-        "taken: {taken all}; slowest refusal {slowest refusal, s:.2f} s, memory + {memory grew, MB:.0f} MB; slowest "
+        "accepted: {taken all}; slowest refusal {slowest refusal, s:.2f} s, memory + {memory grew, MB:.0f} MB; slowest "
         "ack {slowest ack, ms:.0f} ms, {slowest ack alone, ms:.0f} ms before; of the real sensor " + _STORED,
     ),
     "files": (
         "{files:,} hostile files read by `ertis verify`, `info` and `process`",
         "refused within 1 s, memory + < 200 MB",
         (
-            "{reads:,} reads: taken: {taken all}; crashed: {crashes all}; with a traceback: {failed all}; slowest "
+            "{reads:,} reads; accepted: {taken all}; crashes: {crashes all}; tracebacks: {failed all}; slowest "
             "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of a processor), memory + {memory grew, MB:.0f} MB"
         ),
     ),
@@ -177,7 +177,7 @@ def _all(found: Any) -> str:
     """Return counts by reason, or names, as a list in words."""
     if isinstance(found, Mapping):
         return ", ".join(f"{count:,} {reason}" for reason, count in sorted(found.items())) or "0"
-    return ", ".join(found or ()) or "nobody"
+    return ", ".join(found or ()) or "none"
 
 
 def network(report: dict[str, Any]) -> str:
