@@ -46,6 +46,7 @@ check: $(VENV)/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(PYTEST) -q tests/test_plain_english.py
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 docs: $(VENV)/ready-to-test  ## the guide as a site: open site/index.html

@@ -23,26 +23,31 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ertis_numba.analysis.cfar import cfar_peaks
+    from ertis_numba.analysis.compare import compare
+    from ertis_numba.analysis.detect import find_peaks
+    from ertis_numba.analysis.health import health
+    from ertis_numba.analysis.points import PointExtractor
     from ertis_numba.devices.emulator import Emulator
     from ertis_numba.devices.setup import Setup
-    from ertis_numba.devices.sonar import Sonar
+    from ertis_numba.devices.sonar import SonarDriver
     from ertis_numba.errors import (
         ArgumentError,
         CallMismatchWarning,
         DamagedError,
         DataError,
         DeviceError,
+        DiskFullError,
         ErrorBudgetWarning,
         ErtisError,
         ForeignDataError,
         FormatVersionError,
-        InUseError,
+        JournalInUseError,
         NetworkError,
-        NoRoomError,
         RefusedError,
         SettingsError,
+        SonarDisconnectedError,
         SonarError,
-        SonarGoneError,
     )
     from ertis_numba.figures import plot
     from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
@@ -57,11 +62,6 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
     from ertis_numba.simulation.render import Simulator, render
     from ertis_numba.simulation.scene import Scene, load_scene
-    from ertis_numba.stages.cfar import cfar_peaks
-    from ertis_numba.stages.compare import compare
-    from ertis_numba.stages.detect import find_peaks
-    from ertis_numba.stages.health import health
-    from ertis_numba.stages.points import PointExtractor
     from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 
     __version__: str
@@ -74,6 +74,7 @@ __all__ = [
     "DamagedError",
     "DataError",
     "DeviceError",
+    "DiskFullError",
     "Emulator",
     "Energyscape",
     "Entry",
@@ -81,11 +82,10 @@ __all__ = [
     "ErtisError",
     "ForeignDataError",
     "FormatVersionError",
-    "InUseError",
+    "JournalInUseError",
     "KeyPair",
     "Measurement",
     "NetworkError",
-    "NoRoomError",
     "Peak",
     "Permission",
     "Pipeline",
@@ -100,9 +100,9 @@ __all__ = [
     "SettingsError",
     "Setup",
     "Simulator",
-    "Sonar",
+    "SonarDisconnectedError",
+    "SonarDriver",
     "SonarError",
-    "SonarGoneError",
     "Stamp",
     "Subscriber",
     "cfar_peaks",
@@ -126,7 +126,7 @@ __all__ = [
 _HOMES = {
     "devices.emulator": ("Emulator",),
     "devices.setup": ("Setup",),
-    "devices.sonar": ("Sonar",),
+    "devices.sonar": ("SonarDriver",),
     "errors": (
         "ArgumentError",
         "CallMismatchWarning",
@@ -137,13 +137,13 @@ _HOMES = {
         "ErtisError",
         "ForeignDataError",
         "FormatVersionError",
-        "InUseError",
+        "JournalInUseError",
         "NetworkError",
-        "NoRoomError",
+        "DiskFullError",
         "RefusedError",
         "SettingsError",
         "SonarError",
-        "SonarGoneError",
+        "SonarDisconnectedError",
     ),
     "figures": ("plot",),
     "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
@@ -158,11 +158,11 @@ _HOMES = {
     "settings": ("Settings",),
     "simulation.render": ("Simulator", "render"),
     "simulation.scene": ("Scene", "load_scene"),
-    "stages.cfar": ("cfar_peaks",),
-    "stages.compare": ("compare",),
-    "stages.detect": ("find_peaks",),
-    "stages.health": ("health",),
-    "stages.points": ("PointExtractor",),
+    "analysis.cfar": ("cfar_peaks",),
+    "analysis.compare": ("compare",),
+    "analysis.detect": ("find_peaks",),
+    "analysis.health": ("health",),
+    "analysis.points": ("PointExtractor",),
     "storage": ("open_energyscapes", "open_recording", "write_energyscapes", "write_recording"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

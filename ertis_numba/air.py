@@ -37,7 +37,7 @@ def sound_speed_m_s(air: Air) -> float:
     float
     """
     kelvin = _ZERO_C_K + air.temperature_c
-    vapour = _vapour(air)
+    vapour = _water_vapour_fraction(air)
     molar_mass = (1 - vapour) * _DRY_AIR_KG_MOL + vapour * _WATER_KG_MOL
     # 1 / (γ − 1) is the heat capacity over R, which adds up over the parts of the mixture.
     capacity = (1 - vapour) / (_DRY_HEAT_RATIO - 1) + vapour / (_VAPOUR_HEAT_RATIO - 1)
@@ -62,7 +62,7 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
     kelvin = _ZERO_C_K + air.temperature_c
     pressure = air.pressure_pa / _REFERENCE_PRESSURE_PA
     warmth = kelvin / _REFERENCE_K
-    vapour_percent = 100 * _vapour(air)
+    vapour_percent = 100 * _water_vapour_fraction(air)
     oxygen_hz = pressure * (24 + 4.04e4 * vapour_percent * (0.02 + vapour_percent) / (0.391 + vapour_percent))
     nitrogen_hz = (
         pressure / math.sqrt(warmth) * (9 + 280 * vapour_percent * math.exp(-4.170 * (warmth ** (-1 / 3) - 1)))
@@ -73,7 +73,7 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
     return np.asarray(_DB_PER_NEPER * frequency_hz**2 * (classical + warmth**-2.5 * (oxygen + nitrogen)))
 
 
-def _vapour(air: Air) -> float:
+def _water_vapour_fraction(air: Air) -> float:
     """Return the molar share of water vapour."""
     kelvin = _ZERO_C_K + air.temperature_c
     saturation: float = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)

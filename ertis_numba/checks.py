@@ -16,19 +16,19 @@ __all__ = [
     "choice",
     "finite",
     "finite_array",
-    "gap",
     "instance",
+    "integer",
     "interval",
     "items",
     "length",
     "positive",
     "sensor_name",
+    "sequence_gap",
     "shape",
-    "whole",
 ]
 
-_Item = TypeVar("_Item")
-_REASON_BYTES = 64
+_ItemType = TypeVar("_ItemType")
+_MAX_REASON_BYTES = 64
 _SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 
 
@@ -66,7 +66,7 @@ def interval(name: str, value: tuple[float, float], low: float, high: float) -> 
         raise ArgumentError(f"{name} runs from {first:g} to {last:g}; give the smaller number first")
 
 
-def whole(name: str, value: int, low: int, high: int | None = None) -> int:
+def integer(name: str, value: int, low: int, high: int | None = None) -> int:
     """Return ``value`` if it is a whole number in ``[low, high]``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ArgumentError(f"{name} is {value!r}; give a whole number")
@@ -76,10 +76,10 @@ def whole(name: str, value: int, low: int, high: int | None = None) -> int:
     return int(value)
 
 
-def length(name: str, value: str, most: int) -> None:
-    """Refuse a text of more than ``most`` characters."""
-    if len(value) > most:
-        raise ArgumentError(f"{name} has {len(value)} characters; the limit is {most}")
+def length(name: str, value: str, largest: int) -> None:
+    """Refuse a text of more than ``largest`` characters."""
+    if len(value) > largest:
+        raise ArgumentError(f"{name} has {len(value)} characters; the limit is {largest}")
 
 
 def choice(name: str, value: object, known: Iterable[object]) -> None:
@@ -112,7 +112,7 @@ def instance(name: str, value: object, wanted: type, source: str) -> None:
         raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")
 
 
-def items(name: str, values: Iterable[_Item], wanted: type, source: str) -> Iterator[_Item]:
+def items(name: str, values: Iterable[_ItemType], wanted: type, source: str) -> Iterator[_ItemType]:
     """Yield values that are all of one type; refuse a single one, and what cannot be iterated."""
     if not isinstance(values, Iterable):
         raise ArgumentError(f"{name} is of type {type(values).__name__}; give a list of {wanted.__name__}")
@@ -131,8 +131,8 @@ def sensor_name(name: str) -> str:
     return name
 
 
-def gap(first: int, last: int, reason: str) -> None:
+def sequence_gap(first: int, last: int, reason: str) -> None:
     """Refuse sequence numbers from ``first`` to ``last`` that a file cannot say to be missing for this reason."""
-    whole("last missing sequence number", last, whole("first missing sequence number", first, 0), 2**63 - 1)
-    if not reason or not reason.isprintable() or len(reason.encode()) > _REASON_BYTES:
-        raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_REASON_BYTES} bytes")
+    integer("last missing sequence number", last, integer("first missing sequence number", first, 0), 2**63 - 1)
+    if not reason or not reason.isprintable() or len(reason.encode()) > _MAX_REASON_BYTES:
+        raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_MAX_REASON_BYTES} bytes")

@@ -11,9 +11,20 @@ from typing import Any, Final
 from ertis_numba.errors import DeviceError, NetworkError
 from ertis_numba.extras import extra
 
-__all__ = ["Client", "Future", "Line", "Lines", "Raised", "connect", "local", "require_workers", "silence", "worker"]
+__all__ = [
+    "Client",
+    "Future",
+    "RemoteError",
+    "WorkerActor",
+    "WorkerActors",
+    "connect",
+    "current_worker",
+    "local_cluster",
+    "require_workers",
+    "silence_loggers",
+]
 
-_LATER_S: Final = 0.5  # than dask itself gives up, which then knows why
+_TIMEOUT_MARGIN_S: Final = 0.5  # than dask itself gives up, which then knows why
 
 # Its own annotations are partial.
 Client = Any
@@ -21,24 +32,24 @@ Future = Any
 
 
 @dataclass(frozen=True, slots=True)
-class Raised:
-    """What a function that was called at the other end of a `Line` has raised, in a line."""
+class RemoteError:
+    """What a function that was called at the other end of a `WorkerActor` has raised, in a line."""
 
     text: str
 
 
-class Line:
+class WorkerActor:
     """The end of a line that is in a worker: an actor of dask, called by its owner without the scheduler in between.
 
     A task costs a scheduler's decision and two of its batches each way, and its arguments are serialised twice more.
     """
 
     async def call(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return what a function returns, which is called in a thread of its own, or what it has `Raised`."""
+        """Return what a function returns, which is called in a thread of its own, or what it has `RemoteError`."""
         try:
             return await asyncio.to_thread(function, *arguments, **options)
         except Exception as error:  # noqa: BLE001  what is raised here is then trouble of the line itself
-            return Raised(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+            return RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
 def connect(address: str, *, timeout_s: float) -> Client:
@@ -60,7 +71,7 @@ def connect(address: str, *, timeout_s: float) -> Client:
         async def _start(self, *arguments: Any, **options: Any) -> Any:
             start: Any = super()._start
             try:
-                return await asyncio.wait_for(start(*arguments, **options), timeout_s + _LATER_S)
+                return await asyncio.wait_for(start(*arguments, **options), timeout_s + _TIMEOUT_MARGIN_S)
             except BaseException:
                 await self._close()  # it would wait for an answer until the process ends, and complain
                 raise
@@ -69,14 +80,14 @@ def connect(address: str, *, timeout_s: float) -> Client:
         make: Any = Client
         return make(address, timeout=timeout_s, set_as_default=False, name="ertis")
     except (OSError, ValueError, TimeoutError) as error:
-        told = " ".join(str(error).split())[:200] or f"what is there says nothing in {timeout_s:g} s"
+        reported = " ".join(str(error).split())[:200] or f"what is there says nothing in {timeout_s:g} s"
         raise NetworkError(
-            f"no dask scheduler answers at {address} ({told}); give the address that 'dask scheduler' has printed"
+            f"no dask scheduler answers at {address} ({reported}); give the address that 'dask scheduler' has printed"
         ) from error
 
 
 @contextmanager
-def silence() -> Iterator[None]:
+def silence_loggers() -> Iterator[None]:
     """Keep dask from printing, on its own account, what is told otherwise, until the block ends."""
     import distributed  # noqa: PLC0415, F401  its loggers are made, each with a level, when it is loaded
 
@@ -108,7 +119,7 @@ def require_workers(client: Client, address: str, *, timeout_s: float) -> None:
         ) from error
 
 
-class Lines:
+class WorkerActors:
     """Lines to the workers of a scheduler; each ends with the client, or when it is let go of.
 
     Parameters
@@ -120,10 +131,10 @@ class Lines:
     def __init__(self, client: Client) -> None:
         client.direct_to_workers = True
         self._client = client
-        self._asked: dict[str, tuple[Future, Future]] = {}
+        self._pending: dict[str, tuple[Future, Future]] = {}
 
-    def reached(self, addresses: Collection[str], *, timeout_s: float) -> dict[str, tuple[Any, int]]:
-        """Return a new `Line` to each worker that is reached by now, and the number of its process.
+    def connected(self, addresses: Collection[str], *, timeout_s: float) -> dict[str, tuple[Any, int]]:
+        """Return a new `WorkerActor` to each worker that is reached by now, and the number of its process.
 
         Of the others those that are asked for the next time, too, go on being waited for: one that is dead, which the
         scheduler may not know yet, holds up the rest for no longer than the timeout.
@@ -132,26 +143,26 @@ class Lines:
 
         wait: Any = distributed.wait
         with self._client.as_current():  # whose they are
-            self._asked = {address: self._asked.get(address) or self._ask(address) for address in addresses}
+            self._pending = {address: self._pending.get(address) or self._submit(address) for address in addresses}
             with suppress(TimeoutError):
-                wait([future for futures in self._asked.values() for future in futures], timeout=timeout_s)
-            ended = {address: self._asked.pop(address) for address in addresses if self._has_ended(address)}
-            good = {address: futures for address, futures in ended.items() if _are_good(futures)}
+                wait([future for futures in self._pending.values() for future in futures], timeout=timeout_s)
+            ended = {address: self._pending.pop(address) for address in addresses if self._has_ended(address)}
+            good = {address: futures for address, futures in ended.items() if _all_finished(futures)}
             return {name: (line.result(timeout_s), int(pid.result(timeout_s))) for name, (line, pid) in good.items()}
 
-    def _ask(self, address: str) -> tuple[Future, Future]:
+    def _submit(self, address: str) -> tuple[Future, Future]:
         there: dict[str, Any] = {"workers": [address], "allow_other_workers": False, "pure": False}
-        return self._client.submit(Line, actor=True, **there), self._client.submit(os.getpid, **there)
+        return self._client.submit(WorkerActor, actor=True, **there), self._client.submit(os.getpid, **there)
 
     def _has_ended(self, address: str) -> bool:
-        return all(future.done() for future in self._asked[address])
+        return all(future.done() for future in self._pending[address])
 
 
-def _are_good(futures: tuple[Future, ...]) -> bool:
+def _all_finished(futures: tuple[Future, ...]) -> bool:
     return all(future.status == "finished" for future in futures)
 
 
-def worker() -> Any:
+def current_worker() -> Any:
     """Return the worker that runs this task."""
     from distributed import get_worker  # noqa: PLC0415  there is one where this runs
 
@@ -159,7 +170,7 @@ def worker() -> Any:
 
 
 @contextmanager
-def local(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
+def local_cluster(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
     """Yield the address of a scheduler with workers on this machine, which end with the block.
 
     Raises

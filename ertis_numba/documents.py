@@ -19,7 +19,7 @@ import tomli_w
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, SettingsError
 
-__all__ = ["MAX_KEY_PARTS", "Document", "Table"]
+__all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
 _KEY = re.compile(r"\s*([\w.-]+)\s*=")
@@ -28,9 +28,9 @@ MAX_KEY_PARTS: Final = 16
 
 _NAME = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_NAME}(?:[ \t]*+\.[ \t]*+{_NAME}){{{MAX_KEY_PARTS}}}")
-_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
+_PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
-_WANTED = {
+_TYPE_NAMES = {
     "array": "a list",
     "bool": "true or false",
     "float": "a number",
@@ -41,7 +41,7 @@ _WANTED = {
 """What msgspec calls types, in words."""
 
 
-class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table of a TOML file.
 
     Lists may stand for tuples, whole numbers for numbers, those and arrays of NumPy for Python's own, and paths for
@@ -50,13 +50,13 @@ class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def __post_init__(self) -> None:
         try:
-            typed = msgspec.convert(self, _plain_twin(type(self)), from_attributes=True)
+            typed = msgspec.convert(self, _type_checking_struct(type(self)), from_attributes=True)
         except msgspec.ValidationError:
-            given = {name: _plain(getattr(self, name)) for name in self.__struct_fields__}
+            given = {name: _to_builtin(getattr(self, name)) for name in self.__struct_fields__}
             try:
-                typed = msgspec.convert(given, _plain_twin(type(self)))
+                typed = msgspec.convert(given, _type_checking_struct(type(self)))
             except msgspec.ValidationError as error:
-                raise ArgumentError(_told_of_type(self, given, str(error))) from None
+                raise ArgumentError(_type_error(self, given, str(error))) from None
         for name in self.__struct_fields__:
             msgspec.structs.force_setattr(self, name, getattr(typed, name))
 
@@ -79,7 +79,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return msgspec.structs.replace(self, **changes)
 
 
-class Document(Table, frozen=True, kw_only=True):
+class TomlDocument(TomlTable, frozen=True, kw_only=True):
     """A whole TOML file.
 
     Attributes
@@ -118,10 +118,10 @@ class Document(Table, frozen=True, kw_only=True):
         try:
             return msgspec.toml.decode(text, type=cls)
         except msgspec.ValidationError as error:
-            line = _line_to_blame(cls, text, error) if find_line else 0
-            raise SettingsError(_told(cls, source, error, f", line {line}" if line else "")) from error
+            line = _line_of_error(cls, text, error) if find_line else 0
+            raise SettingsError(_document_error(cls, source, error, f", line {line}" if line else "")) from error
         except msgspec.DecodeError as error:  # a syntax error, which names its line itself
-            raise SettingsError(_told(cls, source, error)) from error
+            raise SettingsError(_document_error(cls, source, error)) from error
         except RecursionError as error:
             raise SettingsError(
                 f"{source or cls.label()}: lists or tables are nested too deeply; flatten them"
@@ -180,7 +180,7 @@ class Document(Table, frozen=True, kw_only=True):
 
 
 @cache
-def _plain_twin(kind: type[Table]) -> type[msgspec.Struct]:
+def _type_checking_struct(kind: type[TomlTable]) -> type[msgspec.Struct]:
     """Return a structure of the same fields that checks their types only; choices are left to their own check."""
     fields = [
         (field.name, str if get_origin(field.type) is Literal else field.type) for field in msgspec.structs.fields(kind)
@@ -188,40 +188,40 @@ def _plain_twin(kind: type[Table]) -> type[msgspec.Struct]:
     return msgspec.defstruct(kind.__name__, fields, kw_only=True)
 
 
-def _plain(value: Any) -> Any:
+def _to_builtin(value: Any) -> Any:
     """Return what is of NumPy, such as a position that was computed, or a path, as Python's own."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _to_builtin(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_to_builtin(item) for item in value]
     if hasattr(value, "tolist"):
         return value.tolist()
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def _told_of_type(table: Table, given: dict[str, Any], error: str) -> str:
+def _type_error(table: TomlTable, given: dict[str, Any], error: str) -> str:
     """Return an error of types in the words of this package: the key, what came, what was wanted."""
     reason, _, path = error.partition(" - at `$")
     expected = _EXPECTED.match(reason)
     if expected is None and reason != "Number out of range":  # a table's own, given as a dictionary
         return reason
     value: Any = given
-    for name, place in _PART.findall(path):
+    for name, place in _PATH_PART.findall(path):
         value = value[name or int(place)]
     key = f"{table.label()}{path.rstrip('`')}"
     if expected is None:
         return f"{key} is beyond all numbers; give a finite number"
     if expected[2]:
         return f"{key} has shape ({expected[3]},); give shape ({expected[2]},)"
-    field = next(field for field in msgspec.structs.fields(table) if field.name == _PART.findall(path)[0][0])
+    field = next(field for field in msgspec.structs.fields(table) if field.name == _PATH_PART.findall(path)[0][0])
     tables = " or ".join(f"{kind.__name__}(...)" for kind in _tables(field.type))
-    wanted = [_WANTED.get(name, tables) for name in expected[1].split(" | ")]
+    wanted = [_TYPE_NAMES.get(name, tables) for name in expected[1].split(" | ")]
     return f"{key} is {' '.join(reprlib.repr(value).split())}; give {' or '.join(wanted)}"
 
 
-def _tables(kind: Any) -> Iterator[type[Table]]:
+def _tables(kind: Any) -> Iterator[type[TomlTable]]:
     """Yield the tables that a field may hold."""
-    if isinstance(kind, type) and issubclass(kind, Table):
+    if isinstance(kind, type) and issubclass(kind, TomlTable):
         yield kind
     for part in get_args(kind):
         yield from _tables(part)
@@ -236,7 +236,7 @@ def _without_none(value: Any) -> Any:
     return value
 
 
-def _told(kind: type[Document], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
+def _document_error(kind: type[TomlDocument], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
     """Return an error in the words of this package: where, what came, the remedy."""
     reason, _, path = str(error).partition(" - at `$")
     path = f", {path.strip('.`')}" if path.strip(".`") else ""
@@ -247,7 +247,7 @@ def _told(kind: type[Document], source: str | None, error: msgspec.MsgspecError,
     return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
 
 
-def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationError) -> int:
+def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.ValidationError) -> int:
     """Return the number of the line that an error is about, counted from 1.
 
     That is the line in the erring table whose key the error names, or the first line of the table; 0 if there is none.
@@ -258,14 +258,14 @@ def _line_to_blame(kind: type[Document], text: str, error: msgspec.ValidationErr
     # Tables are read one after the other, and what errs once keeps erring: the first one is found by halves.
     table = bisect.bisect_left(stops[:-1], x=True, key=lambda stop: _error(kind, lines[: stop - 1]) == str(error))
     begin, stop = starts[table], stops[table]
-    told, _, path = str(error).partition(" - at `$")
-    named = {*re.findall(r"\w+", told.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
+    reported, _, path = str(error).partition(" - at `$")
+    named = {*re.findall(r"\w+", reported.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
     keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
     is_table = bool(lines and _HEADER.match(lines[begin - 1]))
     return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else 0)
 
 
-def _error(kind: type[Document], lines: list[str]) -> str:
+def _error(kind: type[TomlDocument], lines: list[str]) -> str:
     try:
         msgspec.toml.decode("\n".join(lines), type=kind)
     except msgspec.DecodeError as error:

@@ -28,17 +28,17 @@ __all__ = [
     "DamagedError",
     "DataError",
     "DeviceError",
+    "DiskFullError",
     "ErrorBudgetWarning",
     "ErtisError",
     "ForeignDataError",
     "FormatVersionError",
-    "InUseError",
+    "JournalInUseError",
     "NetworkError",
-    "NoRoomError",
     "RefusedError",
     "SettingsError",
+    "SonarDisconnectedError",
     "SonarError",
-    "SonarGoneError",
 ]
 
 
@@ -70,11 +70,11 @@ class FormatVersionError(DataError):
     """A file was written by a newer version of this package."""
 
 
-class InUseError(DataError):
+class JournalInUseError(DataError):
     """A journal belongs to another process: a capture that runs, or what seals it."""
 
 
-class NoRoomError(DataError):
+class DiskFullError(DataError):
     """The disk has no room for the data; nothing was written."""
 
 
@@ -86,7 +86,7 @@ class SonarError(ErtisError, OSError):
     """A sensor cannot be opened, or does not answer as it should."""
 
 
-class SonarGoneError(SonarError):
+class SonarDisconnectedError(SonarError):
     """A sensor was unplugged."""
 
 

@@ -14,7 +14,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"]
 
-_SET_NS: Final = 946_684_800 * 10**9  # the year 2000: nobody has recorded before
+_MIN_CLOCK_NS: Final = 946_684_800 * 10**9  # the year 2000: nobody has recorded before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +27,7 @@ class Stamp:
         Serial number or name of the sensor.
     sequence : int
         Number given at capture; a gap is a loss.
-    epoch : int
+    session_id : int
         Number of the run of the sensor that gave the sequence numbers: (sensor, epoch, sequence) is unique.
     sync_count : int
         Pulse of the SYNC chain; equal for all sensors that emitted together.
@@ -41,12 +41,12 @@ class Stamp:
     sync_count: int = 0
     timestamp_ns: int = 0
     timestamp_uncertainty_ns: int = 0
-    epoch: int = 0
+    session_id: int = 0
 
     @property
     def is_timed(self) -> bool:
         """Whether its clock was that of the world: one that was never set, or is simulated, begins at 1970."""
-        return self.timestamp_ns >= _SET_NS
+        return self.timestamp_ns >= _MIN_CLOCK_NS
 
     @property
     def iso(self) -> str | None:
@@ -77,12 +77,12 @@ class Measurement:
     stamp : Stamp
     """
 
-    words: NDArray[Any]
+    data: NDArray[Any]
     settings: Settings
     stamp: Stamp = Stamp()
 
     def __post_init__(self) -> None:
-        checks.instance("words", self.words, np.ndarray, "a recording holds, or numpy.asarray makes")
+        checks.instance("data", self.data, np.ndarray, "a recording holds, or numpy.asarray makes")
         checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
 
 
@@ -92,7 +92,7 @@ class Energyscape:
 
     Attributes
     ----------
-    energy : (direction, range) float32
+    amplitude : (direction, range) float32
         Envelope amplitude; 1 is a full-scale echo of the whole call in every microphone.
     azimuth_rad, elevation_rad : (direction,) float64
         Sensor frame: x forward, azimuth towards y, elevation towards z.
@@ -102,7 +102,7 @@ class Energyscape:
     stamp : Stamp
     """
 
-    energy: NDArray[np.float32]
+    amplitude: NDArray[np.float32]
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
     range_m: NDArray[np.float64]
@@ -110,15 +110,15 @@ class Energyscape:
     stamp: Stamp = Stamp()
 
     def __post_init__(self) -> None:
-        for name in ("energy", "azimuth_rad", "elevation_rad", "range_m"):
+        for name in ("amplitude", "azimuth_rad", "elevation_rad", "range_m"):
             checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
         checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
         checks.shape("elevation_rad", self.elevation_rad.shape, self.azimuth_rad.shape)
-        checks.shape("energy", self.energy.shape, (*self.azimuth_rad.shape, *self.range_m.shape))
+        checks.shape("amplitude", self.amplitude.shape, (*self.azimuth_rad.shape, *self.range_m.shape))
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:  # noqa: FBT001  NumPy's
         """Return the energies for NumPy functions: (direction, range)."""
-        return np.array(self.energy, dtype=dtype, copy=copy)
+        return np.array(self.amplitude, dtype=dtype, copy=copy)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed.
@@ -145,7 +145,7 @@ class PointCloud:
     ----------
     position_m : (point, axis) float32
         Sensor frame: x forward, y left, z up, in metres and right-handed, as REP-103 has it; the strongest point first.
-    energy : (point,) float32
+    amplitude : (point,) float32
         Envelope amplitude, as in `Energyscape`.
     settings : Settings
     stamp : Stamp
@@ -159,7 +159,7 @@ class PointCloud:
     """
 
     position_m: NDArray[np.float32]
-    energy: NDArray[np.float32]
+    amplitude: NDArray[np.float32]
     settings: Settings
     stamp: Stamp = Stamp()
     translation_m: tuple[float, float, float] | None = None
@@ -167,16 +167,16 @@ class PointCloud:
     uncertainty_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("position_m", "energy"):
+        for name in ("position_m", "amplitude"):
             checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
-        n_points = len(self.energy) if self.energy.ndim else 1
-        checks.shape("energy", self.energy.shape, (n_points,))
+        n_points = len(self.amplitude) if self.amplitude.ndim else 1
+        checks.shape("amplitude", self.amplitude.shape, (n_points,))
         checks.shape("position_m", self.position_m.shape, (n_points, 3))
         if self.uncertainty_m is not None:
             checks.shape("uncertainty_m", np.shape(self.uncertainty_m), (n_points, 2))
 
     def __len__(self) -> int:
-        return len(self.energy)
+        return len(self.amplitude)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed.

@@ -13,12 +13,12 @@ from ertis_numba import checks, kernels
 from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import Grid, microphones
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.memory import require_memory
-from ertis_numba.words import word_format
 
 if TYPE_CHECKING:
     from ertis_numba.prediction import BudgetMonitor, Prediction
@@ -119,13 +119,15 @@ class Pipeline:
         settings = planner.complete(settings, kernel_set, threads=threads, max_bytes=left_bytes)
         self.settings = settings
         self.device = kernel_set.device
-        self._accepted = settings
-        self._format = word_format(settings)
+        self._accepted_settings = settings
+        self._format = sample_format(settings)
         self._closed = False
-        self._monitor = _monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
+        self._monitor = (
+            _budget_monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
+        )
         self._warned = False
-        self._unmatched = _CALL_CHECKS if predict and not kernel_set.simulated else 0
-        self._chain = self._made_chain(kernel_set, threads, graphs=graphs)
+        self._remaining_call_checks = _CALL_CHECKS if predict and not kernel_set.simulated else 0
+        self._chain = self._build_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
 
@@ -152,9 +154,9 @@ class Pipeline:
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
-        energy = self._chain.new_image() if out is None else self._checked_out(out)
-        self._chain.process(words, energy, threads=threads)
-        image = self._energyscape(_rescaled(energy, exponent), measurement)
+        amplitude = self._chain.new_image() if out is None else self._checked_out(out)
+        self._chain.process(words, amplitude, threads=threads)
+        image = self._energyscape(_rescaled(amplitude, exponent), measurement)
         self._check_call(measurement)
         self._check_budget(image, measurement)
         return image
@@ -178,11 +180,11 @@ class Pipeline:
         self._require_open()
         batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
         words = [self._words_of(measurement) for measurement in batch]
-        energies = [self._chain.new_image() for _ in batch]
-        self._chain.process_batch([each for each, _ in words], energies)
+        amplitudes = [self._chain.new_image() for _ in batch]
+        self._chain.process_batch([each for each, _ in words], amplitudes)
         images = [
-            self._energyscape(_rescaled(energy, exponent), measurement)
-            for energy, (_, exponent), measurement in zip(energies, words, batch, strict=True)
+            self._energyscape(_rescaled(amplitude, exponent), measurement)
+            for amplitude, (_, exponent), measurement in zip(amplitudes, words, batch, strict=True)
         ]
         for image, measurement in zip(images, batch, strict=True):
             self._check_call(measurement)
@@ -235,15 +237,15 @@ class Pipeline:
 
     def _check_call(self, measurement: Measurement) -> None:
         """Compare echoes with the call until a measurement has sound above the noise, in the first few only."""
-        if self._unmatched <= 0:
+        if self._remaining_call_checks <= 0:
             return
         # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
-        from ertis_numba.stages.call_match import call_match  # noqa: PLC0415
+        from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
 
-        self._unmatched -= 1
+        self._remaining_call_checks -= 1
         match = call_match(replace(measurement, settings=self.settings))
         if match is not None:
-            self._unmatched = 0
+            self._remaining_call_checks = 0
             if match.warning:
                 warnings.warn(match.warning, CallMismatchWarning, stacklevel=3)
 
@@ -260,12 +262,12 @@ class Pipeline:
             self._warned = True
             warnings.warn(text, ErrorBudgetWarning, stacklevel=3)
 
-    def _made_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
+    def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
         """Return the chain, its kernels compiled and its buffers made."""
         try:
             chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
             if not kernel_set.simulated:
-                chain.warm_up(np.zeros(self._format.rows, self._format.dtype))
+                chain.warm_up(np.zeros(self._format.shape_2d, self._format.dtype))
         except DeviceError as error:
             failed = str(error)
         else:
@@ -277,9 +279,9 @@ class Pipeline:
         if self._closed:
             raise ArgumentError("the pipeline is closed; make another one")
 
-    def _energyscape(self, energy: NDArray[np.float32], measurement: Measurement) -> Energyscape:
+    def _energyscape(self, amplitude: NDArray[np.float32], measurement: Measurement) -> Energyscape:
         return Energyscape(
-            energy=energy,
+            amplitude=amplitude,
             azimuth_rad=self.grid.azimuth_rad,
             elevation_rad=self.grid.elevation_rad,
             range_m=self.range_m,
@@ -291,11 +293,11 @@ class Pipeline:
         """Return the words, scaled into the range of single precision, and the exponent of the divisor 2^n."""
         self._require_open()
         self._require_same_sensor(measurement.settings)
-        return self._format.normalised(self._format.checked(measurement.words))
+        return self._format.normalised(self._format.validated(measurement.data))
 
     def _require_same_sensor(self, settings: Settings) -> None:
         """Refuse what the tables were not made for: only how to process may differ."""
-        if settings is self._accepted:
+        if settings is self._accepted_settings:
             return
         for name in ("call", "recording", "air"):
             came, wanted = getattr(settings, name), getattr(self.settings, name)
@@ -306,7 +308,7 @@ class Pipeline:
                 f"measurement has array {settings.array.layout!r}, the pipeline another, "
                 f"{self.settings.array.layout!r}; make a pipeline from its settings"
             )
-        self._accepted = settings
+        self._accepted_settings = settings
 
     def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = (len(self.grid), len(self.range_m))
@@ -315,7 +317,7 @@ class Pipeline:
         return out
 
 
-def _monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | None":
+def _budget_monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | None":
     """Return a monitor of the budget; simulated kernels would take minutes for a prediction."""
     if kernel_set.simulated:
         return None
@@ -325,7 +327,7 @@ def _monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | No
     return BudgetMonitor(kernel_set, threads)
 
 
-def _rescaled(energy: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:
+def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:
     """Return an image multiplied by a power of two, in place.
 
     Raises
@@ -335,13 +337,13 @@ def _rescaled(energy: NDArray[np.float32], exponent: int) -> NDArray[np.float32]
     """
     if exponent:
         with np.errstate(over="ignore"):
-            np.ldexp(energy, exponent, out=energy)
-        if not np.isfinite(energy).all():
+            np.ldexp(amplitude, exponent, out=amplitude)
+        if not np.isfinite(amplitude).all():
             raise DataError(
                 f"the measurement's samples reach 2^{exponent}, so its image exceeds the largest float32, 3.4e38; "
                 "divide the samples by their full scale"
             )
-    return energy
+    return amplitude
 
 
 def _device_for(settings: Settings, device: str) -> str:

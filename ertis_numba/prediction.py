@@ -13,14 +13,14 @@ from ertis_numba.kernels import KernelSet
 from ertis_numba.stages.plan_model import TABLE_BYTES
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.sensitivity import Sensitivity
-from ertis_numba.stages.texture import ROUGH_DELAY_TAPS, ROUGH_ZONES, texture_of
+from ertis_numba.stages.signal_model import ROUGH_DELAY_TAPS, ROUGH_ZONES, signal_model_of
 
 __all__ = [
     "MAX_MEMORY_BYTES",
     "BudgetMonitor",
     "BudgetScope",
-    "Noted",
     "Prediction",
+    "PredictionDict",
     "memory_bytes",
     "planner_of",
     "predict",
@@ -41,11 +41,11 @@ MAX_MEMORY_BYTES: Final = 2**28
 
 _MAX_DIRECTIONS: Final = 64
 _BYTES_PER_SAMPLE: Final = 32  # signals of a few microphones, as noise is estimated over the whole record
-_FAINTER: Final = 0.1
+_FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
 
-class Noted(TypedDict):
+class PredictionDict(TypedDict):
     """Prediction as files and reports hold it."""
 
     predicted_error_db: float
@@ -79,7 +79,7 @@ class Prediction:
     budget_applies_to: BudgetScope = "image"
     beamformer: str = "delay_and_sum"
 
-    def as_dict(self) -> Noted:
+    def as_dict(self) -> PredictionDict:
         """Return the prediction in the form for files and reports."""
         return {
             "predicted_error_db": self.predicted_error_db,
@@ -118,21 +118,21 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     """
     settings = image.settings
     adaptive = settings.processing.beamformer != "delay_and_sum"
-    energy = None if adaptive else image.energy
-    texture = texture_of(measurement, settings, kernels, threads=threads, energy=energy)
+    amplitude = None if adaptive else image.amplitude
+    signal_model = signal_model_of(measurement, settings, kernels, threads=threads, amplitude=amplitude)
     if not adaptive:
-        return Planner(settings, kernels, threads=threads, texture=texture)
+        return Planner(settings, kernels, threads=threads, signal_model=signal_model)
     # Imported here because it takes 0.1 s, and other images need none of it.
     from ertis_numba.verification import sampled_error_db  # noqa: PLC0415
 
-    beams = Planner(settings, kernels, threads=threads, texture=texture, sensitivity=Sensitivity())
+    beams = Planner(settings, kernels, threads=threads, signal_model=signal_model, sensitivity=Sensitivity())
     try:
         error_db = sampled_error_db(image, measurement, max_directions=_MAX_DIRECTIONS)
     except DataError:  # The exact image is silent there, so nothing is known of the image.
         return beams
     power = sum(beams.parts(settings.accuracy).values())
     sensitivity = Sensitivity(10 ** (error_db / 10) / power)
-    return Planner(settings, kernels, threads=threads, texture=texture, sensitivity=sensitivity)
+    return Planner(settings, kernels, threads=threads, signal_model=signal_model, sensitivity=sensitivity)
 
 
 def predict(planner: Planner) -> Prediction:
@@ -155,8 +155,8 @@ def memory_bytes(image: Energyscape) -> int:
     if settings.processing.beamformer != "delay_and_sum":
         n_mics = int(microphones(settings.array).enabled.sum())
         n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
-        table = TABLE_BYTES * len(image.energy) * n_mics * ROUGH_DELAY_TAPS * n_zones
-    return table + 20 * image.energy.size + _BYTES_PER_SAMPLE * settings.recording.n_samples
+        table = TABLE_BYTES * len(image.amplitude) * n_mics * ROUGH_DELAY_TAPS * n_zones
+    return table + 20 * image.amplitude.size + _BYTES_PER_SAMPLE * settings.recording.n_samples
 
 
 class BudgetMonitor:
@@ -183,12 +183,12 @@ class BudgetMonitor:
 
     def check(self, image: Energyscape, measurement: Measurement) -> Prediction | None:
         """Return a new prediction if the image needs one."""
-        rows = image.energy[:: max(1, len(image.energy) // _ROWS)]
+        rows = image.amplitude[:: max(1, len(image.amplitude) // _ROWS)]
         level = float(np.vdot(rows, rows)) / rows.size
-        if not 0 < level < _FAINTER * self._faintest or memory_bytes(image) > MAX_MEMORY_BYTES:
+        if not 0 < level < _FAINTER_RATIO * self._faintest or memory_bytes(image) > MAX_MEMORY_BYTES:
             return None
         with self._lock:
-            if not level < _FAINTER * self._faintest:
+            if not level < _FAINTER_RATIO * self._faintest:
                 return None
             self._faintest = level
             self.prediction = predict(planner_of(image, measurement, self._kernels, threads=self._threads))

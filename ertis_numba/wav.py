@@ -12,8 +12,8 @@ from ertis_numba.errors import DataError
 
 __all__ = ["read_wav"]
 
-_OPEN_END = {0, 2**32 - 1}  # sizes that programs write who do not know yet how long it will be
-_WIDE = b"RF64"  # whose sizes are in a chunk of their own
+_UNFINISHED_SIZES = {0, 2**32 - 1}  # sizes that programs write who do not know yet how long it will be
+_RF64 = b"RF64"  # whose sizes are in a chunk of their own
 
 
 def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
@@ -25,7 +25,7 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
         The file is no WAV, has no samples, is cut short, or its header was never finished.
     """
     with path.open("rb") as file:
-        _require_whole(path, file)
+        _require_complete(path, file)
     from scipy.io import wavfile  # noqa: PLC0415  takes long to import, and few need it
 
     with warnings.catch_warnings():
@@ -42,10 +42,10 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
     return float(rate_hz), numbers if numbers.ndim > 1 else numbers[:, None]
 
 
-def _require_whole(path: Path, file: BinaryIO) -> None:
+def _require_complete(path: Path, file: BinaryIO) -> None:
     """Refuse what is no WAV, and a file that holds less than its header says."""
     kind, _, form = struct.unpack("<4sI4s", file.read(12).ljust(12, b"\0"))
-    if kind not in {b"RIFF", b"RIFX", _WIDE} or form != b"WAVE":
+    if kind not in {b"RIFF", b"RIFX", _RF64} or form != b"WAVE":
         raise DataError(f"{path} is no WAV file, it begins with {kind!r}; give WAV, or HDF5 of Acoular (.h5)")
     order = ">" if kind == b"RIFX" else "<"
     wide = frame_bytes = 0
@@ -57,8 +57,8 @@ def _require_whole(path: Path, file: BinaryIO) -> None:
             if not n_channels:
                 raise DataError(f"{path} cannot be read (it has 0 channels); save it again as WAV")
         if name == b"data" and there:
-            said = wide if kind == _WIDE and size in _OPEN_END else size
-            _require_samples(path, said, there, frame_bytes)
+            stated = wide if kind == _RF64 and size in _UNFINISHED_SIZES else size
+            _require_samples(path, stated, there, frame_bytes)
             return
     raise DataError(f"{path} has no samples; save it again as WAV")
 
@@ -76,7 +76,7 @@ def _chunks(file: BinaryIO, order: str) -> Iterator[tuple[bytes, int, int]]:
 
 def _require_samples(path: Path, size: int, there: int, frame_bytes: int) -> None:
     """Refuse samples that are not those of the header: ``size`` bytes of them, of which no more are ``there``."""
-    if size in _OPEN_END:
+    if size in _UNFINISHED_SIZES:
         raise DataError(
             f"{path} has a header that was never finished, as of a recording that was cut off; "
             "let a program that ignores its lengths save it again"

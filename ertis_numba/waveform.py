@@ -12,25 +12,27 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call, Settings
 
 __all__ = [
-    "MatchedFilter",
+    "MatchedFilterSpectrum",
     "call_at",
     "call_samples",
     "call_spectrum",
     "decimation_taps",
     "filter_response",
+    "integer_taps",
     "matched_band_hz",
-    "matched_filter",
+    "matched_filter_spectrum",
     "matched_guard_s",
-    "matched_spectrum",
-    "whole_taps",
+    "matched_noise_spectrum",
 ]
 
 _TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
-_LEAST_TRANSITION = 0.02  # of the decimated rate; the filter's length grows with the inverse
-_STOP_BAND_DB = 60.0
-_SLACK_DB = 0.5  # by which a filter may miss its stop band
-_DENSER = 16  # samples of an own waveform for each of its own, between which splines run
-_ROUNDING_DB = -50.0  # what rounded taps may change the response by, where the stop band is no deeper than 60 dB
+_MIN_TRANSITION = 0.02  # of the decimated rate; the filter's length grows with the inverse
+_STOPBAND_ATTENUATION_DB = 60.0
+_STOPBAND_TOLERANCE_DB = 0.5  # by which a filter may miss its stop band
+_WAVEFORM_OVERSAMPLING = 16  # samples of an own waveform for each of its own, between which splines run
+_MAX_ROUNDING_ERROR_DB = (
+    -50.0
+)  # what rounded taps may change the response by, where the stop band is no deeper than 60 dB
 
 
 def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
@@ -78,8 +80,8 @@ def _interpolator(call: Call) -> Callable[[NDArray[np.float64]], NDArray[np.floa
 
     samples = call_samples(call)
     n_fft = 2 ** math.ceil(math.log2(2 * len(samples)))  # zeros behind it, over which its beginning does not wrap
-    dense = np.fft.irfft(np.fft.rfft(samples, n_fft), n_fft * _DENSER) * _DENSER
-    time_s = np.arange((len(samples) - 1) * _DENSER + 2) / (call.sample_rate_hz * _DENSER)
+    dense = np.fft.irfft(np.fft.rfft(samples, n_fft), n_fft * _WAVEFORM_OVERSAMPLING) * _WAVEFORM_OVERSAMPLING
+    time_s = np.arange((len(samples) - 1) * _WAVEFORM_OVERSAMPLING + 2) / (call.sample_rate_hz * _WAVEFORM_OVERSAMPLING)
     spline: Callable[[NDArray[np.float64]], NDArray[np.float64]] = CubicSpline(time_s, dense[: len(time_s)])
     return spline
 
@@ -117,7 +119,7 @@ def call_spectrum(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MatchedFilter:
+class MatchedFilterSpectrum:
     """The matched filter of a call as the occupied bins of a one-sided spectrum.
 
     Attributes
@@ -153,7 +155,7 @@ def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
     return 2 / narrowest_hz * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
 
 
-def matched_filter(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilter:
+def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilterSpectrum:
     """Return the matched filter for spectra of ``n_fft`` points of decimated signals.
 
     ``H(f) = g conj(S(f)) W(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
@@ -187,21 +189,21 @@ def matched_filter(settings: Settings, *, n_fft: int, decimation: int | None = N
     )
     window = np.cos(math.pi / 2 * np.clip(outside, 0.0, 1.0)) ** 2
     power = np.abs(spectrum) ** 2 * window
-    return MatchedFilter(
+    return MatchedFilterSpectrum(
         first_bin=int(bins[0]),
         values=np.conj(spectrum) * window * (n_fft / np.sum(power)),
         centre_hz=float(np.sum(frequency_hz * power) / np.sum(power)),
     )
 
 
-def matched_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the power of white noise after the matched filter: frequencies in hertz and shares, both (wave,) float64.
 
     The shares add up to 1. Of an echo, whose own spectrum comes on top, the band is a little narrower.
     """
     rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
     n_fft = round(max(8 * math.ceil(settings.call.duration_s * fine_hz), 1024) * rate_hz / fine_hz)
-    matched = matched_filter(settings, n_fft=n_fft)
+    matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
     power = np.abs(matched.values) ** 2
     # Parts of the band rather than single bins: the spectrum of a sweep has ripples.
@@ -212,12 +214,12 @@ def matched_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.fl
 
 
 def decimation_taps(
-    *, sample_rate_hz: float, decimation: int, pass_hz: float, stop_band_db: float = _STOP_BAND_DB
+    *, sample_rate_hz: float, decimation: int, pass_hz: float, stopband_attenuation_db: float = _STOPBAND_ATTENUATION_DB
 ) -> NDArray[np.float64]:
     """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
 
     A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
-    damped by ``stop_band_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so
+    damped by ``stopband_attenuation_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so
     that the group delay is k samples of the decimated signal exactly.
 
     Parameters
@@ -226,7 +228,7 @@ def decimation_taps(
     decimation : int
     pass_hz : float
         Upper edge of the band that must stay clean.
-    stop_band_db : float
+    stopband_attenuation_db : float
 
     Returns
     -------
@@ -239,17 +241,17 @@ def decimation_taps(
     """
     rate_hz = sample_rate_hz / decimation
     transition_hz = rate_hz - 2 * pass_hz
-    if transition_hz < _LEAST_TRANSITION * rate_hz:
+    if transition_hz < _MIN_TRANSITION * rate_hz:
         raise ArgumentError(
             f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
         )
     width_rad = 2 * math.pi * transition_hz / sample_rate_hz
-    wanted = (stop_band_db - 7.95) / (2.285 * width_rad)
+    wanted = (stopband_attenuation_db - 7.95) / (2.285 * width_rad)
     half = decimation * math.ceil(wanted / 2 / decimation)
     taps = _windowed_sinc(half, decimation, width_rad)
     # Kaiser's formula is a fit; for some short filters it promises a few decibels too much.
     folding_hz = np.linspace(rate_hz - pass_hz, min(rate_hz + pass_hz, sample_rate_hz / 2), 256)
-    enough = 10 ** ((_SLACK_DB - stop_band_db) / 20)
+    enough = 10 ** ((_STOPBAND_TOLERANCE_DB - stopband_attenuation_db) / 20)
     while decimation > 1 and np.abs(filter_response(taps, folding_hz / sample_rate_hz)).max() > enough:
         half += decimation
         taps = _windowed_sinc(half, decimation, width_rad)
@@ -257,18 +259,18 @@ def decimation_taps(
 
 
 def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.float64]:
-    stop_band_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
+    stopband_attenuation_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
     beta = (
-        0.1102 * (stop_band_db - 8.7)
-        if stop_band_db > 50
-        else (0.5842 * max(stop_band_db - 21, 0) ** 0.4 + 0.07886 * max(stop_band_db - 21, 0))
+        0.1102 * (stopband_attenuation_db - 8.7)
+        if stopband_attenuation_db > 50
+        else (0.5842 * max(stopband_attenuation_db - 21, 0) ** 0.4 + 0.07886 * max(stopband_attenuation_db - 21, 0))
     )  # Kaiser's formulae
     position = np.arange(-half, half + 1)
     taps = np.sinc(position / decimation) * np.kaiser(2 * half + 1, beta)
     return np.asarray(taps / taps.sum())
 
 
-def whole_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
+def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
     """Return a filter in whole numbers whose magnitudes add up to the largest of them at most: (tap,) int16 or int32.
 
     It is a filter of its own rather than an approximation at every sum: rounding some hundred taps to 16 bits changes
@@ -293,7 +295,7 @@ def whole_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16
     whole = np.rint(taps * scale)
     change = np.abs(np.fft.rfft(whole / (whole.sum() or 1.0) - taps, 4 * len(taps))).max()
     change_db = 20 * math.log10(max(change, 1e-20))
-    if change_db > _ROUNDING_DB:
+    if change_db > _MAX_ROUNDING_ERROR_DB:
         raise ArgumentError(
             f"decimation filter of {len(taps)} taps is too long for {bits} bits ({change_db:.0f} dB off); "
             "give a smaller processing.decimation"

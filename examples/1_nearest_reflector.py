@@ -14,11 +14,11 @@ import ertis_numba as ertis
 def main(port: str) -> None:
     """Take five measurements, ten a second at most."""
     settings = ertis.Settings.from_preset("default_25_50")
-    with ertis.Sonar.open(port) as sonar, ertis.Pipeline(settings) as pipeline:
+    with ertis.SonarDriver.open(port) as sonar, ertis.Pipeline(settings) as pipeline:
         sonar.configure(ertis.Setup.of(settings))
         for _ in range(5):
             block = sonar.measure()
-            image = pipeline.process(ertis.Measurement(block.words, settings))
+            image = pipeline.process(ertis.Measurement(block.data, settings))
             peaks = ertis.find_peaks(image, top=10, min_level_db=-15.0)
             nearest = min(peaks, key=lambda peak: peak.range_m)
             print(f"#{block.counter}: {nearest.range_m:.2f} m at {nearest.azimuth_deg:+.0f}°")

@@ -59,7 +59,7 @@ def nearest_in_way_m(cloud: ertis.PointCloud) -> float:
 
 def main(address: str, *sensors: str) -> None:
     """Print the speed whenever it changes."""
-    ways, told = {sensor: Way() for sensor in sensors}, ""
+    ways, reported = {sensor: Way() for sensor in sensors}, ""
     with ertis.Subscriber(address, sensors=sensors, products=["points"]) as subscriber:
         while not subscriber.closed:
             cloud = subscriber.receive(timeout_s=0.1)
@@ -69,9 +69,9 @@ def main(address: str, *sensors: str) -> None:
             for way in ways.values():
                 way.wait(time.monotonic())
             speed = SPEEDS[min(way.speed for way in ways.values())]
-            if speed != told:
+            if speed != reported:
                 print(speed, flush=True)
-                told = speed
+                reported = speed
 
 
 if __name__ == "__main__":

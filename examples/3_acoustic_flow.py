@@ -17,8 +17,8 @@ import ertis_numba as ertis
 
 FASTEST_M_S = 3.0
 HALF_WINDOW_M = 0.06  # around the strongest echo of a direction
-LEAST_LEVEL = 0.1  # of the strongest echo of the image
-LEAST_LIKENESS = 0.9
+MIN_LEVEL = 0.1  # of the strongest echo of the image
+MIN_LIKENESS = 0.9
 
 
 def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -26,27 +26,27 @@ def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.
     spacing_m = float(now.range_m[1] - now.range_m[0])
     time_s = (now.stamp.timestamp_ns - before.stamp.timestamp_ns) / 1e9
     half, reach = round(HALF_WINDOW_M / spacing_m), round(FASTEST_M_S * time_s / spacing_m) + 1
-    strongest = before.energy.argmax(axis=1)
+    strongest = before.amplitude.argmax(axis=1)
     has_room = (strongest >= half + reach) & (strongest < len(now.range_m) - half - reach)
-    has_echo = before.energy.max(axis=1) > LEAST_LEVEL * before.energy.max()
+    has_echo = before.amplitude.max(axis=1) > MIN_LEVEL * before.amplitude.max()
     directions = np.flatnonzero(has_room & has_echo)
     # Rows of what was there, and of what is there at every lag.
     around = np.arange(-half, half + 1)
     lags = np.arange(-reach, reach + 1)
     centre = strongest[directions, None]
-    was = before.energy[directions[:, None], centre + around]
-    here = now.energy[directions[:, None, None], centre[:, :, None] + lags[:, None] + around]
+    was = before.amplitude[directions[:, None], centre + around]
+    here = now.amplitude[directions[:, None, None], centre[:, :, None] + lags[:, None] + around]
     alike = np.einsum("dla,da->dl", here, was) / (
         np.linalg.norm(here, axis=2) * np.linalg.norm(was, axis=1)[:, None] + np.finfo(np.float32).tiny
     )
     best = alike.argmax(axis=1)
-    sure = (best > 0) & (best < 2 * reach) & (alike.max(axis=1) > LEAST_LIKENESS)
+    sure = (best > 0) & (best < 2 * reach) & (alike.max(axis=1) > MIN_LIKENESS)
     directions, alike, best = directions[sure], alike[sure], best[sure]
     # The top of the parabola through the best lag and its neighbours.
     row = np.arange(len(best))
     left, middle, right = alike[row, best - 1], alike[row, best], alike[row, best + 1]
-    bend = np.minimum(left - 2 * middle + right, -np.finfo(np.float32).tiny)
-    shift = lags[best] + 0.5 * (left - right) / bend
+    curvature = np.minimum(left - 2 * middle + right, -np.finfo(np.float32).tiny)
+    shift = lags[best] + 0.5 * (left - right) / curvature
     return directions, shift * spacing_m / time_s
 
 
@@ -57,9 +57,9 @@ def main(address: str, sensor: str) -> None:
         for image in subscriber:
             follows = (
                 before is not None
-                and before.stamp.epoch == image.stamp.epoch
+                and before.stamp.session_id == image.stamp.session_id
                 and before.stamp.timestamp_ns < image.stamp.timestamp_ns
-                and before.energy.shape == image.energy.shape
+                and before.amplitude.shape == image.amplitude.shape
             )
             if follows and before is not None:
                 directions, speeds_m_s = flow(before, image)

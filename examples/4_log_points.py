@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 import ertis_numba as ertis
-from ertis_numba.atomic import replacing
+from ertis_numba.atomic_files import atomic_write
 
-COLUMNS = ("timestamp_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "energy")
+COLUMNS = ("timestamp_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "amplitude")
 
 
 class Log:
@@ -28,7 +28,7 @@ class Log:
 
     def save(self, path: Path) -> None:
         """Write the table, complete or not at all."""
-        with replacing(path, overwrite=True) as part:
+        with atomic_write(path, overwrite=True) as part:
             if path.suffix == ".npz":
                 with part.open("wb") as file:
                     np.savez_compressed(file, **self._columns())
@@ -43,16 +43,16 @@ class Log:
         stamps = [cloud.stamp for cloud in self.clouds]
         nothing = np.empty((0, 3), np.float32)
         position_m = np.concatenate([nothing, *(cloud.on_platform_m() for cloud in self.clouds)])
-        energy = np.concatenate([nothing[:, 0], *(cloud.energy for cloud in self.clouds)])
+        amplitude = np.concatenate([nothing[:, 0], *(cloud.amplitude for cloud in self.clouds)])
         times_ns = np.repeat(np.array([stamp.timestamp_ns for stamp in stamps], np.int64), counts)
         sensors = np.repeat(np.array([stamp.sensor for stamp in stamps], np.str_), counts)
         sequences = np.repeat(np.array([stamp.sequence for stamp in stamps], np.int64), counts)
-        return dict(zip(COLUMNS, (times_ns, sensors, sequences, *position_m.T, energy), strict=True))
+        return dict(zip(COLUMNS, (times_ns, sensors, sequences, *position_m.T, amplitude), strict=True))
 
 
-def main(address: str, path: str, most: str = "0") -> None:
+def main(address: str, path: str, largest: str = "0") -> None:
     """Log clouds until there are so many, or until Ctrl-C."""
-    log, n = Log(), int(most)
+    log, n = Log(), int(largest)
     with ertis.Subscriber(address, products=["points"]) as subscriber:
         try:
             for cloud in subscriber:

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from ertis_numba.campaign import Campaign, Ended, find
+from ertis_numba.campaign import Campaign, RecordingEnded, find
 from ertis_numba.campaign.orders import News
 from ertis_numba.campaign.work import follow
 from ertis_numba.settings import Air
@@ -26,7 +26,7 @@ class Here:
     """A crew that follows orders in this process, when it is asked for news."""
 
     def __init__(self, size=2):
-        self.size, self.orders, self.given, self.most = size, deque(), [], 0
+        self.size, self.orders, self.given, self.largest = size, deque(), [], 0
 
     @property
     def free(self):
@@ -51,15 +51,15 @@ class Here:
 
 def run_here(monkeypatch, paths, folder, wanted=None, size=2):
     """Process in this process; return what became of each recording, by its name, and the crew."""
-    crew = Here(size)
+    pool = Here(size)
     with monkeypatch.context() as patch:
-        patch.setattr(Campaign, "_crew", lambda _: crew)
-        return ended(Campaign(find(paths), folder, wanted).run()), crew
+        patch.setattr(Campaign, "_crew", lambda _: pool)
+        return ended(Campaign(find(paths), folder, wanted).run()), pool
 
 
 def ended(events):
     """What became of each recording, by the name of its file."""
-    return {event.recording.name: event for event in events if isinstance(event, Ended)}
+    return {event.recording.name: event for event in events if isinstance(event, RecordingEnded)}
 
 
 def outcomes(found):

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
-from ertis_numba.words import word_format
 
 LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
 SHORT = Settings(
@@ -70,7 +70,7 @@ CASES = {
 
 def noise(settings: Settings, seed: int = 1) -> Measurement:
     """White noise: it tells at all ranges and directions at once what echoes would."""
-    words, random = word_format(settings), np.random.default_rng(seed)
+    words, random = sample_format(settings), np.random.default_rng(seed)
     if settings.recording.is_pdm:
         numbers = random.integers(0, 2**settings.array.word_bits, words.shape, dtype=words.dtype)
     else:

@@ -39,17 +39,20 @@ class Node:
             if kind is None or isinstance(message, kind):
                 return message
 
-    def hear_settled(self, settled):
+    def hear_settled(self, acked_through):
         """Acks until one says that a number is settled."""
         while True:
             ack = self.hear(messages.Ack)
-            if ack.settled >= settled:
+            if ack.acked_through >= acked_through:
                 return ack
 
-    def hello(self, sensor="left", *, epoch=EPOCH, first=10, settings=TINY, **more):
+    def hello(self, sensor="left", *, session_id=EPOCH, first=10, settings=TINY, **more):
         text = settings if isinstance(settings, bytes) else settings.to_toml().encode()
         crc32 = more.pop("settings_crc32", zlib.crc32(text))
-        self.send(messages.Hello(sensor=sensor, epoch=epoch, next_sequence=first, settings_crc32=crc32, **more), text)
+        self.send(
+            messages.Hello(sensor=sensor, session_id=session_id, next_sequence=first, settings_crc32=crc32, **more),
+            text,
+        )
         return self.hear((messages.Welcome, messages.Refused))
 
     def measure(self, *given, **changes):
@@ -60,10 +63,10 @@ class Node:
 def data_of(entry, **changes):
     """The message of an entry."""
     stamp, air = entry.measurement.stamp, entry.measurement.settings.air
-    words = changes.pop("words", entry.measurement.words.tobytes())
+    words = changes.pop("words", entry.measurement.data.tobytes())
     fields = {
         "sensor": stamp.sensor,
-        "epoch": stamp.epoch,
+        "session_id": stamp.session_id,
         "sequence": stamp.sequence,
         "sync_count": stamp.sync_count,
         "timestamp_ns": stamp.timestamp_ns,
@@ -99,19 +102,19 @@ def stored(folder):
     for path in sorted(folder.glob(f"*.h5{SUFFIX}")):
         with Journal.open(path) as journal:
             found += wanted(journal.entries())
-            missing += [(gap.sensor, gap.epoch, gap.first, gap.last, gap.reason) for gap in journal.gaps]
+            missing += [(gap.sensor, gap.session_id, gap.first, gap.last, gap.reason) for gap in journal.gaps]
     for path in sorted(folder.glob("*.h5")):
         for name in sensor_names(path):
             with open_recording(path, sensor=name) as reader:
                 found += wanted(Entry(measurement, 0) for measurement in reader)
-                missing += [(name, gap.epoch, gap.first, gap.last, gap.reason) for gap in reader.gaps]
+                missing += [(name, gap.session_id, gap.first, gap.last, gap.reason) for gap in reader.gaps]
     return found, missing
 
 
 def wanted(entries):
     """What `stored` returns of entries."""
     return [
-        ((stamp.sensor, stamp.epoch, stamp.sequence), entry.measurement.words.tobytes())
+        ((stamp.sensor, stamp.session_id, stamp.sequence), entry.measurement.data.tobytes())
         for entry in entries
         for stamp in [entry.measurement.stamp]
     ]

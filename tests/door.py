@@ -7,8 +7,8 @@ import zmq
 
 from ertis_numba.network import sockets
 from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.gate import Gate
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
+from ertis_numba.network.zap_authenticator import ZapAuthenticator
 
 CENTRAL, ROBOT, VIEWER, DESK, STRANGER = (
     KeyPair.new(name) for name in ("central", "robot", "viewer", "desk", "stranger")
@@ -28,13 +28,13 @@ MOMENT_S = 0.4  # of what is not to happen: a handshake takes a hundredth of it
 class Door:
     """A server and its gate in one loop, as a central node has them, and clients that knock."""
 
-    def __init__(self, folder, *, with_keys=True, gate=Gate, server_gate=True, most_bytes=sockets.MOST_BYTES):
+    def __init__(self, folder, *, with_keys=True, gate=ZapAuthenticator, server_gate=True, max_bytes=sockets.MAX_BYTES):
         self.list = folder / "allow.toml"
         LISTED.save(self.list)
         self.keys = ServerKeys(CENTRAL, self.list) if with_keys else None
         self.context, self.outside = zmq.Context(), zmq.Context()
         self.gate = gate(self.context, self.keys if server_gate else None)
-        self.server = sockets.server(self.context, LOOPBACK, keys=self.keys, most_bytes=most_bytes)
+        self.server = sockets.server(self.context, LOOPBACK, keys=self.keys, max_bytes=max_bytes)
         self.gate.watch(self.server)
         self.address = sockets.bound(self.server)
         self.port = int(self.address.rpartition(":")[2])
@@ -96,7 +96,7 @@ class Door:
         """Send something as soon as a client is connected."""
         self._unsaid.append((client, text))
 
-    def told(self, client):
+    def reported(self, client):
         """Wait until a client is told why it is not let in."""
         lines = []
         assert self.until(lambda: lines.extend(self.monitors[client].read()) or lines)

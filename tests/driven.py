@@ -8,9 +8,9 @@ from contextlib import contextmanager
 import zmq
 
 from ertis_numba.network import sockets
-from ertis_numba.network.log import Log
+from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Data, Description, Hello, Subscribe, decode, encode
-from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.settings import Settings
 from tests.cases import SHORT, noise
 
@@ -19,12 +19,12 @@ ANY = "tcp://127.0.0.1:0"
 MEASUREMENT = noise(SHORT)
 
 
-def hello(sensor="front", settings=SHORT, epoch=7, **changes):
+def hello(sensor="front", settings=SHORT, session_id=7, **changes):
     text = settings.to_toml().encode()
-    return Hello(sensor=sensor, epoch=epoch, next_sequence=0, settings_crc32=zlib.crc32(text), **changes)
+    return Hello(sensor=sensor, session_id=session_id, next_sequence=0, settings_crc32=zlib.crc32(text), **changes)
 
 
-def data(sensor="front", sequence=0, *, epoch=7, settings=SHORT, **changes):
+def data(sensor="front", sequence=0, *, session_id=7, settings=SHORT, **changes):
     now_ns = time.time_ns()
     values = {
         "sync_count": sequence,
@@ -36,11 +36,11 @@ def data(sensor="front", sequence=0, *, epoch=7, settings=SHORT, **changes):
         "pressure_pa": settings.air.pressure_pa,
         "crc32": 0,
     }
-    return Data(sensor=sensor, epoch=epoch, sequence=sequence, **(values | changes))
+    return Data(sensor=sensor, session_id=session_id, sequence=sequence, **(values | changes))
 
 
 class Loop:
-    """Drives a `Processing`, and looks at its counts after every step."""
+    """Drives a `ImageProcessing`, and looks at its counts after every step."""
 
     def __init__(self, processing):
         self.processing = processing
@@ -79,7 +79,7 @@ class Loop:
 
     def offer(self, sensor="front", words=None, **values):
         self._sensors.add(sensor)
-        words = MEASUREMENT.words if words is None else words
+        words = MEASUREMENT.data if words is None else words
         self.processing.offer(data(sensor, self.offered, **values), words, time.monotonic_ns())
         self.offered += 1
         self.check()
@@ -94,7 +94,9 @@ class Loop:
 @contextmanager
 def driven(**options):
     log = Lines("processing")
-    processing = Processing(Options(**({"publish": ANY, "device": "numpy", "workers": 1} | options)), log)
+    processing = ImageProcessing(
+        ProcessingOptions(**({"publish": ANY, "device": "numpy", "workers": 1} | options)), log
+    )
     processing.start()
     loop = Loop(processing)
     loop.lines = log.lines
@@ -104,7 +106,7 @@ def driven(**options):
         processing.close()
 
 
-class Lines(Log):
+class Lines(EventLog):
     """A log that is remembered: events and their fields."""
 
     def __init__(self, name):
@@ -122,7 +124,7 @@ class Application:
 
     def __init__(self, address, keys=None):
         self._context = zmq.Context()
-        self._said, self._said_s = None, 0.0
+        self._reported_names, self._said_s = None, 0.0
         self.socket = sockets.client(self._context, address, keys=keys)
         self.consumed = 0
         self.descriptions = {}
@@ -133,20 +135,20 @@ class Application:
         self.send(Subscribe(products=products, consumed=self.consumed, **values))
 
     def send(self, message):
-        self._said = message if isinstance(message, Subscribe) else None
+        self._reported_names = message if isinstance(message, Subscribe) else None
         self._said_s = time.monotonic()
         try:
             # To wait here for a publisher would hold up the loop that starts it.
             self.socket.send(encode(message), zmq.NOBLOCK)
         except zmq.Again:
-            if self._said is None:
+            if self._reported_names is None:
                 raise
             self._said_s = 0.0  # it is said again with the next step
 
     def keep(self):
         """Say again what was said last, as a subscriber does, which is forgotten otherwise."""
-        if self._said is not None and time.monotonic() - self._said_s > 0.5:
-            self.send(self._said)
+        if self._reported_names is not None and time.monotonic() - self._said_s > 0.5:
+            self.send(self._reported_names)
 
     def read(self):
         while self.socket.poll(0):

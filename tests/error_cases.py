@@ -11,13 +11,19 @@ from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.texture import texture_of
+from ertis_numba.stages.signal_model import signal_model_of
 from tests import reference
 from tests.scenes import only
 
 CPU = kernels.load("cpu")
 BEST = Accuracy(
-    precision="float32", oversampling=6, delay_taps=6, beam_taps=0, beam_density=2.0, stop_band_db=140.0, zones=1
+    precision="float32",
+    oversampling=6,
+    delay_taps=6,
+    beam_taps=0,
+    beam_density=2.0,
+    stopband_attenuation_db=140.0,
+    focal_zones=1,
 )
 """Stands for the exact image, from which it differs by -115 dB or less."""
 
@@ -43,10 +49,13 @@ PLANS = {
     "16 bits": _plan(precision="int16", oversampling=8, delay_taps=4),
     "16 bits, one tap": _plan(precision="int16", oversampling=64, delay_taps=1),
     "16 bits, nodes": _plan(precision="int16", beam_taps=4, beam_density=3.0),
-    **{f"stop band {stop_band_db:g}": _plan(stop_band_db=stop_band_db) for stop_band_db in (40.0, 60.0, 80.0, 100.0)},
-    "draft": _plan(precision="int16", oversampling=1, delay_taps=2, beam_taps=2, stop_band_db=40.0),
-    "standard": _plan(precision="int16", oversampling=2, delay_taps=2, beam_taps=4, stop_band_db=40.0),
-    "fine": _plan(precision="int16", oversampling=3, delay_taps=3, beam_taps=6, stop_band_db=60.0),
+    **{
+        f"stop band {stopband_attenuation_db:g}": _plan(stopband_attenuation_db=stopband_attenuation_db)
+        for stopband_attenuation_db in (40.0, 60.0, 80.0, 100.0)
+    },
+    "draft": _plan(precision="int16", oversampling=1, delay_taps=2, beam_taps=2, stopband_attenuation_db=40.0),
+    "standard": _plan(precision="int16", oversampling=2, delay_taps=2, beam_taps=4, stopband_attenuation_db=40.0),
+    "fine": _plan(precision="int16", oversampling=3, delay_taps=3, beam_taps=6, stopband_attenuation_db=60.0),
 }
 
 
@@ -63,7 +72,7 @@ def image_of(measurement, settings):
     """The image by a complete plan: (direction, range) float32."""
     chain = FastChain(settings, kernels_for(settings.accuracy), threads=1)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
-    chain.process(measurement.words.reshape(len(measurement.words), -1), image)
+    chain.process(measurement.data.reshape(len(measurement.data), -1), image)
     return image
 
 
@@ -72,13 +81,13 @@ class Rated:
 
     def __init__(self, measurement, settings):
         self.measurement, self.settings = measurement, settings
-        self.texture = texture_of(measurement, settings, CPU, threads=2)
+        self.signal_model = signal_model_of(measurement, settings, CPU, threads=2)
         self._best = image_of(measurement, tuned_for(settings, BEST))
 
     def predicted(self, plan):
         """What the planner expects, knowing what is heard."""
         settings = tuned_for(self.settings, plan)
-        return Planner(settings, kernels_for(plan), threads=1, texture=self.texture).chosen(plan)
+        return Planner(settings, kernels_for(plan), threads=1, signal_model=self.signal_model).chosen(plan)
 
     def measured_db(self, plan):
         image = image_of(self.measurement, tuned_for(self.settings, plan))

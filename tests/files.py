@@ -42,6 +42,6 @@ def image(azimuth_deg=None, elevation_deg=None, *, range_m=None, seed=1, setting
     elevation_deg = np.zeros_like(azimuth_deg) if elevation_deg is None else np.asarray(elevation_deg, dtype=float)
     range_m = np.linspace(0.5, 5.0, 400) if range_m is None else np.asarray(range_m, dtype=float)
     rng = np.random.default_rng(seed)
-    energy = (0.002 * rng.rayleigh(size=(len(azimuth_deg), len(range_m)))).astype(np.float32)
-    energy[len(azimuth_deg) // 2, len(range_m) // 2] = 0.5
-    return Energyscape(energy, np.radians(azimuth_deg), np.radians(elevation_deg), range_m, settings)
+    amplitude = (0.002 * rng.rayleigh(size=(len(azimuth_deg), len(range_m)))).astype(np.float32)
+    amplitude[len(azimuth_deg) // 2, len(range_m) // 2] = 0.5
+    return Energyscape(amplitude, np.radians(azimuth_deg), np.radians(elevation_deg), range_m, settings)

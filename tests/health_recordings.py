@@ -43,12 +43,12 @@ def real():
 
 def with_bits(measurement, channel, bits):
     """The measurement with other bits, (sample,) of 0 and 1, in one channel of 8-bit or 32-bit words."""
-    words = measurement.words & ~words_bit(measurement, channel)
-    return dataclasses.replace(measurement, words=words | (np.asarray(bits).astype(words.dtype) << channel))
+    words = measurement.data & ~words_bit(measurement, channel)
+    return dataclasses.replace(measurement, data=words | (np.asarray(bits).astype(words.dtype) << channel))
 
 
 def words_bit(measurement, channel):
-    return measurement.words.dtype.type(1 << channel)
+    return measurement.data.dtype.type(1 << channel)
 
 
 def modulated(signal, channel=0):

@@ -19,11 +19,11 @@ TINY = line(8, 8).replace(recording=Recording(n_samples=4096))
 EPOCH = 5
 
 
-def entries(count=3, *, sensor="left", first=10, settings=TINY, epoch=EPOCH, seed=1):
+def entries(count=3, *, sensor="left", first=10, settings=TINY, session_id=EPOCH, seed=1):
     """Measurements of noise whose stamps all differ, as they would arrive."""
     made = []
     for number, measurement in enumerate(noise(settings, count, seed)):
-        stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, epoch=epoch)
+        stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, session_id=session_id)
         made.append(Entry(replace(measurement, stamp=stamp), monotonic_ns=1_000 + number))
     return made
 
@@ -73,7 +73,7 @@ def crashed(folder, given=None, *, moment="log", **options):
 
 def same(came, wanted):
     """Whether an entry that was read is another one to the last bit, and has its CRC-32."""
-    words = [np.ascontiguousarray(entry.measurement.words) for entry in (came, wanted)]
+    words = [np.ascontiguousarray(entry.measurement.data) for entry in (came, wanted)]
     return (
         (came.monotonic_ns, came.measurement.stamp) == (wanted.monotonic_ns, wanted.measurement.stamp)
         and came.measurement.settings.air == wanted.measurement.settings.air

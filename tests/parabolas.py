@@ -7,7 +7,7 @@ import numpy as np
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
-from ertis_numba.waveform import matched_filter
+from ertis_numba.waveform import matched_filter_spectrum
 
 TINY = np.finfo(np.float32).tiny
 
@@ -16,7 +16,7 @@ def interpolated(image, directions, around, direction, range_index):
     """Unit vector, range and amplitude of the maximum near a bin."""
     step_m = image.range_m[1] - image.range_m[0]
     bins = [(direction, range_index + step) for step in (-1, 0, 1)] + [(other, range_index) for other in around]
-    measured = np.log(np.maximum([float(image.energy[each]) for each in bins], TINY))
+    measured = np.log(np.maximum([float(image.amplitude[each]) for each in bins], TINY))
     offsets = directions[around] - directions[direction]
     first = found = parabolas(measured, offsets)
     last = math.inf
@@ -55,7 +55,7 @@ def amplitude(settings, direction_offset, range_offset_m):
 def waves_of(settings):
     """Wave numbers and power of the call, and where microphones are."""
     n_fft = 2048
-    matched = matched_filter(settings, n_fft=n_fft)
+    matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
     power = np.abs(matched.values) ** 2
     positions_m = microphones(settings.array).enabled_positions_m
@@ -65,8 +65,8 @@ def waves_of(settings):
 def parabolas(logs, offsets):
     """Shift along the range in bins, offset of the direction, and logarithm of the level."""
     before, level, after = logs[:3]
-    bend = before - 2 * level + after
-    shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    curvature = before - 2 * level + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     offset, rise = quadric_top(offsets, logs[3:] - level)
     return shift, offset, level + 0.25 * (after - before) * shift + rise
 

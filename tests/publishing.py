@@ -13,8 +13,8 @@ import zmq
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid
 from ertis_numba.network import messages, sockets
-from ertis_numba.network.gate import Gate
 from ertis_numba.network.status import Status
+from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from ertis_numba.settings import Processing, Settings
 
 SETTINGS = Settings(processing=Processing(directions="2d:31", range_m=(0.5, 3.0)))
@@ -27,25 +27,25 @@ PART = 5_000  # bytes of a frame: images come in several
 def image(sequence=0, *, sensor="front", reflectors=(), sync_count=None, **stamp):
     """An image with reflectors: (azimuth in degrees, range in m, amplitude)."""
     grid = direction_grid(SETTINGS.processing)
-    energy = np.full((len(grid), len(RANGE_M)), 1e-4, np.float32)
+    amplitude = np.full((len(grid), len(RANGE_M)), 1e-4, np.float32)
     for azimuth_deg, range_m, amplitude in reflectors:
         across = (grid.azimuth_rad - np.radians(azimuth_deg)) / np.radians(6)
         along = (RANGE_M - range_m) / 0.02
-        energy += (amplitude * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
+        amplitude += (amplitude * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
     stamp = Stamp(
         sensor=sensor,
         sequence=sequence,
-        epoch=7,
+        session_id=7,
         sync_count=sequence if sync_count is None else sync_count,
         **{"timestamp_ns": 1_700_000_000_000_000_000 + sequence * 100_000_000, "timestamp_uncertainty_ns": 900} | stamp,
     )
-    return Energyscape(energy, grid.azimuth_rad, grid.elevation_rad, RANGE_M, SETTINGS, stamp)
+    return Energyscape(amplitude, grid.azimuth_rad, grid.elevation_rad, RANGE_M, SETTINGS, stamp)
 
 
 def cloud(sequence=0, *, position_m=((1.0, 0.0, 0.0),), sensor="front"):
     position_m = np.array(position_m, np.float32).reshape(-1, 3)
-    energy = np.linspace(1, 0.5, len(position_m), dtype=np.float32)
-    return PointCloud(position_m, energy, SETTINGS, image(sequence, sensor=sensor).stamp)
+    amplitude = np.linspace(1, 0.5, len(position_m), dtype=np.float32)
+    return PointCloud(position_m, amplitude, SETTINGS, image(sequence, sensor=sensor).stamp)
 
 
 def measurement(sequence=0, *, sensor="front", temperature_c=20.0):
@@ -87,7 +87,7 @@ class Publisher:
 
     def __init__(self, *, address="tcp://127.0.0.1:0", keys=None, answers=True, describes_each=False):
         self._context = zmq.Context(io_threads=1)
-        self._gate = Gate(self._context, keys)
+        self._authenticator = ZapAuthenticator(self._context, keys)
         self._socket = sockets.server(self._context, address, keys=keys)
         self.address = sockets.bound(self._socket)
         self.answers = answers
@@ -99,7 +99,7 @@ class Publisher:
         return self
 
     def __exit__(self, *_):
-        self._gate.close()
+        self._authenticator.close()
         self._context.destroy(linger=0)
 
     def pump(self, until, *, within_s=PATIENCE_S):
@@ -111,12 +111,12 @@ class Publisher:
 
     def _turn(self):
         poller = zmq.Poller()
-        for socket in (self._socket, self._gate.socket):
+        for socket in (self._socket, self._authenticator.socket):
             if socket is not None:
                 poller.register(socket, zmq.POLLIN)
         ready = [socket for socket, _ in poller.poll(5)]
-        if self._gate.socket in ready:
-            self._gate.serve()
+        if self._authenticator.socket in ready:
+            self._authenticator.serve()
         if self._socket in ready:
             peer, *frames = self._socket.recv_multipart()
             message = messages.decode(frames[0], (messages.Subscribe, messages.Ping, messages.Bye))
@@ -126,15 +126,15 @@ class Publisher:
             elif isinstance(message, messages.Bye):
                 self.peers.pop(peer, None)
             elif self.answers:
-                self.tell(peer, messages.Pong(state="processing"))
+                self.notify(peer, messages.Pong(state="processing"))
 
-    def tell(self, peer, message, *payload):
+    def notify(self, peer, message, *payload):
         with contextlib.suppress(zmq.ZMQError):  # who has left
             self._socket.send_multipart([peer, messages.encode(message), *payload])
 
     def tell_all(self, message, *payload):
         for peer in self.peers:
-            self.tell(peer, message, *payload)
+            self.notify(peer, message, *payload)
 
     def raw(self, *frames):
         for peer in self.peers:
@@ -154,7 +154,7 @@ class Publisher:
                 continue
             peer.sent += 1
             header, payload = self._message(item, key, peer, number=number, dropped=peer.dropped)
-            self.tell(key, msgspec.structs.replace(header, **changes), *payload)
+            self.notify(key, msgspec.structs.replace(header, **changes), *payload)
 
     def _message(self, item, key, peer, **common):
         if isinstance(item, messages.Group):
@@ -165,7 +165,7 @@ class Publisher:
         common |= {
             "description": self._describe(item, key, peer),
             "sensor": stamp.sensor,
-            "epoch": stamp.epoch,
+            "session_id": stamp.session_id,
             "sequence": stamp.sequence,
             "sync_count": stamp.sync_count,
             "timestamp_ns": stamp.timestamp_ns,
@@ -173,16 +173,16 @@ class Publisher:
             "monotonic_ns": 5,
         }
         if isinstance(item, Measurement):
-            air, words = item.settings.air, item.words.tobytes()
+            air, words = item.settings.air, item.data.tobytes()
             common |= {name: getattr(air, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")}
             return messages.Raw(crc32=zlib.crc32(words), **common), (words,)
         common |= {"received_ns": 1_000_000, "published_ns": 13_000_000}
         if isinstance(item, PointCloud):
-            rows = np.concatenate([item.position_m, item.energy[:, None]], axis=1)
+            rows = np.concatenate([item.position_m, item.amplitude[:, None]], axis=1)
             return messages.Points(n_points=len(item), **common), (rows.tobytes(),)
-        body = item.energy.tobytes()
+        body = item.amplitude.tobytes()
         parts = [body[start : start + PART] for start in range(0, len(body), PART)]
-        return messages.Image(shape=item.energy.shape, dtype=item.energy.dtype.name, **common), parts
+        return messages.Image(shape=item.amplitude.shape, dtype=item.amplitude.dtype.name, **common), parts
 
     def _describe(self, item, key, peer):
         about = (item.stamp.sensor, kind_of(item), item.stamp.sequence if self._describes_each else 0)
@@ -197,7 +197,7 @@ class Publisher:
             axes = [b"", b"", b""]
             if isinstance(item, Energyscape):
                 axes = [item.azimuth_rad.tobytes(), item.elevation_rad.tobytes(), item.range_m.tobytes()]
-            self.tell(key, described, SETTINGS.to_toml().encode(), *axes)
+            self.notify(key, described, SETTINGS.to_toml().encode(), *axes)
         return peer.described[about]
 
     @contextlib.contextmanager

@@ -7,10 +7,10 @@ from ertis_numba.settings import Array, Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Scene, Sensor
 from ertis_numba.simulation.arrivals import arrivals
 from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.plan import Plan, Verdict
+from ertis_numba.simulation.plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.waveform import call_at
 
 RATE_HZ = 4_500_000.0
@@ -25,7 +25,7 @@ SPEED_M_S = sound_speed_m_s(SENSOR.air)
 
 def only(*names):
     """A plan of some effects and of those that cannot be left out, whatever the scene calls for."""
-    return Plan(
+    return EffectPlan(
         tuple(
             Verdict(name=name, on=name in names or name in INDISPENSABLE, reason="a test asks for it", estimate_db=None)
             for name in EFFECTS
@@ -47,7 +47,7 @@ def heard(scene, *names, index=0, sensor=None):
 def ways(scene, *names, index=0, sensor=None, frequency_hz=(40_000.0,)):
     """What arrives of calls with some effects."""
     shot = snapshot(scene, scene.sensor(sensor), index / scene.rate_hz)
-    return arrivals(shot, {*names, *INDISPENSABLE}, np.asarray(frequency_hz, dtype=np.float64), Stopwatch())
+    return arrivals(shot, {*names, *INDISPENSABLE}, np.asarray(frequency_hz, dtype=np.float64), CostStopwatch())
 
 
 def sorted_ways(scene, *names, **options):
@@ -96,7 +96,7 @@ def filtered(before, after):
 
 def bits_of(measurement):
     """The bits of every channel as (channel, sample) of +1 and −1."""
-    words = measurement.words.reshape(len(measurement.words), -1)
+    words = measurement.data.reshape(len(measurement.data), -1)
     octets = words.astype(words.dtype.newbyteorder("<")).view(np.uint8)
     return 2.0 * np.unpackbits(octets, axis=1, bitorder="little").T - 1.0
 
@@ -120,10 +120,10 @@ def scene_of(*points, sensor=SENSOR, **more):
     return Scene(seed=7, sensors=(sensor,), points=points, **more)
 
 
-def listener_and_emitter(ear_m, mouth_m, **more):
+def listener_and_emitter(receiver_m, mouth_m, **more):
     """A scene whose first sensor hears the second only."""
-    ear = EAR.replace(position_m=vector(ear_m), emitter=Emitter(silent=True))
-    return Scene(sensors=(ear, EAR.replace(name="mouth", position_m=vector(mouth_m))), **more)
+    receiver = EAR.replace(position_m=vector(receiver_m), emitter=Emitter(silent=True))
+    return Scene(sensors=(receiver, EAR.replace(name="mouth", position_m=vector(mouth_m))), **more)
 
 
 def vector(values):

@@ -26,7 +26,7 @@ def impatient(monkeypatch):
         (link, "_REFUSED_S", 0.1),
         (link, "_TURN_MS", 10),
         (runs, "_PATIENCE_S", 0.05),
-        (runs, "_MOST_PATIENCE_S", 0.2),
+        (runs, "_MAX_PATIENCE_S", 0.2),
     ):
         monkeypatch.setattr(module, name, value)
 
@@ -39,7 +39,7 @@ class Node(SensorNode):
 
     def __init__(self, address, sensors=("left",), **options):
         self.notes, self.acks = queue.Queue(), queue.Queue()
-        super().__init__(address, on_note=self.notes.put, on_settled=self.acks.put, **options)
+        super().__init__(address, on_note=self.notes.put, on_acked=self.acks.put, **options)
         for sensor in sensors:
             self.add_sensor(sensor, TINY, firmware="1.2.3", translation_m=(1, 2, 3))
 
@@ -56,9 +56,9 @@ def same(held, wanted):
     """Whether a central node has what was given, with everything that belongs to it."""
     message, words = held
     entry, stamp, air = wanted, wanted.measurement.stamp, wanted.measurement.settings.air
-    return words == entry.measurement.words.tobytes() and message == messages.Data(
+    return words == entry.measurement.data.tobytes() and message == messages.Data(
         sensor=stamp.sensor,
-        epoch=stamp.epoch,
+        session_id=stamp.session_id,
         sequence=stamp.sequence,
         sync_count=stamp.sync_count,
         timestamp_ns=stamp.timestamp_ns,

@@ -9,7 +9,7 @@ import zmq
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.network import messages, sockets
-from ertis_numba.network.gate import Gate
+from ertis_numba.network.zap_authenticator import ZapAuthenticator
 
 TURN_MS = 20
 
@@ -27,19 +27,19 @@ class StandIn:
         What no sensor node should do.
     """
 
-    def __init__(self, *, seed=0, acks="stored", window=16, keys=None, most_bytes=sockets.MOST_BYTES):
+    def __init__(self, *, seed=0, acks="stored", window=16, keys=None, max_bytes=sockets.MAX_BYTES):
         self.random = random.Random(seed)
-        self.held, self.gaps, self.settled, self.wrong = {}, {}, {}, []
+        self.held, self.gaps, self.acked_through, self.wrong = {}, {}, {}, []
         self.acks, self.window, self.state, self.text = acks, window, "storage", ""
         self.dropped = ()  # told with the next ack
-        self.most_runs, self.forget_peers = 1000, threading.Event()
+        self.max_runs, self.forget_peers = 1000, threading.Event()
         self.silent, self.version = False, messages.VERSION
         self.ignored = 0.0  # share of measurements
         self.lost = self.repeated = self.late = 0.0  # shares of acks
         self.refusal = lambda _message: None
         self.hellos, self.seen = queue.Queue(), set()
         self.taken = self.resent = self.connections = 0
-        self.keys, self.most_bytes = keys, most_bytes
+        self.keys, self.max_bytes = keys, max_bytes
         self.address = "tcp://127.0.0.1:*"
         self._kept_back = []
         self._thread = None
@@ -65,12 +65,12 @@ class StandIn:
             self._thread.join()
             self._thread = None
         if forget:
-            self.settled.clear()
+            self.acked_through.clear()
 
     def _serve(self, ready):
         context = zmq.Context()
-        gate = Gate(context, self.keys)
-        router = sockets.server(context, self.address, keys=self.keys, most_bytes=self.most_bytes)
+        gate = ZapAuthenticator(context, self.keys)
+        router = sockets.server(context, self.address, keys=self.keys, max_bytes=self.max_bytes)
         self.address, self._peers, self._kept_back = sockets.bound(router), {}, []
         poller = zmq.Poller()
         for each in filter(None, (router, gate.socket)):
@@ -117,9 +117,9 @@ class StandIn:
                 for key in self._peers[peer]:
                     self._ack(router, peer, key)
             case messages.Data() | messages.Gap():
-                key = message.sensor, message.epoch
+                key = message.sensor, message.session_id
                 if key not in self._peers[peer]:
-                    refused = messages.Refused(code="hello", reason="who?", sensor=key[0], epoch=key[1])
+                    refused = messages.Refused(code="hello", reason="who?", sensor=key[0], session_id=key[1])
                     self._say(router, peer, refused)
                     return
                 self.seen.add(getattr(message, "sequence", None))
@@ -132,48 +132,54 @@ class StandIn:
                 self.wrong.append(f"it says {message}")
 
     def _greet(self, router, peer, message, settings):
-        key = message.sensor, message.epoch
+        key = message.sensor, message.session_id
         if zlib.crc32(settings) != message.settings_crc32:
             self.wrong.append("settings")
-        if len(self._peers[peer] | {key}) > self.most_runs:
-            refused = messages.Refused(code="size", reason="so many runs; say bye", sensor=key[0], epoch=key[1])
+        if len(self._peers[peer] | {key}) > self.max_runs:
+            refused = messages.Refused(code="size", reason="so many runs; say bye", sensor=key[0], session_id=key[1])
             self._say(router, peer, refused)
             return
         self._peers[peer].add(key)
-        before = self.settled.setdefault(key, message.next_sequence - 1)
+        before = self.acked_through.setdefault(key, message.next_sequence - 1)
         if message.next_sequence > before + 1:
             self.gaps.setdefault(key, []).append((before + 1, message.next_sequence - 1, "never came"))
-            self.settled[key] = message.next_sequence - 1
+            self.acked_through[key] = message.next_sequence - 1
         welcome = messages.Welcome(
             sensor=key[0],
-            epoch=key[1],
+            session_id=key[1],
             state=self.state,
             acks=self.acks,
             window=self.window,
-            settled=self.settled[key],
+            acked_through=self.acked_through[key],
         )
         self._say(router, peer, welcome)
         self.hellos.put((message, settings))
 
     def _store(self, key, message, payload):
-        settled = self.settled[key]
+        acked_through = self.acked_through[key]
         if isinstance(message, messages.Gap):
-            if message.first <= settled + 1 and message.last > settled:
-                self.gaps.setdefault(key, []).append((max(message.first, settled + 1), message.last, message.reason))
-                self.settled[key] = message.last
+            if message.first <= acked_through + 1 and message.last > acked_through:
+                self.gaps.setdefault(key, []).append(
+                    (max(message.first, acked_through + 1), message.last, message.reason)
+                )
+                self.acked_through[key] = message.last
             return
         if zlib.crc32(payload[0]) != message.crc32:
             self.wrong.append(f"CRC-32 of {message.sequence}")
-        if message.sequence <= settled:
+        if message.sequence <= acked_through:
             self.resent += 1
-        elif message.sequence == settled + 1:
+        elif message.sequence == acked_through + 1:
             self.held.setdefault(key, {})[message.sequence] = (message, payload[0])
-            self.settled[key] = message.sequence
+            self.acked_through[key] = message.sequence
             self.taken += 1
 
     def _ack(self, router, peer, key):
         ack = messages.Ack(
-            sensor=key[0], epoch=key[1], settled=self.settled[key], status=self.acks, dropped=self.dropped
+            sensor=key[0],
+            session_id=key[1],
+            acked_through=self.acked_through[key],
+            status=self.acks,
+            dropped=self.dropped,
         )
         chance = self.random.random
         if chance() < self.lost:

@@ -69,8 +69,8 @@ class Terminal:
         """Wait for its end; return the exit code, and stdout if that is a pipe."""
         while self._read():
             pass
-        told, _ = self._process.communicate(timeout=PATIENCE_S)
-        return self._process.returncode, told
+        reported, _ = self._process.communicate(timeout=PATIENCE_S)
+        return self._process.returncode, reported
 
     @property
     def shown(self):

@@ -7,7 +7,7 @@ import ertis_numba as ertis
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages.accuracy import PARTS, Texture, decibels
+from ertis_numba.stages.accuracy import PARTS, SignalModel, decibels
 from ertis_numba.stages.planner import Planner
 from tests import reference
 from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, kernels_for, random_measurement, rated
@@ -55,7 +55,7 @@ def test_what_stands_for_the_exact_image_is_exact(real):
     azimuth_rad = np.radians(np.linspace(-90, 90, 181))[some]
     range_m = ertis.Pipeline(settings).range_m
     directions = unit_vectors(azimuth_rad, np.zeros_like(azimuth_rad))
-    exact = reference.exact(real.measurement.words, settings, directions, range_m)
+    exact = reference.exact(real.measurement.data, settings, directions, range_m)
     assert reference.error_db(image_of(real.measurement, settings)[some], exact) < -115
 
 
@@ -90,14 +90,14 @@ def test_texture_is_that_of_what_is_heard():
     """Noise of microphones that have nothing in common: a gain of 1, and a flat spectrum."""
     settings = Settings(processing=Processing(directions="2d:91"), accuracy=Accuracy())
     words = np.random.default_rng(1).integers(0, 2**32, settings.recording.n_samples, dtype=np.uint32)
-    texture = Rated(Measurement(words, settings), settings).texture
-    assert texture.gain == pytest.approx(1.0, rel=0.1)
-    assert texture.level == pytest.approx(1.0, rel=0.05)
-    assert texture.noise[1:-1] == pytest.approx(1.0, rel=0.5)
-    assert texture.shares.sum() == pytest.approx(1.0)
-    assert texture.shares == pytest.approx(Texture.unknown(settings).shares, rel=0.3, abs=1e-3)
+    signal_model = Rated(Measurement(words, settings), settings).signal_model
+    assert signal_model.gain == pytest.approx(1.0, rel=0.1)
+    assert signal_model.level == pytest.approx(1.0, rel=0.05)
+    assert signal_model.noise[1:-1] == pytest.approx(1.0, rel=0.5)
+    assert signal_model.shares.sum() == pytest.approx(1.0)
+    assert signal_model.shares == pytest.approx(SignalModel.unknown(settings).shares, rel=0.3, abs=1e-3)
     # Of complex noise, the largest of thousands: the logarithm of their number.
-    assert 8 < texture.crest < 20
+    assert 8 < signal_model.crest < 20
 
 
 def test_silence_has_a_texture():
@@ -115,6 +115,8 @@ def test_nothing_has_a_level():
 def test_more_damping_lets_less_noise_through():
     """From 60 dB on; taps of 16 bits do no better than 40 dB for long, which is what the model is there to know."""
     planner = Planner(Settings(), CPU, threads=1)
-    powers = [planner.chosen(BEST.replace(stop_band_db=float(db))).parts["filter"] for db in range(40, 141, 20)]
+    powers = [
+        planner.chosen(BEST.replace(stopband_attenuation_db=float(db))).parts["filter"] for db in range(40, 141, 20)
+    ]
     assert powers[1] < 1.5 * powers[0]
     assert (np.diff(np.log10(powers[1:])) < -1).all()

@@ -17,8 +17,8 @@ def test_loop(tmp_path):
     clouds = [cloud(number, position_m=[[0.3, 0.4, 0], [3, 0, 0]]) for number in range(6)]
     with Publisher() as publisher, publisher.playing(clouds):
         code = code.replace("tcp://127.0.0.1:5602", publisher.address)
-        told = run(tmp_path, sys.executable, "-W", "error", "-c", code).stdout.splitlines()
-    numbers = [int(re.fullmatch(r"#(\d): nearest at 0\.50 m, 2 points", line)[1]) for line in told]
+        reported = run(tmp_path, sys.executable, "-W", "error", "-c", code).stdout.splitlines()
+    numbers = [int(re.fullmatch(r"#(\d): nearest at 0\.50 m, 2 points", line)[1]) for line in reported]
     assert numbers == sorted(set(numbers))
     assert numbers[-1] >= 3
     assert max(numbers[:-1], default=0) < 3

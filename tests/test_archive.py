@@ -8,18 +8,18 @@ from datetime import datetime
 
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError, InUseError, NoRoomError
-from ertis_numba.journal import SUFFIX, Gap, Journal, Sensor, seal_apart
+from ertis_numba.errors import ArgumentError, DataError, DiskFullError, JournalInUseError
+from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_apart
 from ertis_numba.network.central_node import Archive, _volumes
-from ertis_numba.network.central_node._items import (
-    Failed,
-    Fault,
+from ertis_numba.network.central_node._received_items import (
     Forgotten,
-    Item,
+    ReceivedItem,
     Remark,
     Resumed,
-    Run,
     SealedOne,
+    SealingFailed,
+    SensorSession,
+    StorageFault,
     Stored,
     Twin,
 )
@@ -28,19 +28,29 @@ from ertis_numba.storage import open_recording, sensor_names
 from tests.central import stored, wanted
 from tests.journals import EPOCH, TINY, create, entries
 
-SOURCE, RIGHT = Sensor.of("left", TINY), Sensor.of("right", TINY)
-RUN = Run("left", EPOCH)
+SOURCE, RIGHT = JournalSensor.of("left", TINY), JournalSensor.of("right", TINY)
+RUN = SensorSession("left", EPOCH)
 WAIT_S = 20.0
 
 
 def item_of(entry, source=SOURCE):
     stamp = entry.measurement.stamp
-    entry.crc32 = zlib.crc32(entry.measurement.words.data)
-    return Item(Run(stamp.sensor, stamp.epoch), stamp.sequence, stamp.sequence, entry, source, time.monotonic(), b"")
+    entry.crc32 = zlib.crc32(entry.measurement.data.data)
+    return ReceivedItem(
+        SensorSession(stamp.sensor, stamp.session_id),
+        stamp.sequence,
+        stamp.sequence,
+        entry,
+        source,
+        time.monotonic(),
+        b"",
+    )
 
 
 def gap_of(first, last, reason="lost", sensor="left"):
-    return Item(Run(sensor, EPOCH), first, last, Gap(sensor, first, last, reason, EPOCH), SOURCE, 0.0, b"")
+    return ReceivedItem(
+        SensorSession(sensor, EPOCH), first, last, JournalGap(sensor, first, last, reason, EPOCH), SOURCE, 0.0, b""
+    )
 
 
 class Opened:
@@ -79,7 +89,7 @@ class Opened:
         self.until(Stored, lambda event: event.items[-1].last >= number)
 
 
-def told(opened):
+def reported(opened):
     """Numbers that were told to be stored, in that order."""
     return [item.last for event in opened.events if isinstance(event, Stored) for item in event.items]
 
@@ -93,8 +103,8 @@ def test_it_stores_in_order_and_tells_of_each_once(tmp_path):
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, given), gap_of(40, 44), *map(item_of, from_zero(2, 45)))
         opened.until_stored(46)
-        assert opened.archive.settled(RUN) == 46
-    assert told(opened) == [*range(40), 44, 45, 46]
+        assert opened.archive.acked_through(RUN) == 46
+    assert reported(opened) == [*range(40), 44, 45, 46]
     assert stored(tmp_path) == (wanted([*given, *from_zero(2, 45)]), [("left", EPOCH, 40, 44, "lost")])
 
 
@@ -109,9 +119,11 @@ def test_what_does_not_follow_is_sent_back(tmp_path):
 
 def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
     others = from_zero(2, sensor="right")
-    bad = item_of(from_zero(1)[0], Sensor.of("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192))))
+    bad = item_of(
+        from_zero(1)[0], JournalSensor.of("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
+    )
     with Opened(tmp_path) as opened:
-        right = Sensor.of("right", TINY)
+        right = JournalSensor.of("right", TINY)
         opened.give(item_of(others[0], right), bad, item_of(others[1], right))
         opened.until_stored(1)
     assert [event.reason for event in opened.events if isinstance(event, Forgotten)] != [""]
@@ -123,12 +135,12 @@ def test_what_follows_an_item_that_no_journal_can_hold_is_sent_back(tmp_path):
     given[1:2] = from_zero(1, 1, settings=TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
     others = from_zero(2, sensor="right")
     with Opened(tmp_path) as opened:
-        right = Sensor.of("right", TINY)
+        right = JournalSensor.of("right", TINY)
         opened.archive._store(  # noqa: SLF001  all of them in one batch
-            opened.archive._shelf,  # noqa: SLF001
+            opened.archive._journal_store,  # noqa: SLF001
             [*map(item_of, given), *(item_of(other, right) for other in others)],
         )
-        assert opened.archive.settled(RUN) == 0
+        assert opened.archive.acked_through(RUN) == 0
     back = [(event.item.first, bool(event.reason)) for event in opened.events if isinstance(event, Forgotten)]
     assert back == [(1, True), (2, False)]
     assert stored(tmp_path)[0] == wanted([given[0], *others])
@@ -158,7 +170,7 @@ def test_gaps_share_a_transaction(tmp_path, monkeypatch):
     monkeypatch.setattr(Journal, "note_gaps", lambda journal, gaps: (commits.append(len(gaps)), notes(journal, gaps)))
     with Opened(tmp_path) as opened:
         opened.archive._store(  # noqa: SLF001
-            opened.archive._shelf,  # noqa: SLF001
+            opened.archive._journal_store,  # noqa: SLF001
             [*(gap_of(number, number) for number in range(20)), *map(item_of, from_zero(1, 20)), gap_of(21, 21)],
         )
     assert commits == [20, 1]
@@ -169,10 +181,10 @@ def test_gaps_share_a_transaction(tmp_path, monkeypatch):
 
 
 def test_two_places_of_a_sensor_are_two_recordings_even_in_a_batch(tmp_path):
-    moved = Sensor.of("left", TINY, translation_m=(1.0, 0.0, 0.0))
+    moved = JournalSensor.of("left", TINY, translation_m=(1.0, 0.0, 0.0))
     first, second = from_zero(2)
     with Opened(tmp_path) as opened:
-        opened.archive._store(opened.archive._shelf, [item_of(first), item_of(second, moved)])  # noqa: SLF001
+        opened.archive._store(opened.archive._journal_store, [item_of(first), item_of(second, moved)])  # noqa: SLF001
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
 
 
@@ -203,7 +215,7 @@ def test_time_makes_a_recording_full(tmp_path, monkeypatch):
         opened.give(item_of(from_zero(1)[0]))
         opened.until_stored(0)
         monkeypatch.setattr(opened.archive, "_rotate_s", 0.0)
-        while opened.archive._shelf.volume is not None:  # noqa: SLF001
+        while opened.archive._journal_store.volume is not None:  # noqa: SLF001
             select.select([opened.fd], [], [], 0.05)
         monkeypatch.undo()
         opened.give(item_of(from_zero(1, 1)[0]))
@@ -236,8 +248,8 @@ def test_a_commit_that_fails_is_done_once(before, times, tmp_path, monkeypatch):
         opened.give(*map(item_of, given))
         opened.until_stored(2)
         opened.until(Resumed)
-    assert [type(event) for event in opened.events if not isinstance(event, Stored)][:2] == [Fault, Resumed]
-    assert sorted(told(opened)) == [0, 1, 2]
+    assert [type(event) for event in opened.events if not isinstance(event, Stored)][:2] == [StorageFault, Resumed]
+    assert sorted(reported(opened)) == [0, 1, 2]
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
@@ -246,7 +258,7 @@ def test_any_error_is_a_fault_that_passes(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, from_zero(2)))
         opened.until_stored(1)
-    faults = [event.text for event in opened.events if isinstance(event, Fault)]
+    faults = [event.text for event in opened.events if isinstance(event, StorageFault)]
     assert faults == ["[Errno 5] Input/output error"]
 
 
@@ -259,7 +271,7 @@ def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypat
         path.unlink()
         opened.give(item_of(from_zero(1, 1)[0]))
         opened.until_stored(1)
-    assert "removed or replaced" in opened.until(Fault).text
+    assert "removed or replaced" in opened.until(StorageFault).text
     assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
 
 
@@ -279,7 +291,7 @@ def test_failed_journal_is_limited_and_its_rows_are_stored_in_a_new_one(tmp_path
             assert [key.sequence for key in failed.index()] == [0]
     with Journal.open(paths[1]) as follower:
         assert [key.sequence for key in follower.index()] == [1, 2]
-    assert told(opened) == [0, 1, 2]
+    assert reported(opened) == [0, 1, 2]
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
@@ -297,7 +309,7 @@ def test_a_disk_without_room_keeps_its_journal(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         opened.give(item_of(given[0]))
         opened.until_stored(0)
-        failing(monkeypatch, times=3, error=NoRoomError("the disk is full"))
+        failing(monkeypatch, times=3, error=DiskFullError("the disk is full"))
         opened.give(item_of(given[1]))
         opened.until_stored(1)
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 1
@@ -308,11 +320,11 @@ def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):
     failing(monkeypatch, times=10**9)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
-        opened.until(Fault)
+        opened.until(StorageFault)
     monkeypatch.undo()
-    assert told(opened) == []
+    assert reported(opened) == []
     with Opened(tmp_path) as opened:
-        assert opened.archive.settled(RUN) == -1
+        assert opened.archive.acked_through(RUN) == -1
 
 
 def test_what_was_stored_before_a_fault_is_sealed_at_the_end(tmp_path, monkeypatch):
@@ -322,10 +334,10 @@ def test_what_was_stored_before_a_fault_is_sealed_at_the_end(tmp_path, monkeypat
         opened.until_stored(0)
         failing(monkeypatch, times=10**9)
         opened.give(second)
-        opened.until(Fault)
+        opened.until(StorageFault)
     assert [type(event) for event in opened.events if isinstance(event, Resumed | SealedOne)] == [SealedOne]
     assert not list(tmp_path.glob("*.journal"))
-    assert told(opened) == [0]
+    assert reported(opened) == [0]
 
 
 def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
@@ -338,7 +350,7 @@ def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
         for path in tmp_path.iterdir():
             shutil.copy(path, left)
     with Opened(left, seal=True) as opened:
-        assert opened.archive.settled(RUN) == 2
+        assert opened.archive.acked_through(RUN) == 2
         opened.until(SealedOne)
     assert stored(left)[0] == wanted(given)
 
@@ -398,7 +410,9 @@ def test_names_tell_the_order_of_journals_of_one_second(tmp_path, monkeypatch):
 
 def test_a_gap_of_a_sensor_beside_another_is_told_later(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
-        right = Item(Run("right", EPOCH), 0, 4, Gap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b"")
+        right = ReceivedItem(
+            SensorSession("right", EPOCH), 0, 4, JournalGap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b""
+        )
         opened.give(right, *map(item_of, from_zero(2)))
         opened.until_stored(1)
     with Opened(tmp_path, seal=True) as opened:
@@ -418,14 +432,14 @@ def test_a_folder_without_a_ledger_is_read(tmp_path):
     (tmp_path / ".ertis-ledger").unlink()
     create(tmp_path, from_zero(2, 3), name="other.h5").close()
     with Opened(tmp_path) as opened:
-        assert opened.archive.settled(RUN) == 4
+        assert opened.archive.acked_through(RUN) == 4
 
 
 def test_a_journal_that_somebody_else_has_is_not_guessed(tmp_path):
-    with create(tmp_path, from_zero(2)), pytest.raises(InUseError, match="in use by another process"):
+    with create(tmp_path, from_zero(2)), pytest.raises(JournalInUseError, match="in use by another process"):
         Archive(tmp_path).open()
     with Opened(tmp_path) as opened:  # and the folder is free again
-        assert opened.archive.settled(RUN) == 1
+        assert opened.archive.acked_through(RUN) == 1
 
 
 def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
@@ -437,7 +451,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
     in_the_way = path.with_name(path.name.removesuffix(SUFFIX))
     in_the_way.write_text("something else")
     with Opened(tmp_path, seal=True) as opened:
-        assert "exists and holds something else" in opened.until(Failed).text
+        assert "exists and holds something else" in opened.until(SealingFailed).text
         assert opened.archive.status().sealing_failed >= 1
         in_the_way.unlink()
         opened.until(SealedOne)
@@ -447,7 +461,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
 def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     def seals(journal, **options):
         seal_apart(journal, **options)
-        raise InUseError("somebody else has it")
+        raise JournalInUseError("somebody else has it")
 
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -455,7 +469,7 @@ def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_apart", seals)
     with Opened(tmp_path, seal=True) as opened:
         pass
-    assert not [event for event in opened.events if isinstance(event, Failed)]
+    assert not [event for event in opened.events if isinstance(event, SealingFailed)]
     assert (opened.archive.status().sealing, opened.archive.status().sealing_failed) == (0, 0)
     assert stored(tmp_path)[0] == wanted(from_zero(1))
 
@@ -506,7 +520,7 @@ def test_different_measurement_with_a_stored_number_is_kept_after_rotation(tmp_p
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, given))
         opened.until_stored(2)
-        opened.archive._shelf.rotate()  # noqa: SLF001  as when it is full
+        opened.archive._journal_store.rotate()  # noqa: SLF001  as when it is full
         opened.give(*again)
         opened.until(Twin, lambda event: event.item is again[1])
     assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
@@ -554,10 +568,10 @@ def test_damaged_ledger_is_reported_once_and_rebuilt(tmp_path, place):
     content[place] ^= 0x80
     ledger.write_bytes(content)
     with Opened(tmp_path) as opened:
-        assert opened.archive.settled(RUN) == 5
+        assert opened.archive.acked_through(RUN) == 5
         assert ".ertis-ledger is damaged: 1 of " in opened.until(Remark).text
     with Opened(tmp_path) as opened:
-        assert opened.archive.settled(RUN) == 5
+        assert opened.archive.acked_through(RUN) == 5
     assert not any(isinstance(event, Remark) for event in opened.events)
 
 

@@ -10,18 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ertis_numba import kernels, verification
+from ertis_numba.analysis.compare import _Lobe
+from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.uncertainty import _effective_covariance_m2
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
-from ertis_numba.settings import Array, Settings, taper_of
+from ertis_numba.settings import Array, Settings, parse_window
 from ertis_numba.simulation import Point, Scene
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.compare import _Lobe
-from ertis_numba.stages.point_spread import PointSpread
-from ertis_numba.stages.uncertainty import _effective_covariance_m2
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests import reference
 from tests.cases import SHORT, noise
@@ -138,9 +138,9 @@ def test_weighted_image_is_that_of_an_array_with_gains_divided_by_the_weights(de
     gain[layout.enabled] = 1 / array_weights(settings)
     referee = weighted(settings, "uniform").replace(array=layout.to_array().replace(gain=tuple(gain.tolist())))
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    exact = reference.exact(measurement.words, referee, directions, image.range_m, spherical=wavefront == "spherical")
-    assert reference.error_db(image.energy, exact) < settings.accuracy.max_error_db
-    assert reference.error_db(verification.exact_image(image, measurement).energy, exact) < -100
+    exact = reference.exact(measurement.data, referee, directions, image.range_m, spherical=wavefront == "spherical")
+    assert reference.error_db(image.amplitude, exact) < settings.accuracy.max_error_db
+    assert reference.error_db(verification.exact_image(image, measurement).amplitude, exact) < -100
 
 
 @pytest.mark.parametrize("method", ["fast", "paper"])
@@ -153,7 +153,7 @@ def test_weight_of_zero_is_a_disabled_microphone(method):
     )
     disabled = settings.replace(array=settings.array.replace(disabled=channels))
     found, expected = (
-        Pipeline(each, predict=False).process(noise(each)).energy for each in (weighted(settings, weights), disabled)
+        Pipeline(each, predict=False).process(noise(each)).amplitude for each in (weighted(settings, weights), disabled)
     )
     assert np.linalg.norm(found - expected) < 1e-6 * np.linalg.norm(expected)
 
@@ -165,10 +165,10 @@ def test_weights_keep_the_level_of_an_echo_and_lower_its_side_lobes():
     measurement = Simulator(scene).render()
     tops, sides = [], []
     for window in ("uniform", "hann"):
-        energy = Pipeline(weighted(settings, window), predict=False).process(measurement).energy
-        tops.append(energy.max())
+        amplitude = Pipeline(weighted(settings, window), predict=False).process(measurement).amplitude
+        tops.append(amplitude.max())
         aside = np.abs(np.arange(181) - 90) > 12  # beyond the main lobe of either
-        sides.append(energy[aside][:, np.abs(np.arange(energy.shape[1]) - np.argmax(energy[90])) < 3].max())
+        sides.append(amplitude[aside][:, np.abs(np.arange(amplitude.shape[1]) - np.argmax(amplitude[90])) < 3].max())
     assert 20 * np.log10(tops[1] / tops[0]) == pytest.approx(0.0, abs=0.5)
     assert 20 * np.log10(sides[1] / sides[0]) < -10
 
@@ -181,7 +181,7 @@ def test_predicted_error_of_weighted_images_is_not_too_low(weights, wavefront):
     measurement = noise(settings)
     image = Pipeline(settings, "cpu", 1, predict=False).process(measurement)
     predicted_db = predict(planner_of(image, measurement, kernels.load("cpu"), threads=1)).predicted_error_db
-    true_db = verification.error_db(image.energy, verification.exact_image(image, measurement).energy)
+    true_db = verification.error_db(image.amplitude, verification.exact_image(image, measurement).amplitude)
     assert true_db - 1 < predicted_db < true_db + 12
 
 
@@ -262,7 +262,7 @@ def test_adaptive_beamformers_support_uniform_weights_only(beamformer, weights):
 
 def test_every_window_has_an_error_free_name():
     for name in WINDOWS:
-        assert taper_of(name).window == name.partition(":")[0]
+        assert parse_window(name).window == name.partition(":")[0]
 
 
 @pytest.mark.parametrize(("weights", "name"), [("uniform", "uniform"), ("hann", "hann"), ((1.0,) * 32, "listed")])

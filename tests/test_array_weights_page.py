@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
+from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.figures._array import width_deg
 from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Array, Settings
-from ertis_numba.stages.point_spread import PointSpread
 from tests.pages import page
 
 ARRAYS = {

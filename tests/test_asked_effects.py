@@ -73,7 +73,7 @@ def test_recorded_noise_has_the_level_that_the_scene_asks_for():
     quiet = sensor(noise_dbfs=-60.0).replace(recording=Recording(n_samples=40_000, encoding="float32"))
     far = Point(range_m=0.35, strength_db=-3.0)  # over before the second half of the record
     simulator = Simulator(Scene(sensors=(quiet,), points=(far,)))
-    rest = simulator.render().words[30_000:]
+    rest = simulator.render().data[30_000:]
     assert 20 * np.log10(np.sqrt(np.mean(np.square(rest, dtype=np.float64)))) == pytest.approx(-60.0, abs=0.2)
 
 

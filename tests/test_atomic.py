@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.atomic import replacing
+from ertis_numba.atomic_files import atomic_write
 
 
 def test_nothing_is_left_of_what_fails(tmp_path):
@@ -13,7 +13,7 @@ def test_nothing_is_left_of_what_fails(tmp_path):
         part.write_text("half")
         raise OSError(errno.EIO, "wanted", str(part))
 
-    with pytest.raises(OSError, match="wanted") as caught, replacing(tmp_path / "a.txt") as part:
+    with pytest.raises(OSError, match="wanted") as caught, atomic_write(tmp_path / "a.txt") as part:
         half(part)
     assert caught.value.filename == str(tmp_path / "a.txt")
     assert list(tmp_path.iterdir()) == []
@@ -27,13 +27,13 @@ def test_what_came_first_is_told_where_nothing_can_be_removed(tmp_path, monkeypa
         raise OSError(errno.EROFS, "cannot be removed", str(path))
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    with pytest.raises(OSError, match="cannot be written") as caught, replacing(tmp_path / "a.txt") as part:
+    with pytest.raises(OSError, match="cannot be written") as caught, atomic_write(tmp_path / "a.txt") as part:
         raise OSError(errno.EROFS, "cannot be written", str(part))
     assert caught.value.filename == str(tmp_path / "a.txt")
 
 
 def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
     """Where the system tells an error of a file that is open, it has no name."""
-    with pytest.raises(OSError, match="No space") as caught, replacing(tmp_path / "a.txt"):
+    with pytest.raises(OSError, match="No space") as caught, atomic_write(tmp_path / "a.txt"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a.txt")

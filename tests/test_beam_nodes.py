@@ -12,17 +12,17 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Settings
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamNodes
 from ertis_numba.stages.fitting import Spectrum
 from ertis_numba.stages.planner import Planner
-from ertis_numba.waveform import matched_spectrum
+from ertis_numba.waveform import matched_noise_spectrum
 from tests import reference
 from tests.cases import SHORT, noise
 from tests.hard_cases.tuned import tuned
 
 SPEED_M_S = sound_speed_m_s(Air())
 CALL = Call()
-SPECTRUM = Spectrum(*matched_spectrum(Settings(call=CALL), n_waves=40))
+SPECTRUM = Spectrum(*matched_noise_spectrum(Settings(call=CALL), n_waves=40))
 
 
 def random_plane(n_mics, seed):
@@ -155,8 +155,8 @@ def test_arrays_that_are_no_plane_get_direct_sums(array):
     assert pipeline.settings.accuracy.beam_taps == 0
     some = np.arange(0, len(pipeline.grid), 100)
     directions = unit_vectors(pipeline.grid.azimuth_rad[some], pipeline.grid.elevation_rad[some])
-    wanted = reference.exact(measurement.words, settings, directions, pipeline.range_m)
-    assert reference.error_db(pipeline.process(measurement).energy[some], wanted) < -35
+    wanted = reference.exact(measurement.data, settings, directions, pipeline.range_m)
+    assert reference.error_db(pipeline.process(measurement).amplitude[some], wanted) < -35
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,13 @@ def test_arrays_that_are_no_plane_get_direct_sums(array):
     [
         Accuracy(beam_taps=4),
         Accuracy(
-            precision="float32", oversampling=2, delay_taps=2, beam_taps=4, beam_density=2.0, stop_band_db=60.0, zones=1
+            precision="float32",
+            oversampling=2,
+            delay_taps=2,
+            beam_taps=4,
+            beam_density=2.0,
+            stopband_attenuation_db=60.0,
+            focal_zones=1,
         ),
     ],
 )

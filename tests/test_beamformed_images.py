@@ -35,9 +35,9 @@ def test_pipeline_gives_the_same_bits_on_any_number_of_threads(beamformer):
     settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer))
     measurement = cases.noise(settings)
     counts = range(1, KERNELS["cpu"].max_threads + 1)
-    images = [Pipeline(settings, threads=count, predict=False).process(measurement).energy for count in counts]
+    images = [Pipeline(settings, threads=count, predict=False).process(measurement).amplitude for count in counts]
     assert len({image.tobytes() for image in images}) == 1
-    plain = Pipeline(settings, device="numpy", predict=False).process(measurement).energy
+    plain = Pipeline(settings, device="numpy", predict=False).process(measurement).amplitude
     assert np.abs(images[0] - plain).max() < 1e-5 * plain.max()
 
 
@@ -62,7 +62,7 @@ def cut(points, **options):
     measurement = Simulator(scene, plan=only("spreading", "modulation")).render()
     settings = scene.sensor(None).settings()
     image = Pipeline(settings.replace(processing=settings.processing.replace(**options))).process(measurement)
-    ring = image.energy[:, np.abs(image.range_m - 1.2) < 0.015].max(axis=1)
+    ring = image.amplitude[:, np.abs(image.range_m - 1.2) < 0.015].max(axis=1)
     return np.degrees(image.azimuth_rad), 20 * np.log10(ring)
 
 
@@ -98,7 +98,7 @@ def test_capon_parts_what_delay_and_sum_does_not():
         Point(azimuth_deg=side * 4.0, range_m=1.2 + place, strength_db=-20) for side, place in ((-1, 0), (1, 0.005))
     ]
     plain = dip_db(*cut(points), -4.0, 4.0)
-    assert dip_db(*cut(points, beamformer="capon", loading=0.3), -4.0, 4.0) > plain + 6
+    assert dip_db(*cut(points, beamformer="capon", diagonal_loading=0.3), -4.0, 4.0) > plain + 6
     assert dip_db(*cut(points, beamformer="capon"), -4.0, 4.0) > plain + 2
 
 
@@ -114,7 +114,7 @@ def test_capon_parts_independent_sources_within_a_beam(device):
     weights = (np.exp(-1j * np.pi * np.multiply.outer(sines, mics)) / 16).astype(np.complex64)
     offsets = np.tile(mics.astype(np.int32) * 32, (len(sines), 1))
     power = {}
-    for name, options in {"plain": {"loading": 1e6}, "capon": {"loading": 1e-3}}.items():
+    for name, options in {"plain": {"diagonal_loading": 1e6}, "capon": {"diagonal_loading": 1e-3}}.items():
         processing = Processing(beamformer="capon", snapshots=32, **options)
         out = np.empty((len(sines), 32), dtype=np.float32)
         AdaptiveBeamform(processing, KERNELS[device], KERNELS[device].memory(), offsets, weights)(signals[:, None], out)
@@ -133,8 +133,8 @@ def test_capon_parts_independent_sources_within_a_beam(device):
         ({"dmas_order": 9}, r"processing\.dmas_order is 9; give a whole number from 2 to 8"),
         ({"snapshots": 0}, r"processing\.snapshots is 0; give a whole number from 1 to 32"),
         ({"snapshots": 33}, r"processing\.snapshots is 33; give a whole number from 1 to 32"),
-        ({"loading": 0.0}, r"processing\.loading is 0; give a number from 1e-06 to 1e\+06"),
-        ({"loading": math.nan}, r"processing\.loading is nan; give a finite number"),
+        ({"diagonal_loading": 0.0}, r"processing\.diagonal_loading is 0; give a number from 1e-06 to 1e\+06"),
+        ({"diagonal_loading": math.nan}, r"processing\.diagonal_loading is nan; give a finite number"),
         (
             {"beamformer": "dmas", "method": "paper"},
             r"processing\.method is 'paper', which can delay_and_sum only; give 'fast' with .*'dmas'",
@@ -145,8 +145,8 @@ def test_capon_parts_independent_sources_within_a_beam(device):
         ),
     ],
 )
-def test_settings_that_cannot_be(options, told):
-    with pytest.raises(ArgumentError, match=told):
+def test_settings_that_cannot_be(options, reported):
+    with pytest.raises(ArgumentError, match=reported):
         Processing(**options)
 
 

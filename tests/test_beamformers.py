@@ -111,7 +111,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
 @pytest.mark.parametrize("n_mics", [2, 8, 31])
 @pytest.mark.parametrize(
     ("beamformer", "options"),
-    [("coherence_factor", {}), ("capon", {}), ("capon", {"loading": 1e-6, "snapshots": 32})]
+    [("coherence_factor", {}), ("capon", {}), ("capon", {"diagonal_loading": 1e-6, "snapshots": 32})]
     + [("dmas", {"dmas_order": order}) for order in (2, 5, 8)],
 )
 def test_what_all_microphones_hear_alike_keeps_its_level(kernel_set, beamformer, options, n_mics):
@@ -139,7 +139,7 @@ def test_one_microphone_is_its_envelope(kernel_set, beamformer):
 def test_capon_of_much_loading_is_delay_and_sum(kernel_set):
     signals = complex_noise(8, 40)
     expected = np.abs(signals.mean(axis=0))
-    np.testing.assert_allclose(combined(kernel_set, "capon", signals, loading=1e6), expected, rtol=1e-4)
+    np.testing.assert_allclose(combined(kernel_set, "capon", signals, diagonal_loading=1e6), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("loading", [1e-3, 0.1, 10.0])
@@ -149,7 +149,7 @@ def test_capon_of_one_snapshot_knows_the_coherence_factor_only(kernel_set, loadi
     factor = combined(kernel_set, "coherence_factor", signals) / beams
     expected = beams * loading / (loading + 8 * (1 - factor))
     np.testing.assert_allclose(
-        combined(kernel_set, "capon", signals, snapshots=1, loading=loading), expected, rtol=1e-5
+        combined(kernel_set, "capon", signals, snapshots=1, diagonal_loading=loading), expected, rtol=1e-5
     )
 
 

@@ -118,16 +118,16 @@ def test_right_image_passes_and_its_error_is_told(image):
 )
 def test_refuses_a_wrong_image(image, wrong):
     with pytest.raises(DataError, match=r"image of 7 directions is .* dB off the exact one; wanted at most -30 dB"):
-        checks.require_exact(image.replace(energy=wrong(image.energy)), noise(SHORT))
+        checks.require_exact(image.replace(amplitude=wrong(image.amplitude)), noise(SHORT))
 
 
 @pytest.mark.parametrize("shift", [(3, 0), (0, 30)])
 def test_refuses_another_strongest_reflector(image, shift):
-    energy = np.full_like(image.energy, 0.1)
-    energy[2, 50] = 1.0
+    amplitude = np.full_like(image.amplitude, 0.1)
+    amplitude[2, 50] = 1.0
     with pytest.raises(DataError, match=r"strongest reflector of one image, at 0.591 m, has -20.0 dB in another"):
         checks.require_same_reflector(
-            image.replace(energy=energy), image.replace(energy=np.roll(energy, shift, axis=(0, 1)))
+            image.replace(amplitude=amplitude), image.replace(amplitude=np.roll(amplitude, shift, axis=(0, 1)))
         )
 
 
@@ -165,11 +165,11 @@ def test_command_refuses_a_file_without_a_place_before_it_measures(tmp_path):
 def test_subject_is_the_shipped_recording_or_noise(monkeypatch):
     measurement, source = subject.measurement()
     assert source == "data/synthetic/reflectors.h5"
-    assert measurement.words.shape == (163_840,)
+    assert measurement.data.shape == (163_840,)
     monkeypatch.setattr(subject, "_RECORDING", Path("nowhere.h5"))
     measurement, source = subject.measurement()
     assert source == "white noise, seed 1"
-    assert measurement.words.shape == (163_840,)
+    assert measurement.data.shape == (163_840,)
 
 
 def test_machine_is_named(monkeypatch):

@@ -34,7 +34,7 @@ GLITCHES = (41_646, 43_221, 45_321, 46_371, 46_896, 48_471, 142_447, 143_497, 14
 
 def recorded(name):
     with open_recording(SYNTHETIC / f"{name}.h5") as recording:
-        return np.ascontiguousarray(recording[0].words)
+        return np.ascontiguousarray(recording[0].data)
 
 
 def verdict(words, rate_hz=RATE_HZ, **options):
@@ -124,7 +124,7 @@ def test_scenes_are_not_refused(path):
     first = scene.sensors[0]
     sensors = (first.replace(recording=Recording(n_samples=2 * SHORT)), *scene.sensors[1:])
     simulator = Simulator(scene.replace(sensors=sensors))
-    assert verdict(simulator.render().words) is None
+    assert verdict(simulator.render().data) is None
 
 
 def test_broken_microphones_are_told_but_not_refused():
@@ -152,7 +152,7 @@ def test_words_may_be_altered_one_by_one():
 
 
 @pytest.mark.parametrize("most", [2, 256], ids=["bits", "bytes"])
-def test_flipped_bits_are_not_told_from_what_a_real_sensor_does(most):
+def test_flipped_bits_are_not_told_from_what_a_real_sensor_does(largest):
     random = np.random.default_rng(5)
     check = BitCheck(len(REAL), RATE_HZ, splices=True)
     clear_of_glitches = [
@@ -160,13 +160,13 @@ def test_flipped_bits_are_not_told_from_what_a_real_sensor_does(most):
     ]
     for place in clear_of_glitches:
         words = REAL.copy()
-        words.view(np.uint8)[4 * place + random.integers(0, 4)] ^= random.integers(1, most)
+        words.view(np.uint8)[4 * place + random.integers(0, 4)] ^= random.integers(1, largest)
         assert check.check(words) is None
 
 
-def lost_and_added(words, random, *, repeats, most=4_000):
+def lost_and_added(words, random, *, repeats, largest=4_000):
     """Words of which some bytes are missing in one place while in another as many are too many, at least 8 away."""
-    data, n_bytes = words.tobytes(), int(random.integers(1, most + 1))
+    data, n_bytes = words.tobytes(), int(random.integers(1, largest + 1))
     lost, added = 0, 0
     while abs(lost - added) < n_bytes + 8:
         lost, added = random.integers(n_bytes, len(data) - n_bytes, 2)
@@ -195,7 +195,7 @@ def packets_lost(words, random):
 KINDS = {
     "repeated": lambda words, random: lost_and_added(words, random, repeats=True),
     "random": lambda words, random: lost_and_added(words, random, repeats=False),
-    "few repeated": lambda words, random: lost_and_added(words, random, repeats=True, most=64),
+    "few repeated": lambda words, random: lost_and_added(words, random, repeats=True, largest=64),
     "replaced": replaced,
     "packets": packets_lost,
 }
@@ -211,10 +211,10 @@ FOUND = {
 def test_splices_are_found(name):
     words, random = REAL if name == "real" else recorded(name), np.random.default_rng(6)
     check = BitCheck(len(words), RATE_HZ, splices=True)
-    for kind, least in FOUND[name].items():
+    for kind, smallest in FOUND[name].items():
         found = [check.check(KINDS[kind](words, random)) for _ in range(100)]
         assert {*found} <= {None, "splice", "noise"}
-        assert np.mean([item is not None for item in found]) >= least, kind
+        assert np.mean([item is not None for item in found]) >= smallest, kind
     assert check.check(words) is None
     assert BitCheck(len(words), RATE_HZ).check(KINDS["repeated"](words, random)) is None  # unless asked for
 

@@ -39,8 +39,8 @@ def errors(measurement, **pipeline):
     """True and predicted error of the image, and the budget."""
     with Pipeline(measurement.settings, "cpu", 1, predict=False, **pipeline) as made:
         image = made.process(measurement)
-    exact = verification.exact_image(image, measurement).energy
-    return verification.error_db(image.energy, exact), predict(planner_of(image, measurement, CPU, threads=1))
+    exact = verification.exact_image(image, measurement).amplitude
+    return verification.error_db(image.amplitude, exact), predict(planner_of(image, measurement, CPU, threads=1))
 
 
 @pytest.mark.parametrize("sound", ["direct", "hum"])
@@ -58,7 +58,7 @@ def test_sound_outside_the_window_does_not_wrap_into_pcm_images(sound, budget_db
 def test_prediction_does_not_depend_on_the_magnitude_of_samples(beamformer, exponent):
     settings = PCM.replace(processing=PCM.processing.replace(beamformer=beamformer))
     given = pcm(settings, direct=0.5, echo=0.01)
-    scaled = Measurement(np.ldexp(given.words, exponent), settings)
+    scaled = Measurement(np.ldexp(given.data, exponent), settings)
     with Pipeline(settings, "cpu", 1, predict=False) as made:
         wanted, found = (
             predict(planner_of(made.process(each), each, CPU, threads=1)).predicted_error_db for each in (given, scaled)
@@ -84,7 +84,7 @@ def test_predictions_for_one_microphone_are_not_optimistic(place_m, budget_db):
 
 
 @pytest.mark.parametrize(
-    "processing", [{"beamformer": "dmas", "dmas_order": 8}, {"beamformer": "capon", "loading": 1e-3}]
+    "processing", [{"beamformer": "dmas", "dmas_order": 8}, {"beamformer": "capon", "diagonal_loading": 1e-3}]
 )
 def test_budgets_of_adaptive_beamformers_are_kept_or_warned_of(processing):
     settings = PCM.replace(processing=PCM.processing.replace(**processing), accuracy=Accuracy(max_error_db=-35.0))
@@ -94,7 +94,7 @@ def test_budgets_of_adaptive_beamformers_are_kept_or_warned_of(processing):
 
 def test_sensitivity_has_an_inverse_and_makes_plans_more_exact():
     for beamformer in ("delay_and_sum", "coherence_factor", "dmas", "capon"):
-        processing = Processing(beamformer=beamformer, dmas_order=4, loading=1e-2)
+        processing = Processing(beamformer=beamformer, dmas_order=4, diagonal_loading=1e-2)
         sensitivity = Sensitivity.of(processing, 32)
         for power in (1e-10, 1e-5, 1e-2):
             assert sensitivity.output(sensitivity.beams(power)) == pytest.approx(power)
@@ -118,8 +118,8 @@ def test_process_warns_on_stderr_and_in_the_file(tmp_path):
         assert images.error_warning in done.stderr
         assert images.predicted_error_db > -100.0 == images.max_error_db
         assert images.error_warning == json.loads(done.stdout)["sensors"][0]["error_warning"]
-    told = CliRunner().invoke(cli, ["info", str(target)]).stdout
-    assert "images may exceed the error budget" in told
+    reported = CliRunner().invoke(cli, ["info", str(target)]).stdout
+    assert "images may exceed the error budget" in reported
 
 
 def test_process_is_silent_where_the_budget_is_kept(tmp_path):
@@ -162,7 +162,7 @@ def test_process_quiet_prints_neither_plan_nor_verification(tmp_path):
     assert (done.exit_code, done.output) == (0, "")
 
 
-CAPON = PCM.processing.replace(beamformer="capon", loading=1e-3, snapshots=8)
+CAPON = PCM.processing.replace(beamformer="capon", diagonal_loading=1e-3, snapshots=8)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ from click.testing import CliRunner
 from ertis_bench import budgets
 from ertis_cli.main import cli
 
+from ertis_numba.analysis.call_match import call_match, first_call_match
 from ertis_numba.errors import CallMismatchWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.stages.call_match import call_match, first_call_match
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.waveform import call_at
 
@@ -55,7 +55,7 @@ def test_call_match_finds_other_presets(emitted):
 
 
 def test_call_match_accepts_the_call_beside_a_louder_reversed_one():
-    both = heard(CALL).words + 3 * heard(REVERSED, echoes=((9e-3, 1.0),)).words
+    both = heard(CALL).data + 3 * heard(REVERSED, echoes=((9e-3, 1.0),)).data
     assert call_match(Measurement(both, SETTINGS)).matches
 
 

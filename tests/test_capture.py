@@ -18,9 +18,9 @@ import pytest
 from ertis_numba.capture import Session
 from ertis_numba.capture.gap_reasons import DROPPED, NOT_TRIGGERED
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
-from ertis_numba.devices.emulator.faults import Fault, Faults, Spoilt
+from ertis_numba.devices.emulator.faults import BlockFault, Faults, Spoilt
 from ertis_numba.devices.setup import Setup
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.journal import Journal
 from ertis_numba.settings import Recording, Settings
@@ -38,7 +38,7 @@ SETTINGS = Settings(recording=Recording(n_samples=SHORT)).replace(
 @pytest.fixture(scope="module")
 def words():
     """Four measurements, different parts of a simulated one."""
-    whole = open_recording(ROOT / "data" / "synthetic" / "reflectors.h5")[0].words
+    whole = open_recording(ROOT / "data" / "synthetic" / "reflectors.h5")[0].data
     return [np.ascontiguousarray(whole[start : start + SHORT]) for start in range(0, 4 * SHORT, SHORT)]
 
 
@@ -51,7 +51,7 @@ class Dropping(Faults):
 
     def spoil(self, block):
         if int.from_bytes(block[4:8], "little") in self._counters:
-            return Spoilt((), (Fault("drop", 0, len(block)),))
+            return Spoilt((), (BlockFault("drop", 0, len(block)),))
         return super().spoil(block)
 
 
@@ -68,7 +68,7 @@ class Capture:
             )
             for name in names
         ]
-        sonars = {name: stack.enter_context(Sonar.open(str(folder / name))) for name in names}
+        sonars = {name: stack.enter_context(SonarDriver.open(str(folder / name))) for name in names}
         setup = Setup.of(SETTINGS)
         for sonar in sonars.values():
             sonar.configure(setup)
@@ -119,7 +119,7 @@ def test_what_is_stored_is_what_was_sent(captures, words):
     with capture.recording() as recording:
         assert len(recording) == 6
         for number, measurement in enumerate(recording):
-            np.testing.assert_array_equal(measurement.words, words[number % 4])
+            np.testing.assert_array_equal(measurement.data, words[number % 4])
             assert measurement.stamp.sequence == number
             assert measurement.stamp.sync_count >= number  # ticks that a busy machine has missed are left out
         times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
@@ -148,7 +148,7 @@ def test_groups_of_a_sync_chain(captures, words):
     for name in names:
         with capture.recording(name) as recording:
             for measurement in recording:
-                index = next(i for i in range(4) if np.array_equal(words[i], measurement.words))
+                index = next(i for i in range(4) if np.array_equal(words[i], measurement.data))
                 rows.setdefault(measurement.stamp.sync_count, set()).add(index)
     assert set(rows) <= set(range(8))
     assert all(len(indices) == 1 for indices in rows.values())
@@ -222,9 +222,9 @@ class Ordered:
             self.numbers[entry.measurement.stamp.sensor].append(entry.measurement.stamp.sequence)
         return self._journal.append(entries)
 
-    def note_gap(self, sensor, first, last, reason, *, epoch):
+    def note_gap(self, sensor, first, last, reason, *, session_id):
         self.numbers[sensor] += range(first, last + 1)
-        self._journal.note_gap(sensor, first, last, reason, epoch=epoch)
+        self._journal.note_gap(sensor, first, last, reason, session_id=session_id)
 
 
 def test_gaps_and_measurements_come_in_order(captures):
@@ -276,7 +276,7 @@ def test_an_unplugged_sensor_comes_back(captures, words, trigger):
         assert sorted([*sequences, *gaps]) == list(range(sequences[-1] + 1))
         assert all(gap.reason == "the sensor was unplugged" for gap in recording.gaps)
         sent = {zlib.crc32(each.tobytes()) for each in words}
-        assert all(zlib.crc32(measurement.words.tobytes()) in sent for measurement in recording)
+        assert all(zlib.crc32(measurement.data.tobytes()) in sent for measurement in recording)
 
 
 @pytest.mark.alone

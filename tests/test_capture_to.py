@@ -16,11 +16,11 @@ from ertis_cli.main import cli
 from ertis_numba.capture import Session
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.log import logger
-from ertis_numba.network.processing import Options
+from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Processing, Recording, Settings
@@ -49,7 +49,7 @@ TURNED = ((0.0, -0.5, 0.4), (0.0, 0.0, -(0.5**0.5), 0.5**0.5))
 @pytest.fixture(scope="module")
 def words():
     """Four measurements, different parts of a simulated one."""
-    whole = open_recording("data/synthetic/reflectors.h5")[0].words
+    whole = open_recording("data/synthetic/reflectors.h5")[0].data
     return [np.ascontiguousarray(whole[start : start + N_SAMPLES]) for start in range(0, 4 * N_SAMPLES, N_SAMPLES)]
 
 
@@ -86,7 +86,7 @@ def checks(central):
 
 
 def kept(events, name="crc32"):
-    return {(each["sensor"], each["epoch"], each["sequence"]): each[name] for each in events if name in each}
+    return {(each["sensor"], each["session_id"], each["sequence"]): each[name] for each in events if name in each}
 
 
 @pytest.mark.usefixtures("sensors")
@@ -107,14 +107,14 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
         hellos = {hello.sensor: hello for hello, _ in central.hellos.queue}
     assert code == 0, err
     assert kept(events) == checks(central)
-    times = {(name, epoch, number): message.timestamp_ns for (name, epoch), held in central.held.items()
+    times = {(name, session_id, number): message.timestamp_ns for (name, session_id), held in central.held.items()
              for number, (message, _) in held.items()}  # fmt: skip
     assert times == kept(events, "timestamp_ns")
     assert all(each["uncertainty_ns"] > 0 for each in events if each["event"] == "kept")
-    (epoch,) = {epoch for _, epoch, _ in kept(events)}
+    (session_id,) = {session_id for _, session_id, _ in kept(events)}
     given = {"one": words, "two": words[::-1]}
     assert checks(central) == {
-        (name, epoch, number): zlib.crc32(each.tobytes())
+        (name, session_id, number): zlib.crc32(each.tobytes())
         for name, several in given.items()
         for number, each in enumerate(several)
     }
@@ -124,10 +124,10 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
     final = events[-1]
     assert (final["event"], final["output"], final["kept"], final["lost"]) == ("captured", central.address, 8, 0)
     assert final["central"] == {"stored": 8, "accepted": 0, "dropped": {}}
-    assert [final[name] for name in ("refused", "overwritten", "damaged", "unsettled", "reconnects")] == [0] * 5
-    settled = [each for each in events if each["event"] == "settled" and each["sensor"] == "one"]
-    assert settled[-1] == {
-        "event": "settled", "sensor": "one", "epoch": epoch, "settled": 3, "status": "stored", "dropped": []
+    assert [final[name] for name in ("refused", "overwritten", "damaged", "unacked", "reconnects")] == [0] * 5
+    acked_through = [each for each in events if each["event"] == "acked_through" and each["sensor"] == "one"]
+    assert acked_through[-1] == {
+        "event": "acked_through", "sensor": "one", "session_id": session_id, "acked_through": 3, "status": "stored", "dropped": []
     }  # fmt: skip
     assert not list(tmp_path.glob("*.h5*"))
 
@@ -149,7 +149,7 @@ def test_what_never_arrives_is_an_error(tmp_path):
     assert code == 1
     message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
     assert err.splitlines()[-1].startswith(f"ertis: error: {message}, where nobody answers; start 'ertis record' or ")
-    assert (events[-1]["event"], events[-1]["kept"], events[-1]["unsettled"]) == ("captured", 3, 3)
+    assert (events[-1]["event"], events[-1]["kept"], events[-1]["unacked"]) == ("captured", 3, 3)
 
 
 @pytest.mark.usefixtures("sensors")
@@ -177,7 +177,7 @@ def test_no_more_is_kept_than_there_is_room_for(tmp_path, words, given, lost, re
     size_mb = 2.5 * words[0].nbytes / 1e6
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", *given, size_mb, "-n", 3, "--patience", "0.1")
     assert code == 1
-    assert (events[-1][lost], events[-1]["unsettled"]) == (1, 2)
+    assert (events[-1][lost], events[-1]["unacked"]) == (1, 2)
     assert remedy in err.splitlines()[-1]
 
 
@@ -187,8 +187,8 @@ def test_what_the_central_node_drops_is_told(tmp_path):
         central.dropped = ((0, "superseded"), (2, "failed twice"))
         code, events, err = run(tmp_path, "--to", central.address, "-n", 3)
     assert code == 0, err
-    told = [each["dropped"] for each in events if each["event"] == "settled" and each["dropped"]]
-    assert told == [[[0, "superseded"], [2, "failed twice"]]]
+    reported = [each["dropped"] for each in events if each["event"] == "acked_through" and each["dropped"]]
+    assert reported == [[[0, "superseded"], [2, "failed twice"]]]
     assert events[-1]["central"] == {"stored": 0, "accepted": 3, "dropped": {"superseded": 1, "failed twice": 1}}
     assert "1 measurement dropped by the central node, superseded" in err
 
@@ -251,15 +251,15 @@ def test_keys(tmp_path):
         other, _ = KeyPair.new("other").save(tmp_path / "keys")
         code, _, err = run(tmp_path, *to, "--key", other, "--server-key", theirs.public)
         assert (code, central.taken) == (1, 2)
-        told = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
-        assert err.splitlines()[-1].startswith(f"ertis: error: {told}")
+        reported = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
+        assert err.splitlines()[-1].startswith(f"ertis: error: {reported}")
         assert err.splitlines()[-1].endswith(": the central node does not know this key; have it listed there by "
                                              "'ertis keys allow'")  # fmt: skip
 
 
 @pytest.mark.usefixtures("sensors")
 def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
-    publisher = Publisher(Options(publish="tcp://127.0.0.1:0"), logger("test"))
+    publisher = Publisher(ProcessingOptions(publish="tcp://127.0.0.1:0"), logger("test"))
     publisher.start()
     try:
         code, events, err = run(tmp_path, "--to", publisher.address, "-n", 1, "--patience", "1")
@@ -274,17 +274,17 @@ def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
 def test_nodes_that_send_one_sensor_are_told(tmp_path):
     notes = [queue.Queue(), queue.Queue()]
     with running(tmp_path) as central, contextlib.ExitStack() as stack:
-        for epoch, told in enumerate(notes):
-            node = stack.enter_context(SensorNode(central.address, on_note=told.put))
+        for session_id, reported in enumerate(notes):
+            node = stack.enter_context(SensorNode(central.address, on_note=reported.put))
             node.add_sensor("left", TINY)
-            node.append(entries(1, epoch=epoch))
-        for told in notes:
-            assert told.get(timeout=SOON_S) == (
+            node.append(entries(1, session_id=session_id))
+        for reported in notes:
+            assert reported.get(timeout=SOON_S) == (
                 "another sensor node sends sensor left, too; give each a name of its own (--name), or end one"
             )
-        node.append(entries(1, epoch=7))
+        node.append(entries(1, session_id=7))
         assert node.flush(SOON_S)
-    assert all(told.empty() for told in notes)
+    assert all(reported.empty() for reported in notes)
 
 
 @pytest.mark.usefixtures("sensors")
@@ -333,16 +333,16 @@ def test_what_is_refused_was_not_begun(tmp_path, monkeypatch, arguments, message
 def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
     del sensors
     with (
-        Sonar.open(str(tmp_path / "one")) as sonar,
+        SonarDriver.open(str(tmp_path / "one")) as sonar,
         SensorNode("tcp://127.0.0.1:9", spool=tmp_path / "spool", spool_bytes=2 * 4 * N_SAMPLES) as node,
     ):
         sonar.configure(Setup.of(SETTINGS))
-        told = []
-        session = Session({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=told.extend)
+        reported = []
+        session = Session({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=reported.extend)
         session.run(node)
         counts = session.counts["one"]
         assert (counts.stored, dict(counts.missing)) == (2, {"there was no room for it": 3})
-        assert [entry.measurement.stamp.sequence for entry in told] == [0, 1]
+        assert [entry.measurement.stamp.sequence for entry in reported] == [0, 1]
         assert node.counts["one"].refused == 3
 
 
@@ -362,6 +362,7 @@ def test_a_central_node_records_it(tmp_path):
     for name in ("one", "two"):
         with open_recording(path, sensor=name) as recording:
             found |= {
-                (name, each.stamp.epoch, each.stamp.sequence): zlib.crc32(each.words.tobytes()) for each in recording
+                (name, each.stamp.session_id, each.stamp.sequence): zlib.crc32(each.data.tobytes())
+                for each in recording
             }
     assert found == kept(events)

@@ -58,14 +58,14 @@ def test_processing_gets_each_measurement_once(archive, tmp_path):
     with running(tmp_path if archive else None, processing=images) as central, Node(central.address) as node:
         welcome = node.hello()
         assert (welcome.state, welcome.acks) == ("processing", "stored" if archive else "accepted")
-        assert welcome.settled == (-1 if archive else 9)
+        assert welcome.acked_through == (-1 if archive else 9)
         node.measure(*given, given[0])
         assert node.hear_settled(12).status == welcome.acks
         node.send(Ping())
         node.hear(Pong)
     assert [each[0] for each in images.offered] == [10, 11, 12]
     assert all(
-        (words == entry.measurement.words).all() for (_, words, _), entry in zip(images.offered, given, strict=True)
+        (words == entry.measurement.data).all() for (_, words, _), entry in zip(images.offered, given, strict=True)
     )
     assert images.known[0][0] == "left"
     sensor = central.latest.sensors["left"]
@@ -80,10 +80,10 @@ def test_without_an_archive_a_run_is_remembered():
             node.hear_settled(12)
             node.send(messages.Bye())
         with Node(central.address) as node:
-            assert node.hello(first=11).settled == 12
+            assert node.hello(first=11).acked_through == 12
             node.measure(entries(2)[1])
             node.send(Ping())
-            assert node.hear(Ack).settled == 12
+            assert node.hear(Ack).acked_through == 12
     assert central.latest.sensors["left"].received == 3
 
 
@@ -112,9 +112,9 @@ def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
         os.close(end)
     assert stored(tmp_path)[0] == wanted(given)
     assert central.latest.refused["internal"] >= 1
-    told = [event["text"] for event in central.events if event["event"] == "internal"]
-    assert set(told) == {"MemoryError: no more"}
-    assert len(told) <= 2  # once a second
+    reported = [event["text"] for event in central.events if event["event"] == "internal"]
+    assert set(reported) == {"MemoryError: no more"}
+    assert len(reported) <= 2  # once a second
     with running(tmp_path):  # the folder is free again
         pass
 
@@ -126,11 +126,11 @@ def test_what_processing_drops_is_told_to_its_node(monkeypatch):
         drops.clear()
         node.hello()
         drops.append([("left", EPOCH, 10, "superseded")])
-        told = ()
-        while not told:
+        reported = ()
+        while not reported:
             node.send(Ping())
-            told = node.hear(Ack).dropped
-    assert told == ((10, "superseded"),)
+            reported = node.hear(Ack).dropped
+    assert reported == ((10, "superseded"),)
 
 
 class Loading(Images):

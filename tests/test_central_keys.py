@@ -77,8 +77,8 @@ def test_a_list_of_keys_that_cannot_be_used_is_told(tmp_path):
     with running(tmp_path / "a", keys=given) as central:
         for number, content in enumerate((b"[", listed)):
             given.allow.write_bytes(content)
-            while len(told := [event["text"] for event in central.events if event["event"] == "keys"]) <= number:
+            while len(reported := [event["text"] for event in central.events if event["event"] == "keys"]) <= number:
                 select.select([], [], [], 0.01)
-            assert central.status().keys_note == (told[0] if content == b"[" else "")
-    assert str(given.allow) in told[0]
-    assert told[1] == "the list of keys can be used again"
+            assert central.status().keys_note == (reported[0] if content == b"[" else "")
+    assert str(given.allow) in reported[0]
+    assert reported[1] == "the list of keys can be used again"

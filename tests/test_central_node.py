@@ -5,7 +5,7 @@ import random
 import msgspec
 import pytest
 
-from ertis_numba.errors import ArgumentError, InUseError
+from ertis_numba.errors import ArgumentError, JournalInUseError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.network.central_node._condition import Condition
@@ -21,7 +21,7 @@ def test_what_is_acked_is_in_the_recording(tmp_path):
     given = entries(5)
     with running(archive=Archive(tmp_path / "a")) as central, Node(central.address) as node:
         welcome = node.hello(first=10)
-        assert (welcome.state, welcome.acks, welcome.settled) == ("storage", "stored", -1)
+        assert (welcome.state, welcome.acks, welcome.acked_through) == ("storage", "stored", -1)
         node.measure(*given)
         assert node.hear_settled(14).status == "stored"
     assert stored(tmp_path / "a") == (wanted(given), [("left", EPOCH, 0, 9, "never reached the central node")])
@@ -37,7 +37,7 @@ def test_a_number_is_stored_once_and_acked_again(tmp_path):
         node.measure(*given[1:])
         node.send(Ping())
         assert node.hear(Pong).state == "storage"
-        assert node.hear(Ack).settled == 12
+        assert node.hear(Ack).acked_through == 12
     assert stored(tmp_path)[0] == wanted(given)
     assert (central.latest.sensors["left"].received, central.latest.sensors["left"].repeated) == (3, 2)
 
@@ -49,7 +49,7 @@ def test_nothing_beyond_a_hole_is_taken(tmp_path):
         node.measure(given[0])
         node.hear_settled(10)
         node.measure(given[2], given[3])
-        assert [node.hear(Ack).settled for _ in range(1)] == [10]
+        assert [node.hear(Ack).acked_through for _ in range(1)] == [10]
         node.measure(*given[1:])
         node.hear_settled(13)
     assert stored(tmp_path)[0] == wanted(given)
@@ -60,9 +60,9 @@ def test_gaps_settle_in_order(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         node.measure(given[0])
-        node.send(Gap(sensor="left", epoch=EPOCH, first=12, last=13, reason="beyond a hole"))
-        node.send(Gap(sensor="left", epoch=EPOCH, first=10, last=12, reason="the ring was full"))
-        node.send(Gap(sensor="left", epoch=EPOCH, first=11, last=12, reason="the ring was full"))
+        node.send(Gap(sensor="left", session_id=EPOCH, first=12, last=13, reason="beyond a hole"))
+        node.send(Gap(sensor="left", session_id=EPOCH, first=10, last=12, reason="the ring was full"))
+        node.send(Gap(sensor="left", session_id=EPOCH, first=11, last=12, reason="the ring was full"))
         node.measure(*given[3:])
         node.hear_settled(15)
     found, missing = stored(tmp_path)
@@ -79,7 +79,7 @@ def test_a_node_that_comes_back_goes_on_where_it_was(tmp_path):
             node.measure(*given[:3])
             node.hear_settled(12)
         with Node(central.address) as node:
-            assert node.hello(first=12).settled == 12
+            assert node.hello(first=12).acked_through == 12
             node.measure(*given[2:])
             node.hear_settled(15)
     assert stored(tmp_path)[0] == wanted(given)
@@ -89,7 +89,7 @@ def test_the_next_run_of_the_central_node_knows_what_is_stored(tmp_path):
     given = entries(6)
     for first, last in ((0, 3), (2, 6)):
         with running(tmp_path) as central, Node(central.address) as node:
-            assert node.hello(first=10 + first).settled == (-1 if first == 0 else 12)
+            assert node.hello(first=10 + first).acked_through == (-1 if first == 0 else 12)
             node.measure(*given[first:last])
             node.hear_settled(9 + last)
     found, missing = stored(tmp_path)
@@ -141,7 +141,7 @@ def test_air_may_change(tmp_path):
 
 
 WRONG = {
-    "before its hello": ({"epoch": 6}, "hello", "say hello first"),
+    "before its hello": ({"session_id": 6}, "hello", "say hello first"),
     "too short": ({"words": b"1234"}, "message", "has 4 bytes, its settings say 4096"),
     "of another CRC-32": ({"crc32": 1}, "message", "another CRC-32"),
     "in no air": ({"temperature_c": float("nan")}, "message", "air.temperature_c"),
@@ -203,11 +203,11 @@ def test_garbage_is_counted_and_harms_nobody(tmp_path):
         stranger.socket.send_multipart([b""])
         node.measure(*given)
         node.hear_settled(12)
-        told = ""
-        while "has version 2 " not in told:  # one bit makes no 2 of a 1
+        reported = ""
+        while "has version 2 " not in reported:  # one bit makes no 2 of a 1
             if not stranger.socket.poll(500):  # who does not read misses answers
                 stranger.socket.send_multipart([b"eRTN\x02more"])
-            told = stranger.hear(Refused).reason
+            reported = stranger.hear(Refused).reason
     assert stored(tmp_path)[0] == wanted(given)
     refused = central.latest.refused
     assert refused["version"] >= 1
@@ -218,7 +218,7 @@ def test_garbage_is_counted_and_harms_nobody(tmp_path):
 def test_a_gap_that_no_file_can_hold_is_refused(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello(first=0)
-        node.send(Gap(sensor="left", epoch=EPOCH, first=0, last=3, reason="two\nlines"))
+        node.send(Gap(sensor="left", session_id=EPOCH, first=0, last=3, reason="two\nlines"))
         assert node.hear(Refused).code == "message"
 
 
@@ -249,7 +249,7 @@ def test_nodes_that_are_silent_are_forgotten(tmp_path, monkeypatch):
         monkeypatch.undo()
         node.measure(*entries(1, first=11))
         assert node.hear(Refused).code == "hello"
-        assert node.hello(first=11).settled == 10
+        assert node.hello(first=11).acked_through == 10
 
 
 def test_a_central_node_needs_something_to_do():
@@ -263,7 +263,7 @@ def test_it_is_run_in_a_with_statement(tmp_path):
 
 
 def test_a_folder_belongs_to_one_central_node(tmp_path):
-    with running(tmp_path), pytest.raises(InUseError, match="in use by another central node"), running(tmp_path):
+    with running(tmp_path), pytest.raises(JournalInUseError, match="in use by another central node"), running(tmp_path):
         pass
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scipy.special
 
+from ertis_numba.analysis.cfar import METHODS, _reference, cfar, cfar_peaks, clean, threshold_factor
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.stages.cfar import METHODS, _reference, cfar, cfar_peaks, clean, threshold_factor
-from ertis_numba.stages.detect import find_peaks
 from tests.cases import noise
 from tests.test_detect import image_of
 
@@ -93,7 +93,7 @@ def test_false_alarms_in_noise(method, false_alarm):
     for place in (0, MIDDLE, -1):
         assert_share(found[:, place], false_alarm)
     quieter = given.replace(
-        energy=given.energy[:5000] * np.float32(2**-30),
+        amplitude=given.amplitude[:5000] * np.float32(2**-30),
         azimuth_rad=given.azimuth_rad[:5000],
         elevation_rad=given.elevation_rad[:5000],
     )
@@ -157,7 +157,7 @@ def places_of(place, count, *, step=2, guard=11):
 def test_reference_bins_are_as_near_as_can_be():
     """At the usual spacing of ranges: every other bin, ten bins aside, and at both ends the same."""
     image = image_of([], directions="2d:2", range_m=(0.8, 1.7))
-    count = image.energy.shape[1]
+    count = image.amplitude.shape[1]
     places = _reference(image, N)
     for place in range(count):
         assert places[:, place].tolist() == places_of(place, count), place
@@ -169,18 +169,18 @@ def test_reference_bins_are_as_near_as_can_be():
 def test_is_the_reference(method):
     """The same, bin by bin; where it is a matter of the last digit, either is right."""
     image = image_of([(12.0, 0.0, 1.3, 0.3)], directions="2d:5", range_m=(0.8, 1.7))
-    values = np.random.default_rng(1).rayleigh(size=image.energy.shape) * 0.1
-    image = image.replace(energy=(image.energy + values).astype(np.float32))
-    alpha, count = threshold_factor(method, N, 1e-2), image.energy.shape[1]
-    above = np.zeros(image.energy.shape)
+    values = np.random.default_rng(1).rayleigh(size=image.amplitude.shape) * 0.1
+    image = image.replace(amplitude=(image.amplitude + values).astype(np.float32))
+    alpha, count = threshold_factor(method, N, 1e-2), image.amplitude.shape[1]
+    above = np.zeros(image.amplitude.shape)
     for direction, place in np.ndindex(above.shape):
-        power = image.energy[direction, places_of(place, count)].astype(float) ** 2
-        told = {
+        power = image.amplitude[direction, places_of(place, count)].astype(float) ** 2
+        reported = {
             "ordered_statistic": np.sort(power)[23],
             "cell_averaging": power.mean(),
             "greatest_of": max(power[:16].mean(), power[16:].mean()),
         }[method]
-        above[direction, place] = image.energy[direction, place].astype(float) ** 2 / (alpha * told)
+        above[direction, place] = image.amplitude[direction, place].astype(float) ** 2 / (alpha * reported)
     sure = np.abs(above - 1) > 1e-5
     assert np.count_nonzero(~sure) <= 1
     assert (above > 1).any()
@@ -190,8 +190,8 @@ def test_is_the_reference(method):
 def test_weak_reflector_beside_a_strong_one():
     """26 dB weaker and 20 cm behind: the mean is blinded, the ordered statistic is not."""
     image = image_of([(0.0, 0.0, 1.2, 1.0), (0.0, 0.0, 1.4, 0.05)], directions="2d:3", range_m=(0.9, 1.65))
-    values = np.random.default_rng(1).rayleigh(size=image.energy.shape) * 0.002
-    image = image.replace(energy=(image.energy + values).astype(np.float32))
+    values = np.random.default_rng(1).rayleigh(size=image.amplitude.shape) * 0.002
+    image = image.replace(amplitude=(image.amplitude + values).astype(np.float32))
     weak = np.argmin(np.abs(image.range_m - 1.4))
     found = {method: cfar(image, method=method)[1, weak - 2 : weak + 3].any() for method in METHODS}
     assert found == {"ordered_statistic": True, "cell_averaging": False, "greatest_of": False}
@@ -199,26 +199,28 @@ def test_weak_reflector_beside_a_strong_one():
 
 def test_cleaning_keeps_the_strongest_of_each_range():
     image = image_of([], directions="2d:4", range_m=(0.9, 1.0))
-    energy = np.zeros(image.energy.shape, np.float32)
-    energy[:, 3] = [1.0, 0.55, 0.45, 0.1]
-    energy[:, 5] = [0.0, 0.0, 0.02, 0.01]
-    given = image.replace(energy=energy)
-    kept = clean(given, within_db=6.0).energy
+    amplitude = np.zeros(image.amplitude.shape, np.float32)
+    amplitude[:, 3] = [1.0, 0.55, 0.45, 0.1]
+    amplitude[:, 5] = [0.0, 0.0, 0.02, 0.01]
+    given = image.replace(amplitude=amplitude)
+    kept = clean(given, within_db=6.0).amplitude
     np.testing.assert_array_equal(kept[:, 3], np.float32([1.0, 0.55, 0, 0]))
     np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))  # the half is a little above −6 dB
     assert not kept[:, [0, 1, 2, 4]].any()
-    kept = clean(given, within_db=6.0, above_mean_db=6.0).energy  # the mean of the first is 0.525, of the other 0.0075
+    kept = clean(
+        given, within_db=6.0, above_mean_db=6.0
+    ).amplitude  # the mean of the first is 0.525, of the other 0.0075
     assert not kept[:, 3].any()
     np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))
-    assert given.energy is energy
+    assert given.amplitude is amplitude
 
 
 def test_cleaning_takes_side_lobes_away():
     image = image_of([(12.0, 0.0, 1.2, 1.0), (-40.0, 0.0, 1.4, 0.02)], directions="2d:181", range_m=(0.9, 1.6))
     kept = clean(image, within_db=10.0)
-    lobes = np.flatnonzero(kept.energy[:, np.argmin(np.abs(image.range_m - 1.2))])
+    lobes = np.flatnonzero(kept.amplitude[:, np.argmin(np.abs(image.range_m - 1.2))])
     assert np.ptp(np.degrees(image.azimuth_rad[lobes])) < 20
-    assert kept.energy[50, np.argmin(np.abs(image.range_m - 1.4))] > 0  # 34 dB weaker, but alone at its range
+    assert kept.amplitude[50, np.argmin(np.abs(image.range_m - 1.4))] > 0  # 34 dB weaker, but alone at its range
 
 
 def test_peaks_are_found_however_weak():
@@ -226,8 +228,8 @@ def test_peaks_are_found_however_weak():
     reflectors = [(12.3, 0, 1.1, 1.0), (-33.3, 0, 1.45, 0.005)]
     image = image_of(reflectors, directions="2d:91", range_m=(0.9, 1.65))
     rng = np.random.default_rng(1)
-    parts = rng.normal(size=(2, *image.energy.shape)) * 0.001 / math.sqrt(2)
-    image = image.replace(energy=np.abs(image.energy + parts[0] + 1j * parts[1]).astype(np.float32))
+    parts = rng.normal(size=(2, *image.amplitude.shape)) * 0.001 / math.sqrt(2)
+    image = image.replace(amplitude=np.abs(image.amplitude + parts[0] + 1j * parts[1]).astype(np.float32))
     peaks = cfar_peaks(image)
     assert len(find_peaks(image)) == 1
     assert [peak.azimuth_deg for peak in peaks[:2]] == pytest.approx([12.3, -33.3], abs=3)
@@ -240,11 +242,11 @@ def test_peaks_are_found_however_weak():
 @pytest.mark.parametrize("method", METHODS)
 def test_silence_stands_out_of_nothing(method):
     image = rayleigh(3)
-    silent = image.replace(energy=np.zeros_like(image.energy))
+    silent = image.replace(amplitude=np.zeros_like(image.amplitude))
     assert not cfar(silent, method=method).any()
-    silent.energy[1, 20] = 1e-6
+    silent.amplitude[1, 20] = 1e-6
     assert np.argwhere(cfar(silent, method=method)).tolist() == [[1, 20]]
-    assert not clean(image.replace(energy=np.zeros_like(image.energy))).energy.any()
+    assert not clean(image.replace(amplitude=np.zeros_like(image.amplitude))).amplitude.any()
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,10 @@ REFUSED = [
     (checks.between, ("x", math.nan, 0, 2), "x is nan; give a finite number"),
     (checks.interval, ("x", (2.0, 1.0), 0, 5), "x runs from 2 to 1; give the smaller number first"),
     (checks.interval, ("x", (0.0, 6.0), 0, 5), "x is 6; give a number from 0 to 5"),
-    (checks.whole, ("x", 1.0, 0), "x is 1.0; give a whole number"),
-    (checks.whole, ("x", True, 0), "x is True; give a whole number"),
-    (checks.whole, ("x", -1, 0), "x is -1; give a whole number of at least 0"),
-    (checks.whole, ("x", 9, 0, 8), "x is 9; give a whole number from 0 to 8"),
+    (checks.integer, ("x", 1.0, 0), "x is 1.0; give a whole number"),
+    (checks.integer, ("x", True, 0), "x is True; give a whole number"),
+    (checks.integer, ("x", -1, 0), "x is -1; give a whole number of at least 0"),
+    (checks.integer, ("x", 9, 0, 8), "x is 9; give a whole number from 0 to 8"),
     (checks.choice, ("layout", "eRTIS_v3D", ["eRTIS_v2", "eRTIS_v3D1"]), "did you mean 'eRTIS_v3D1'"),
     (checks.choice, ("device", "abacus", ["cpu"]), "device 'abacus' is unknown; known are cpu"),
     (checks.finite_array, ("x", np.array([[0.0, 1.0], [np.nan, 2.0]])), "x holds nan at [1, 0]; give finite numbers"),
@@ -47,8 +47,8 @@ def test_what_fits_is_returned():
     assert isinstance(checks.finite("x", np.float32(2)), float)
     assert checks.positive("x", 1e-300) == 1e-300
     assert checks.between("x", 2, 0, 2) == 2.0
-    assert checks.whole("x", np.int64(7), 0) == 7
-    assert isinstance(checks.whole("x", np.int64(7), 0), int)
+    assert checks.integer("x", np.int64(7), 0) == 7
+    assert isinstance(checks.integer("x", np.int64(7), 0), int)
     checks.interval("x", (1.0, 1.0), 0, 5)
     checks.choice("x", 32, (8, 32))
     checks.finite_array("x", np.zeros(0))

@@ -73,7 +73,7 @@ def test_from_raw_words_to_a_picture(tmp_path, raw):
     assert picture.read_bytes().startswith(b"\x89PNG")
     with open_recording(rec) as back:
         assert back.settings.air == Air(temperature_c=12.5, humidity_percent=80.0)
-        assert np.array_equal(np.concatenate([m.words for m in back]), np.fromfile(raw, "<u4"))
+        assert np.array_equal(np.concatenate([m.data for m in back]), np.fromfile(raw, "<u4"))
     with open_energyscapes(img) as back:
         assert back.range_m[-1] <= 1.2
         assert back.attributes["source"] == "rec.h5"
@@ -127,9 +127,9 @@ def test_info(recording, images):
 
 
 def test_info_of_unknown_times(tmp_path):
-    write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].words, SMALL)])
-    told = report("info", tmp_path / "rec.h5")
-    assert (told["first"], told["last"]) == (None, None)
+    write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].data, SMALL)])
+    reported = report("info", tmp_path / "rec.h5")
+    assert (reported["first"], reported["last"]) == (None, None)
 
 
 def test_peaks_table(images):
@@ -141,7 +141,7 @@ def test_peaks_table(images):
 
 
 def test_threads_and_methods_and_types(recording, tmp_path):
-    energies = {}
+    amplitudes = {}
     for name, extra in {
         "one": ["--threads", 1],
         "two": ["--threads", 2],
@@ -151,11 +151,11 @@ def test_threads_and_methods_and_types(recording, tmp_path):
     }.items():
         run("process", recording, "-o", tmp_path / f"{name}.h5", *FAST, *extra)
         with open_energyscapes(tmp_path / f"{name}.h5") as back:
-            energies[name] = back[0].energy
-    assert np.array_equal(energies["one"], energies["two"])
-    np.testing.assert_allclose(energies["half"], energies["one"], rtol=2**-10, atol=1e-7)
-    np.testing.assert_allclose(energies["numpy"], energies["one"], atol=0.01 * energies["one"].max())
-    assert not np.array_equal(energies["paper"], energies["one"])
+            amplitudes[name] = back[0].amplitude
+    assert np.array_equal(amplitudes["one"], amplitudes["two"])
+    np.testing.assert_allclose(amplitudes["half"], amplitudes["one"], rtol=2**-10, atol=1e-7)
+    np.testing.assert_allclose(amplitudes["numpy"], amplitudes["one"], atol=0.01 * amplitudes["one"].max())
+    assert not np.array_equal(amplitudes["paper"], amplitudes["one"])
 
 
 def test_limits_of_a_grid(recording, tmp_path):
@@ -195,18 +195,18 @@ def test_files_that_a_settings_file_names_are_beside_it(recording, tmp_path, mon
 
 def test_settings_file_replaces_an_array_as_a_whole(recording, tmp_path):
     (tmp_path / "some.toml").write_text('[array]\nlayout = "eRTIS_v2"\n')
-    energies = []
+    amplitudes = []
     for extra in ([], ["--settings", tmp_path / "some.toml"]):
         run("process", recording, "-o", tmp_path / "img.h5", *FAST, *extra, "--force")
         with open_energyscapes(tmp_path / "img.h5") as back:
-            energies.append(back[0].energy)
+            amplitudes.append(back[0].amplitude)
     assert back.settings.array.layout == "eRTIS_v2"
-    assert not np.allclose(energies[0], energies[1])
+    assert not np.allclose(amplitudes[0], amplitudes[1])
 
 
 def test_changing_air_is_refused_unless_one_is_given(tmp_path):
     warm = SMALL.replace(air=Air(temperature_c=30.0))
-    words = noise()[0].words
+    words = noise()[0].data
     write_recording(tmp_path / "rec.h5", [Measurement(words, SMALL), Measurement(words, warm, Stamp(sequence=1))])
     done = run("process", tmp_path / "rec.h5", *FAST, code=1)
     assert "measurement 1 was taken at 30 °C" in done.stderr
@@ -408,11 +408,11 @@ def test_slow_work_is_explained(capsys):
 )
 def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypatch, command):
     """That it took a second is all that is known."""
-    told = []
+    reported = []
 
     @contextmanager
     def at_once(text, **_):
-        told.append(text)
+        reported.append(text)
         yield
 
     monkeypatch.setattr(options, "note_when_slow", at_once)
@@ -420,7 +420,7 @@ def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypa
     (tmp_path / "scene.toml").write_text("seed = 1\n")
     done = CliRunner().invoke(cli, command.format(ROOT / "data" / "synthetic" / "reflectors.h5").split())
     assert done.exit_code == 0, done.output
-    assert told[0] == "preparing ..."
+    assert reported[0] == "preparing ..."
 
 
 def test_compiling_is_said_where_kernels_are_compiled(capsys):
@@ -440,10 +440,10 @@ def test_compiling_is_not_said_of_a_warm_run(recording, tmp_path):
 
 def test_info_tells_air_and_times_to_people(recording):
     lines = run("info", recording).stdout.splitlines()
-    told = dict(re.split("  +", line, maxsplit=1) for line in lines)
-    assert (told["temperature"], told["humidity"]) == ("20.0 °C", "50.0 %")
-    assert told["sound speed"] == "343.87 m/s"
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{3})? UTC", told["first"])
+    reported = dict(re.split("  +", line, maxsplit=1) for line in lines)
+    assert (reported["temperature"], reported["humidity"]) == ("20.0 °C", "50.0 %")
+    assert reported["sound speed"] == "343.87 m/s"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{3})? UTC", reported["first"])
     held = report("info", recording)
     assert held["sound_speed_m_s"] == 343.87
 
@@ -452,5 +452,5 @@ def test_one_microphone_tells_no_directions(tmp_path):
     alone = SMALL.replace(array=SMALL.array.replace(layout="one", positions_m=((0.0, 0.0, 0.0),)))
     for settings, count in ((SMALL, 0), (alone, 1)):
         path = write_energyscapes(tmp_path / f"{count}.h5", [image(settings=settings)])
-        said = run("peaks", path).stderr
-        assert said.count("note: sensor sensor has one microphone, which tells ranges but no directions") == count
+        stated = run("peaks", path).stderr
+        assert stated.count("note: sensor sensor has one microphone, which tells ranges but no directions") == count

@@ -191,10 +191,10 @@ def test_one_line_and_nothing_left(folder, monkeypatch, name):
     done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == code, done.output
     assert done.stdout == ""
-    said = done.stderr.removeprefix(f"{options.PREPARING}\n")  # as a slow machine is told
-    assert said.startswith("ertis: error: ")
-    assert said.count("\n") == 1
-    assert message in said
+    stated = done.stderr.removeprefix(f"{options.PREPARING}\n")  # as a slow machine is told
+    assert stated.startswith("ertis: error: ")
+    assert stated.count("\n") == 1
+    assert message in stated
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 

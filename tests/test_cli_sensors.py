@@ -44,11 +44,11 @@ def recording(tmp_path):
 def images(tmp_path_factory):
     """Images of two sensors: the first finds all, the second misses one and has one too many."""
     shown = {"front": [ideal(LEFT, MIDDLE), ideal(RIGHT)], "rear": [ideal(LEFT, MIDDLE)]}
-    told = {"front": ((MIDDLE, LEFT), (RIGHT,)), "rear": ((MIDDLE, RIGHT),)}
+    reported = {"front": ((MIDDLE, LEFT), (RIGHT,)), "rear": ((MIDDLE, RIGHT),)}
     return write_energyscapes(
         tmp_path_factory.mktemp("images") / "img.h5",
         [image.replace(stamp=Stamp(sensor=name)) for name, given in shown.items() for image in given],
-        truth={name: Truth(scene="", seed=1, reflectors=rows) for name, rows in told.items()},
+        truth={name: Truth(scene="", seed=1, reflectors=rows) for name, rows in reported.items()},
     )
 
 
@@ -79,14 +79,14 @@ def test_process_takes_one_sensor(recording, tmp_path):
     assert (made["measurements"], made["directions"], made["sensors"][0]["sensor"]) == (1, 9, "left")
     assert sensor_names(tmp_path / "one.h5") == ("left",)
     with open_energyscapes(tmp_path / "both.h5", sensor="left") as both, open_energyscapes(tmp_path / "one.h5") as one:
-        assert np.array_equal(both[0].energy, one[0].energy)
+        assert np.array_equal(both[0].amplitude, one[0].amplitude)
 
 
 def test_process_says_a_line_for_each_sensor(recording, tmp_path):
     lines = run("process", recording, "-o", tmp_path / "img.h5", *FAST).stderr.splitlines()
-    told = [text for text in lines if "img.h5" in text]
-    assert "2 measurements of right, 9 directions" in told[0]
-    assert "1 measurement of left, 9 directions" in told[1]
+    reported = [text for text in lines if "img.h5" in text]
+    assert "2 measurements of right, 9 directions" in reported[0]
+    assert "1 measurement of left, 9 directions" in reported[1]
 
 
 def test_process_refuses_before_it_writes(recording, tmp_path):

@@ -21,11 +21,11 @@ def test_own_echoes_shift_by_drift_times_their_delay():
 
 def of_two(listener_ppm, emitter_ppm, **more):
     """A sensor that hears another's call, 0.5 m away."""
-    ear = EAR.replace(electronics=Electronics(clock_drift_ppm=listener_ppm), emitter=Emitter(silent=True))
-    mouth = EAR.replace(
+    receiver = EAR.replace(electronics=Electronics(clock_drift_ppm=listener_ppm), emitter=Emitter(silent=True))
+    transmitter = EAR.replace(
         name="mouth", position_m=vector((0.5, 0.0, 0.0)), electronics=Electronics(clock_drift_ppm=emitter_ppm)
     )
-    return scene_of(sensor=ear, **more).replace(sensors=(ear, mouth))
+    return scene_of(sensor=receiver, **more).replace(sensors=(receiver, transmitter))
 
 
 @pytest.mark.parametrize(("listener_ppm", "emitter_ppm"), [(50, 0), (0, 50), (-30, 40), (80, 80)])
@@ -68,9 +68,9 @@ def test_truth_stays_where_reflectors_are():
 def test_last_measurement_before_a_sync_decides():
     """At first clocks agree; after a hundred measurements the other sensor's call lies elsewhere."""
     point = Point(range_m=0.7, strength_db=-15.0)
-    ear = EAR.replace(emitter=Emitter(level_db=-15.0), electronics=Electronics(clock_drift_ppm=10.0))
-    other = ear.replace(name="other", position_m=(1.0, 0.2, 0.0), yaw_deg=180.0, electronics=Electronics())
-    scene = scene_of(point, sensor=ear).replace(sensors=(ear, other), count=100)
+    receiver = EAR.replace(emitter=Emitter(level_db=-15.0), electronics=Electronics(clock_drift_ppm=10.0))
+    other = receiver.replace(name="other", position_m=(1.0, 0.2, 0.0), yaw_deg=180.0, electronics=Electronics())
+    scene = scene_of(point, sensor=receiver).replace(sensors=(receiver, other), count=100)
 
     def change_db(scene):
         return next(each.estimate_db for each in make_plan(scene).verdicts if each.name == "clock_drift")

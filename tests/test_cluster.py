@@ -16,8 +16,8 @@ import ertis_numba as ertis
 from ertis_numba.cluster import connect
 from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.cluster import Cluster
-from ertis_numba.network.processing.options import Options
-from ertis_numba.network.processing.runner import Done, Job, Kind, KindFailed, KindReady, Lost
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.runner import FinishedJob, Job, JobKind, KindFailed, KindReady, Lost
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 LONG_S = 60.0
@@ -39,7 +39,7 @@ def scheduler():
 
 @pytest.fixture
 def cluster(scheduler):
-    runner = Cluster(Options(cluster=scheduler, deadline_s=30.0), lambda _: None)
+    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=30.0), lambda _: None)
     yield runner
     runner.close()
 
@@ -74,15 +74,15 @@ def get_all_ready(runner, n_workers, kind):
 
 
 def kind_of(measurement, number=0, settings=None):
-    return Kind(number, (settings or measurement.settings).to_toml(), measurement.words.nbytes)
+    return JobKind(number, (settings or measurement.settings).to_toml(), measurement.data.nbytes)
 
 
 def job_of(measurement, number, kind, *, points=False):
     data = Data(
-        sensor="front", epoch=1, sequence=number, sync_count=0, timestamp_ns=0, uncertainty_ns=0, monotonic_ns=0,
+        sensor="front", session_id=1, sequence=number, sync_count=0, timestamp_ns=0, uncertainty_ns=0, monotonic_ns=0,
         temperature_c=20.0, humidity_percent=50.0, pressure_pa=101325.0, crc32=0,
     )  # fmt: skip
-    return Job(number, data, measurement.words, kind, 0, points=points)
+    return Job(number, data, measurement.data, kind, 0, points=points)
 
 
 def test_images_are_those_of_a_pipeline_here(cluster, measurement):
@@ -92,17 +92,17 @@ def test_images_are_those_of_a_pipeline_here(cluster, measurement):
     assert isinstance(events_of(cluster)[0], KindReady)
     assert cluster.takes(kind)
     with ertis.Pipeline(measurement.settings) as pipeline:
-        wanted = pipeline.process(measurement).energy
+        wanted = pipeline.process(measurement).amplitude
     jobs = [job_of(measurement, number, kind, points=number == 1) for number in range(2)]
     get_all_ready(cluster, 2, kind)
     for job in jobs:
         cluster.submit(job)
     done = events_of(cluster, 2)
-    assert all(isinstance(event, Done) for event in done)
+    assert all(isinstance(event, FinishedJob) for event in done)
     for event in done:
         assert np.array_equal(event.job.slot.view.image_as(wanted.shape, np.float32), wanted)
         assert (event.job.n_points > 0) == event.job.points
-        cluster.give_back(event.job.slot)
+        cluster.release(event.job.slot)
     assert sum(worker.done for worker in cluster.status()) == 2
     assert "2 workers" in cluster.choice
 
@@ -119,7 +119,7 @@ def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
     with pytest.raises(AssertionError, match=r"a job is submitted that no worker takes; ask takes\(\) first"):
         cluster.submit(job_of(measurement, 2, kind))
     for event in events_of(cluster, 2):
-        cluster.give_back(event.job.slot)
+        cluster.release(event.job.slot)
     assert cluster.takes(kind)
 
 
@@ -135,7 +135,7 @@ def test_words_that_do_not_fit_are_told(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
-    cluster.submit(Job(7, job_of(measurement, 7, kind).data, measurement.words[:-1], kind, 0))
+    cluster.submit(Job(7, job_of(measurement, 7, kind).data, measurement.data[:-1], kind, 0))
     (event, *_) = events_of(cluster)
     assert isinstance(event, Lost)
     assert not event.again
@@ -163,7 +163,7 @@ def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
                 waiting.insert(0, event.job)
             else:
                 made.add(event.job.number)
-                cluster.give_back(event.job.slot)
+                cluster.release(event.job.slot)
         time.sleep(0.01)
     assert victim not in {worker.pid for worker in cluster.status()}
     assert cluster.respawned == 1
@@ -171,8 +171,8 @@ def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
 
 
 def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
-    said = []
-    runner = Cluster(Options(cluster=scheduler, deadline_s=1e-6), said.append)
+    stated = []
+    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=1e-6), stated.append)
     kind = kind_of(measurement)
     runner.prepare(kind)
     events_of(runner)
@@ -181,7 +181,7 @@ def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
     assert isinstance(event, Lost)
     assert event.again
     assert "in time" in event.text
-    assert any("is given nothing more: it was not done in time" in text for text in said)
+    assert any("is given nothing more: it was not done in time" in text for text in stated)
     give(runner, job_of(measurement, 1, kind))  # it is reached again, or another takes it
     runner.close()
 
@@ -212,7 +212,7 @@ def test_a_kind_that_is_forgotten_can_be_prepared_again(cluster, measurement):
 def test_a_scheduler_that_is_not_there_is_told_in_a_line(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.cluster._CONNECT_S", 0.5)
     with pytest.raises(ertis.NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        Cluster(Options(cluster="tcp://127.0.0.1:9"), lambda _: None)
+        Cluster(ProcessingOptions(cluster="tcp://127.0.0.1:9"), lambda _: None)
 
 
 @pytest.mark.parametrize("address", ["foo", "http://127.0.0.1:9", "silent"])

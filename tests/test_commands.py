@@ -94,8 +94,8 @@ def test_what_cannot_be_commanded(arguments, message):
 
 
 def test_commands_in_words():
-    told = [Command(code, 1, 2).about for code in commands.CODES]
-    assert told == [
+    reported = [Command(code, 1, 2).about for code in commands.CODES]
+    assert reported == [
         "firmware version?",
         "measurement length: 1 bytes",
         "PDM clock: 1125000 Hz",
@@ -223,7 +223,7 @@ def test_presets_suit_a_sensor(preset):
 
 
 def test_the_longest_measurement_suits_a_sensor():
-    setup = Setup.of(Settings(recording=Recording(n_samples=commands.MOST_WORDS)))
+    setup = Setup.of(Settings(recording=Recording(n_samples=commands.MAX_WORDS)))
     assert setup.before_call()[1] == Command("G", 2**26)
 
 

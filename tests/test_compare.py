@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.compare import Comparison, Match, compare, errors_of
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Peak, Reflector
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Scene
-from ertis_numba.simulation.plan import Plan, Verdict
+from ertis_numba.simulation.plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.compare import Comparison, Match, compare, errors_of
 from tests.test_detect import image_of
 
 
@@ -50,9 +50,9 @@ def test_reflectors_that_are_where_they_should_be():
 
 def test_known_errors_are_measured():
     """The truth is displaced by a known step from what the image shows."""
-    told = [true(r.azimuth_deg + 2, r.range_m - 0.05, r.level_db) for r in (LEFT, MIDDLE, RIGHT)]
+    reported = [true(r.azimuth_deg + 2, r.range_m - 0.05, r.level_db) for r in (LEFT, MIDDLE, RIGHT)]
     exact = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])])
-    errors = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), told)])
+    errors = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), reported)])
     assert (errors.matched, errors.missed, errors.false) == (3, 0, 0)
     assert errors.angle_rms_deg == pytest.approx(2, abs=2 * exact.angle_rms_deg)
     assert errors.range_bias_m == pytest.approx(0.05, abs=1e-3)
@@ -60,8 +60,8 @@ def test_known_errors_are_measured():
 
 
 def test_levels_are_below_the_strongest_found():
-    told = [true(3.3, 1.3, -3.0), true(55.5, 1.45, -9.0), true(20, 1.1, 0.0, name="not there")]
-    comparison = compare(ideal(MIDDLE, RIGHT), told)
+    reported = [true(3.3, 1.3, -3.0), true(55.5, 1.45, -9.0), true(20, 1.1, 0.0, name="not there")]
+    comparison = compare(ideal(MIDDLE, RIGHT), reported)
     assert [reflector.name for reflector in comparison.missed] == ["not there"]
     # The image shows the second 4 dB below the first, the truth says 6.
     assert [match.level_db for match in comparison.matched] == pytest.approx([0.0, 2.0], abs=0.3)
@@ -83,8 +83,8 @@ def test_what_is_not_there_is_missed_and_what_should_not_be_is_false():
         (true(3.3 + 20, 1.3), False),
     ],
 )
-def test_gate(told, found):
-    assert counts(compare(ideal(MIDDLE), [told])) == ((1, 0, 0, 0) if found else (0, 1, 1, 0))
+def test_gate(reported, found):
+    assert counts(compare(ideal(MIDDLE), [reported])) == ((1, 0, 0, 0) if found else (0, 1, 1, 0))
 
 
 def test_two_at_the_same_place_are_one_found_and_one_missed():
@@ -129,7 +129,7 @@ def test_mirror_image_of_a_reflector_that_counts():
     around = image.replace(
         azimuth_rad=np.concatenate([image.azimuth_rad, np.pi - image.azimuth_rad]),
         elevation_rad=np.tile(image.elevation_rad, 2),
-        energy=np.concatenate([image.energy, np.float32(0.999) * image.energy]),
+        amplitude=np.concatenate([image.amplitude, np.float32(0.999) * image.amplitude]),
     )
     assert counts(compare(around, [MIDDLE]))[:3] == (1, 0, 0)
 
@@ -155,8 +155,8 @@ def test_strong_one_that_is_shown_weaker_is_found():
 
 def test_level_counts_from_the_strongest_that_counts():
     """What is behind the image does not make the others too weak."""
-    told = [true(0, 9.0, 0.0), true(3.3, 1.3, -35.0), true(55.5, 1.45, -39.0)]
-    assert counts(compare(ideal(MIDDLE, RIGHT), told)) == (2, 0, 0, 0)
+    reported = [true(0, 9.0, 0.0), true(3.3, 1.3, -35.0), true(55.5, 1.45, -39.0)]
+    assert counts(compare(ideal(MIDDLE, RIGHT), reported)) == (2, 0, 0, 0)
 
 
 def test_solid_angle():
@@ -164,8 +164,8 @@ def test_solid_angle():
     comparison = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), given, min_level_db=-12)
     assert counts(comparison) == (2, 0, 0, 0)
     assert errors_of([comparison]).angle_rms_deg < 0.7
-    told = [true(-21.7, 1.0, elevation_deg=16.2), given[1]]
-    match = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), told, min_level_db=-12).matched[0]
+    reported = [true(-21.7, 1.0, elevation_deg=16.2), given[1]]
+    match = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), reported, min_level_db=-12).matched[0]
     assert match.angle_deg == pytest.approx(3, abs=0.5)
 
 
@@ -192,7 +192,7 @@ def test_nothing_to_find(noise):
 @pytest.mark.parametrize("n_ranges", [1, 2, 3])
 def test_small_images(n_ranges):
     image = ideal(MIDDLE)
-    small = image.replace(energy=image.energy[:, :n_ranges].copy(), range_m=image.range_m[:n_ranges])
+    small = image.replace(amplitude=image.amplitude[:, :n_ranges].copy(), range_m=image.range_m[:n_ranges])
     assert counts(compare(small, [MIDDLE]))[:2] == (0, 0)
 
 
@@ -234,7 +234,9 @@ def test_echoes_of_several_sensors_are_explained_by_who_emitted():
     """Two sensors, each with the echoes of both calls in its image."""
     scene = Scene.from_toml(FACING)
     for name in ("west", "east"):
-        simulator = Simulator(scene, sensor=name, plan=Plan(tuple(Verdict(name=e, on=True, reason="") for e in NEEDED)))
+        simulator = Simulator(
+            scene, sensor=name, plan=EffectPlan(tuple(Verdict(name=e, on=True, reason="") for e in NEEDED))
+        )
         measurement = simulator.render()
         comparison = compare(
             Pipeline(measurement.settings).process(measurement), simulator.reflectors(), min_level_db=-12

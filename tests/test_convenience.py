@@ -8,9 +8,9 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.noise import noise_of, threshold_of
 from tests.hard_cases.forced import EIGHT
 from tests.scenes import only, scene_of
 
@@ -23,15 +23,15 @@ def image(*points, noise_dbfs=-60.0, seed=0):
     measurement = Simulator(scene, plan=only("spreading")).render()
     made = ertis.Pipeline(SETTINGS, predict=False).process(measurement)
     rng = np.random.default_rng(seed)
-    noise = rng.normal(size=(2, *made.energy.shape)) * 10 ** (noise_dbfs / 20) / np.sqrt(2)
-    return made.replace(energy=np.hypot(made.energy + noise[0], noise[1]).astype(np.float32))
+    noise = rng.normal(size=(2, *made.amplitude.shape)) * 10 ** (noise_dbfs / 20) / np.sqrt(2)
+    return made.replace(amplitude=np.hypot(made.amplitude + noise[0], noise[1]).astype(np.float32))
 
 
 def test_images_are_arrays():
     shown = image(Point(range_m=0.5))
-    assert np.array_equal(np.asarray(shown), shown.energy)
+    assert np.array_equal(np.asarray(shown), shown.amplitude)
     assert np.asarray(shown, dtype=np.float64).dtype == np.float64
-    assert np.max(shown) == shown.energy.max()
+    assert np.max(shown) == shown.amplitude.max()
 
 
 def test_pipelines_take_the_path_of_settings(tmp_path):
@@ -46,11 +46,11 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         (lambda _: ertis.Pipeline(7), "settings is of type int; give Settings"),
         (lambda _: ertis.Pipeline(None), "settings is of type NoneType; give Settings"),
         (lambda _: ertis.Pipeline("missing.toml"), "missing.toml"),
-        (lambda shown: ertis.find_peaks(shown.energy), "image is of type ndarray; give Energyscape"),
+        (lambda shown: ertis.find_peaks(shown.amplitude), "image is of type ndarray; give Energyscape"),
         (lambda shown: ertis.find_peaks(shown, false_alarm=2), "false_alarm is 2"),
-        (lambda shown: shown.replace(energy=shown.energy[:, 1:]), r"energy has shape \(91, \d+\); give shape"),
+        (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"energy has shape \(91, \d+\); give shape"),
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),
-        (lambda shown: shown.replace(engery=shown.energy), "an image has no field 'engery'; give some of energy"),
+        (lambda shown: shown.replace(engery=shown.amplitude), "an image has no field 'engery'; give some of energy"),
     ],
 )
 def test_arguments_of_the_wrong_kind_are_refused_in_a_line(call, message):
@@ -66,15 +66,15 @@ def test_noise_gives_no_reflectors_and_echoes_stay():
     shown = image(Point(range_m=0.5), Point(range_m=0.7, azimuth_deg=30.0))
     peaks = ertis.find_peaks(shown, false_alarm=1e-3, min_level_db=-20)
     assert [round(peak.range_m, 2) for peak in peaks] == [0.5, 0.7]
-    assert peaks[0].level_dbfs == pytest.approx(20 * np.log10(shown.energy.max()), abs=1)
+    assert peaks[0].level_dbfs == pytest.approx(20 * np.log10(shown.amplitude.max()), abs=1)
     assert peaks[1].level_dbfs - peaks[0].level_dbfs == pytest.approx(peaks[1].level_db)
 
 
 def test_noise_of_an_image_is_its_root_mean_square():
     shown = image(noise_dbfs=-40.0)
     assert 20 * np.log10(noise_of(shown)) == pytest.approx(-40, abs=0.3)
-    n_bins = shown.energy.size
-    exceeded = np.mean(shown.energy > threshold_of(shown, n_bins * 1e-2 if n_bins * 1e-2 < 1 else 1.0))
+    n_bins = shown.amplitude.size
+    exceeded = np.mean(shown.amplitude > threshold_of(shown, n_bins * 1e-2 if n_bins * 1e-2 < 1 else 1.0))
     assert exceeded < 1e-3
 
 
@@ -83,10 +83,10 @@ def test_peaks_lists_absolute_levels_and_says_if_nothing_is_found(tmp_path):
     ertis.write_energyscapes(found, [image(Point(range_m=0.5))])
     ertis.write_energyscapes(silent, [image()])
     runner = CliRunner()
-    told = runner.invoke(cli, ["peaks", str(found)])
-    assert told.stdout.splitlines()[0].split()[-1] == "level_dbfs"
-    told = runner.invoke(cli, ["peaks", str(silent)])
-    assert (told.exit_code, told.stdout, told.stderr) == (0, "", "nothing found\n")
+    reported = runner.invoke(cli, ["peaks", str(found)])
+    assert reported.stdout.splitlines()[0].split()[-1] == "level_dbfs"
+    reported = runner.invoke(cli, ["peaks", str(silent)])
+    assert (reported.exit_code, reported.stdout, reported.stderr) == (0, "", "nothing found\n")
     assert json.loads(runner.invoke(cli, ["peaks", str(silent), "--json"]).stdout)["peaks"] == []
     listed = json.loads(runner.invoke(cli, ["peaks", str(silent), "--all", "--json"]).stdout)["peaks"]
     assert len(listed) > 3

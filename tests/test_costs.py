@@ -125,7 +125,7 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
         pipeline = Pipeline(SHORT, device="cpu", threads=1)
     assert "costs cannot be kept (" in caplog.text
-    assert pipeline.process(noise(SHORT)).energy.any()
+    assert pipeline.process(noise(SHORT)).amplitude.any()
     assert ("cpu", CPU.max_threads) in measured
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.devices.protocol import Receiver
+from ertis_numba.devices.protocol import BlockReceiver
 from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters
 
 SHORTEST_S = 0.04
@@ -15,7 +15,7 @@ ANEW = 10**9
 
 def heard(stream, **changes):
     """The numbers that a receiver takes of (time, bytes), what it takes when that has ended, and the receiver."""
-    receiver = Receiver(N_SAMPLES, **{"expected": FIRST, "shortest_s": SHORTEST_S} | changes)
+    receiver = BlockReceiver(N_SAMPLES, **{"expected": FIRST, "shortest_s": SHORTEST_S} | changes)
     found = [block for time_s, data in stream for block in receiver.feed(data, at(time_s))]
     n_bytes = sum(len(data) for _, data in stream)
     assert n_bytes == (len(found) + receiver.held) * N_BYTES + receiver.rejected.total() + receiver.pending
@@ -31,7 +31,7 @@ def stream_of(times_s):
 
 @pytest.mark.parametrize("times_s", [REGULAR, IRREGULAR])
 def test_numbers_that_follow_are_taken_at_once(times_s):
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for index, (time_s, data) in enumerate(stream_of(times_s)):
         assert counters(receiver.feed(data, at(time_s))) == [(FIRST + index) % 2**32]
     assert receiver.lost == 0
@@ -80,7 +80,7 @@ def test_what_comes_after_blocks_that_never_came_is_taken(times_s, n_missing, fi
 
 
 def test_regular_triggers_are_counted_by_the_clock():
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     stream = stream_of(REGULAR)
     for time_s, data in [*stream[:20], *stream[24:]]:
         assert len(receiver.feed(data, at(time_s))) == 1  # none is held
@@ -88,7 +88,7 @@ def test_regular_triggers_are_counted_by_the_clock():
 
 
 def test_irregular_triggers_are_counted_by_what_came_of_them():
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for index, (time_s, data) in enumerate(stream_of(IRREGULAR)):
         found = receiver.feed(data[:9] if index in {20, 21} else data, at(time_s))
         assert counters(found) == ([] if index in {20, 21} else [(FIRST + index) % 2**32])
@@ -96,7 +96,7 @@ def test_irregular_triggers_are_counted_by_what_came_of_them():
 
 
 def test_a_number_in_doubt_is_held_until_others_decide():
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     stream = stream_of(IRREGULAR)
     for time_s, data in stream[:20]:
         receiver.feed(data, at(time_s))
@@ -145,7 +145,7 @@ def test_a_sensor_that_begins_anew_is_followed_between_strays():
 
 def test_a_pulse_that_a_sensor_has_missed_is_no_gap():
     """The number that follows is taken at once although the clock says that it should be another."""
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     times_s = REGULAR[:20] + REGULAR[21:30] + REGULAR[33:]
     for time_s, data in stream_of(times_s):
         assert len(receiver.feed(data, at(time_s))) == 1
@@ -164,7 +164,7 @@ def test_numbers_may_go_by_twos(times_s):
 
 
 def test_two_that_agree_over_a_damaged_one_are_taken_at_once():
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for index, (time_s, data) in enumerate(stream_of(IRREGULAR)[:24]):
         if index != 20:
             found = receiver.feed(data[:-9] if index == 22 else data, at(time_s))
@@ -199,7 +199,7 @@ def test_a_number_of_a_damaged_block_is_not_another_ones_in_the_end():
 
 
 def test_bytes_that_come_late_are_no_trigger_of_their_own():
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     sent = [block_of(FIRST + index) for index in range(3)]
     assert receiver.feed(sent[0][:15], at(0.0)) == []
     assert len(receiver.feed(sent[0][15:], at(0.035))) == 1
@@ -238,24 +238,24 @@ def test_the_next_number_is_taken_in_the_end_whatever_came_before():
 
 @pytest.mark.parametrize(("first", "taken"), [(-1, False), (0, True), (1, True), (2, False), (2**31, False)])
 def test_after_a_counter_was_set_its_number_or_the_next_comes(first, taken):
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     assert len(receiver.feed(block_of(FIRST + first), at(0))) == taken
     assert receiver.held == (not taken)
     assert receiver.lost == 0
 
 
 def test_any_first_number_is_taken_where_none_is_expected():
-    receiver = Receiver(N_SAMPLES, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, shortest_s=SHORTEST_S)
     assert counters(receiver.feed(block_of(123_456), at(0))) == [123_456]
 
 
 def test_after_a_counter_was_set_strays_and_damaged_blocks_are_no_hindrance():
     strays = [(0.1 * index, b"stray") for index in range(5)]
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for time_s, data in strays:
         receiver.feed(data, at(time_s))
     assert len(receiver.feed(block_of(FIRST), at(0.5))) == 1
-    receiver = Receiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for index in range(5):
         receiver.feed(block_of(FIRST + index)[:-1], at(0.1 * index))
     assert len(receiver.feed(block_of(FIRST + 5), at(0.5))) == 1
@@ -263,7 +263,7 @@ def test_after_a_counter_was_set_strays_and_damaged_blocks_are_no_hindrance():
 
 
 def test_what_is_expected_comes_next_and_what_was_before_does_not():
-    receiver = Receiver(N_SAMPLES, expected=0, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=0, shortest_s=SHORTEST_S)
     receiver.feed(block_of(0) + block_of(77) + block_of(1)[:20] + b"\x12", at(0))
     assert (receiver.held, receiver.missing) == (1, N_BYTES - 21)
     receiver.expect(500)
@@ -275,7 +275,7 @@ def test_what_is_expected_comes_next_and_what_was_before_does_not():
 
 def test_a_late_deadline_and_a_later_number():
     """A measurement that was commanded comes to nothing, the next one is whole."""
-    receiver = Receiver(N_SAMPLES, expected=5, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=5, shortest_s=SHORTEST_S)
     receiver.feed(block_of(5)[:-3], at(0))
     assert receiver.missing == 3
     assert receiver.expire() == []
@@ -284,7 +284,7 @@ def test_a_late_deadline_and_a_later_number():
 
 
 def test_where_nothing_has_begun_a_deadline_decides_what_is_held():
-    receiver = Receiver(N_SAMPLES, expected=5, shortest_s=SHORTEST_S)
+    receiver = BlockReceiver(N_SAMPLES, expected=5, shortest_s=SHORTEST_S)
     assert receiver.feed(block_of(7), at(0)) == []
     assert counters(receiver.expire()) == [7]
     assert receiver.held == 0

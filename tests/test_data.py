@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from ertis_numba.analysis.compare import compare
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene, load_scene
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.compare import compare
-from ertis_numba.stages.detect import find_peaks
 from ertis_numba.storage import open_recording
 
 ROOT = Path(__file__).parents[1]
@@ -49,21 +49,21 @@ def test_recording_is_its_scene(name):
         (measurement,) = recording
         truth = recording.truth
     simulator = Simulator(scene)
-    assert_array_equal(measurement.words, simulator.render().words)
-    (told,) = report["sensors"]
-    assert hashlib.sha256(measurement.words.tobytes()).hexdigest() == told["words_sha256"]
+    assert_array_equal(measurement.data, simulator.render().data)
+    (reported,) = report["sensors"]
+    assert hashlib.sha256(measurement.data.tobytes()).hexdigest() == reported["words_sha256"]
     decided = Scene.from_toml(truth.scene)
     assert decided.replace(effects=scene.effects) == scene
     assert {effect for effect, on in decided.effects.items() if on} == simulator.plan.active
     assert (truth.seed, report["seed"]) == (scene.seed, scene.seed)
     reflectors = simulator.reflectors()
-    assert len(scene.points) == len(reflectors) == len(told["reflectors"])
+    assert len(scene.points) == len(reflectors) == len(reported["reflectors"])
     (stored,) = truth.reflectors
     for field in ("name", "azimuth_deg", "elevation_deg", "range_m", "level_db"):
         wanted = [getattr(reflector, field) for reflector in reflectors]
         for given in (
             [getattr(reflector, field) for reflector in stored],
-            [row[field] for row in told["reflectors"]],
+            [row[field] for row in reported["reflectors"]],
         ):
             assert given == wanted if field == "name" else np.allclose(given, wanted, rtol=0, atol=1e-6)
 
@@ -133,10 +133,10 @@ def test_page_without_markers_is_refused():
     gallery = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(gallery)
     assert sorted(gallery.SHOWN) == SCENES
-    told = gallery.replaced("a <!-- scene x -->old<!-- /scene x --> b", "scene x", "new")
-    assert told == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"
+    reported = gallery.replaced("a <!-- scene x -->old<!-- /scene x --> b", "scene x", "new")
+    assert reported == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"
     with pytest.raises(SystemExit, match="the page has no place for 'scene y'; give it <!-- scene y --> and"):
-        gallery.replaced(told, "scene y", "new")
+        gallery.replaced(reported, "scene y", "new")
 
 
 @functools.cache
@@ -148,8 +148,8 @@ def begun(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_gallery_tells_which_effects_a_scene_calls_for(name):
-    told = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", told_of(name), re.MULTILINE))
-    on = {effect for effect, state in told.items() if state == "on"}
+    reported = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", told_of(name), re.MULTILINE))
+    on = {effect for effect, state in reported.items() if state == "on"}
     assert CALLED_FOR[name] <= on
     scene, plan = begun(name)
     assert not scene.effects
@@ -164,6 +164,6 @@ def test_gallery_scene_gives_sensible_images(name):
         assert 1e-3 < np.abs(simulator.signals()).max() < 0.5  # more overloads the modulators
         settings = sensor.settings().replace(processing=sensor.processing.replace(directions="2d:31"))
         image = Pipeline(settings).process(dataclasses.replace(simulator.render(), settings=settings))
-        assert np.isfinite(image.energy).all()
+        assert np.isfinite(image.amplitude).all()
         found = compare(image, simulator.reflectors(), min_level_db=-6.0)
         assert len(found.matched) > len(found.missed)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
-from ertis_numba.stages.detect import find_peaks
-from ertis_numba.stages.side_lobes import without_side_lobes
-from ertis_numba.waveform import matched_filter
+from ertis_numba.waveform import matched_filter_spectrum
 
 
 def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0):
@@ -24,7 +24,7 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, 
     positions_m = microphones(settings.array).enabled_positions_m
     speed_m_s = sound_speed_m_s(settings.air)
     ranges_m = np.arange(*range_m, speed_m_s / 90_000)
-    matched = matched_filter(settings, n_fft=2048, decimation=10)
+    matched = matched_filter_spectrum(settings, n_fft=2048, decimation=10)
     wave_1_m = 2 * np.pi * (matched.first_bin + np.arange(len(matched.values))) * 450_000 / 2048 / speed_m_s
     power = np.abs(matched.values) ** 2 / np.sum(np.abs(matched.values) ** 2)
     beams = np.zeros((len(grid), len(ranges_m)), dtype=complex)
@@ -35,8 +35,8 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, 
         pattern = np.stack([np.exp(-1j * k * paths_m).mean(axis=1) for k in wave_1_m], axis=1)
         shape = np.exp(2j * wave_1_m[:, None] * (ranges_m - reflector_m)) * power[:, None]
         beams += amplitude * pattern @ shape
-    energy = np.abs(beams + noise * np.random.default_rng(1).standard_normal(beams.shape))
-    return Energyscape(energy.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
+    amplitude = np.abs(beams + noise * np.random.default_rng(1).standard_normal(beams.shape))
+    return Energyscape(amplitude.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
 
 
 def test_one_entry_for_one_reflector():
@@ -87,7 +87,7 @@ def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
 def test_weak_side_lobes_of_other_beamformers_raise_no_limit():
     linear = image_of([(0.0, 0.0, 1.2, 1.0), (40.0, 0.0, 1.2, 0.6)], range_m=(1.05, 1.35))
     settings = linear.settings.replace(processing=linear.settings.processing.replace(beamformer="coherence_factor"))
-    image = linear.replace(energy=linear.energy**2, settings=settings)
+    image = linear.replace(amplitude=linear.amplitude**2, settings=settings)
     assert [round(peak.azimuth_deg) for peak in find_peaks(image, min_level_db=-12)] == [0, 40]
 
 
@@ -100,12 +100,12 @@ def test_rounding_errors_of_one_bit_microphones_are_no_reflectors():
 def test_an_image_without_side_lobes_is_dark_but_for_main_lobes():
     image = image_of([(12.0, 20.0, 1.2, 1.0)], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4)
     dark = without_side_lobes(image)
-    bright = dark.energy.max(axis=1) > 0.02
+    bright = dark.amplitude.max(axis=1) > 0.02
     source = unit_vectors(np.radians([12.0]), np.radians([20.0]))
     apart_deg = np.degrees(np.arccos(unit_vectors(image.azimuth_rad, image.elevation_rad) @ source[0]))
     assert apart_deg[bright].max() < 20
-    assert apart_deg[image.energy.max(axis=1) > 0.02].max() > 60
-    assert dark.energy.max() == image.energy.max()
+    assert apart_deg[image.amplitude.max(axis=1) > 0.02].max() > 60
+    assert dark.amplitude.max() == image.amplitude.max()
 
 
 @pytest.mark.parametrize(("directions", "azimuth_deg"), [("2d:91", 97.0), ("1850", 50.0)])
@@ -126,15 +126,15 @@ def test_top_and_level_limit_the_list():
 def test_silence_and_small_images_are_fine(shape):
     image = image_of([])
     small = image.replace(
-        energy=np.zeros(shape, np.float32),
+        amplitude=np.zeros(shape, np.float32),
         azimuth_rad=image.azimuth_rad[: shape[0]],
         elevation_rad=image.elevation_rad[: shape[0]],
         range_m=image.range_m[: shape[1]],
     )
     assert find_peaks(small) == []
-    energy = small.energy.copy()
-    energy[0, shape[1] // 2] = 1
-    found = find_peaks(small.replace(energy=energy))
+    amplitude = small.amplitude.copy()
+    amplitude[0, shape[1] // 2] = 1
+    found = find_peaks(small.replace(amplitude=amplitude))
     assert len(found) == (1 if shape[1] != 2 else len(found))
     assert all(np.isfinite([peak.azimuth_deg, peak.range_m, peak.level_db]).all() for peak in found)
 

@@ -112,8 +112,8 @@ def test_a_line_array_has_its_pattern(n_mics, azimuth_deg):
     )
     scene = scene_of(Point(azimuth_deg=azimuth_deg, range_m=range_m, strength_db=0), sensor=sensor)
     pipeline = Pipeline(sensor.settings())
-    energy = pipeline.process(Simulator(scene, plan=only("spreading")).render()).energy
-    found = energy[:, np.argmax(energy.max(axis=0))] / energy.max()
+    amplitude = pipeline.process(Simulator(scene, plan=only("spreading")).render()).amplitude
+    found = amplitude[:, np.argmax(amplitude.max(axis=0))] / amplitude.max()
     azimuth_rad = pipeline.grid.azimuth_rad
     wave = 2 * math.pi * 40e3 / SPEED_M_S
     half = wave * spacing_m * (np.sin(azimuth_rad) - math.sin(math.radians(azimuth_deg))) / 2
@@ -134,8 +134,8 @@ def test_first_side_lobe_of_a_line_array():
         processing=Processing(directions="2d:721", range_m=(2.8, 3.2)),
     )
     scene = scene_of(Point(range_m=3.0, strength_db=0), sensor=sensor)
-    energy = Pipeline(sensor.settings()).process(Simulator(scene, plan=only("spreading")).render()).energy
-    cut = energy[:, np.argmax(energy.max(axis=0))]
+    amplitude = Pipeline(sensor.settings()).process(Simulator(scene, plan=only("spreading")).render()).amplitude
+    cut = amplitude[:, np.argmax(amplitude.max(axis=0))]
     inner = cut[1:-1]
     lobes = np.sort(inner[(inner > cut[:-2]) & (inner >= cut[2:])])[::-1]
     assert 20 * np.log10(lobes[1] / lobes[0]) == pytest.approx(-13.15, abs=0.2)
@@ -156,12 +156,12 @@ def test_a_disc_mirrors_like_a_piston(turned_deg):
 
 def test_a_disc_sends_most_where_a_mirror_would():
     """Emitter and ear look at it from both sides of its normal."""
-    ear = EAR.replace(emitter=Emitter(silent=True))
-    mouth = EAR.replace(name="mouth", position_m=(0.0, 0.5, 0.0))
+    receiver = EAR.replace(emitter=Emitter(silent=True))
+    transmitter = EAR.replace(name="mouth", position_m=(0.0, 0.5, 0.0))
 
     def level(facing_deg):
         disc = Point(position_m=(0.5, 0.25, 0.0), diameter_m=0.05, facing_deg=(facing_deg, 0))
-        scene = scene_of(disc, sensor=ear).replace(sensors=(ear, mouth))
+        scene = scene_of(disc, sensor=receiver).replace(sensors=(receiver, transmitter))
         return abs(ways(scene, "target_size", "cross_emission")[0].amplitude[0, 0, 0])
 
     levels = {facing_deg: level(facing_deg) for facing_deg in (160, 170, -180, -170, -160)}

@@ -11,14 +11,14 @@ from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba import export, figures
+from ertis_numba.analysis.compare import compare
+from ertis_numba.analysis.health import health
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout, microphones, received_settings, self_contained
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Settings
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.compare import compare
-from ertis_numba.stages.health import health
 from ertis_numba.storage import open_energyscapes, open_recording
 from ertis_numba.verification import measure
 from tests.files import SMALL, line, noise
@@ -86,7 +86,7 @@ def test_disabled_channels_that_cannot_be_are_refused(disabled, message):
 def test_settings_file_that_only_disables_keeps_the_array(tmp_path):
     (tmp_path / "s.toml").write_text("[array]\ndisabled = [2]\n")
     known = line(8, 8)
-    changed = known.changed_by(tmp_path / "s.toml")
+    changed = known.updated_from_file(tmp_path / "s.toml")
     assert changed.array == known.array.replace(disabled=(2,))
 
 
@@ -109,9 +109,9 @@ def test_disabled_microphones_change_no_image(processing):
     """Whatever they hear."""
     settings = without(SMALL.replace(processing=SMALL.processing.replace(**processing)), 4, 9)
     (measurement,) = noise(settings, count=1)
-    other = dataclasses.replace(measurement, words=measurement.words ^ np.uint32(1 << 4 | 1 << 9))
+    other = dataclasses.replace(measurement, data=measurement.data ^ np.uint32(1 << 4 | 1 << 9))
     with Pipeline(settings, device="numpy" if processing.get("method") == "paper" else "cpu") as pipeline:
-        assert_array_equal(pipeline.process(measurement).energy, pipeline.process(other).energy)
+        assert_array_equal(pipeline.process(measurement).amplitude, pipeline.process(other).amplitude)
 
 
 def test_image_without_microphones_keeps_its_error_budget():
@@ -160,8 +160,8 @@ def test_exports_and_pictures_have_no_disabled_microphone(recording, tmp_path):
 
 def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
     first = tmp_path / "first.h5"
-    (told,) = run("process", recording, "-o", first, "--quiet").stderr.splitlines()
-    advice = told.partition("leave them out by ")[2].partition(",  or")[0].partition(", or see")[0]
+    (reported,) = run("process", recording, "-o", first, "--quiet").stderr.splitlines()
+    advice = reported.partition("leave them out by ")[2].partition(",  or")[0].partition(", or see")[0]
     assert advice == "--without 3,8,11,12,21,26"
     second = tmp_path / "second.h5"
     assert run("process", recording, "-o", second, "--quiet", "--strict", *advice.split()).stderr == ""
@@ -173,7 +173,7 @@ def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
     third = tmp_path / "third.h5"
     assert run("process", recording, "-o", third, "--quiet", "--settings", tmp_path / "s.toml").stderr == ""
     with open_energyscapes(second) as one, open_energyscapes(third) as other:
-        assert_allclose(one[0].energy, other[0].energy, rtol=0, atol=0)
+        assert_allclose(one[0].amplitude, other[0].amplitude, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(

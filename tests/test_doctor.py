@@ -106,12 +106,12 @@ def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
     monkeypatch.setattr(grp, "getgrgid", named)
     monkeypatch.setattr(os, "getgroups", lambda: [21, os.getgid()])
     monkeypatch.setattr(_diagnosis.sys, "platform", "linux")
-    told = permission(SimpleNamespace(stat=lambda: SimpleNamespace(st_gid=group_id, st_mode=0o20000 | mode)))
+    reported = permission(SimpleNamespace(stat=lambda: SimpleNamespace(st_gid=group_id, st_mode=0o20000 | mode)))
     if remedy != "udev":
-        assert told == remedy
+        assert reported == remedy
         return
-    assert "usermod -aG root" not in told
-    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' into /etc/udev/rules.d/\S+\.rules""", told)
+    assert "usermod -aG root" not in reported
+    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' into /etc/udev/rules.d/\S+\.rules""", reported)
 
 
 def test_all_extras_are_looked_at(doctor):

@@ -91,16 +91,16 @@ def test_limits_of_a_sphere():
     assert_allclose(sorted_ways(without_surface, "spreading")[1], 0.001 / 2)
 
 
-def shortest_m(mouth_m, ear_m, centre_m, radius_m):
+def shortest_m(mouth_m, receiver_m, centre_m, radius_m):
     """Length of the way over a sphere by Fermat: the shortest over points of its surface that see both ends."""
-    to_ear, to_mouth = ear_m - centre_m, mouth_m - centre_m
-    first = to_mouth / np.linalg.norm(to_mouth)
-    second = to_ear - (to_ear @ first) * first
+    to_receiver, to_transmitter = receiver_m - centre_m, mouth_m - centre_m
+    first = to_transmitter / np.linalg.norm(to_transmitter)
+    second = to_receiver - (to_receiver @ first) * first
     second /= np.linalg.norm(second)
 
     def length_m(angle):
         corner_m = centre_m + radius_m * (math.cos(angle) * first + math.sin(angle) * second)
-        return np.linalg.norm(corner_m - mouth_m) + np.linalg.norm(ear_m - corner_m)
+        return np.linalg.norm(corner_m - mouth_m) + np.linalg.norm(receiver_m - corner_m)
 
     return scipy.optimize.minimize_scalar(length_m, bounds=(0.0, 1.5), options={"xatol": 1e-9}).fun
 

@@ -26,7 +26,7 @@ def test_ranges_are_longer_by_what_the_page_says(emitter_m, azimuth_deg, range_m
         effects={"cross_emission": True, "sync_delay": False},
     )
     image = Pipeline(array.settings()).process(Simulator(scene, sensor="array").render())
-    direction, place = np.unravel_index(image.energy.argmax(), image.energy.shape)
+    direction, place = np.unravel_index(image.amplitude.argmax(), image.amplitude.shape)
     along_m, square_m2 = float(toward @ emitter_m), float(np.dot(emitter_m, emitter_m))
     longer_m = -along_m / 2 + (square_m2 - along_m**2) / (4 * range_m)
     assert math.degrees(image.azimuth_rad[direction]) == pytest.approx(azimuth_deg, abs=0.6)

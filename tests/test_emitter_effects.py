@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from ertis_numba.analysis.compare import compare
 from ertis_numba.geometry import microphones
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Wall
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.compare import compare
 from tests.scenes import (
     BAND_HZ,
     EAR,

@@ -16,7 +16,7 @@ from ertis_cli.emulate import _get_ready
 from ertis_cli.main import cli
 
 from ertis_numba.devices.setup import Setup
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Call, Processing, Recording, Settings
@@ -93,8 +93,8 @@ def test_the_command_replays_a_recording(emulate, recording, tmp_path):
 def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
     link = tmp_path / "mine"
     process = emulate(recording, "--sensor", "left", "--link", link, "--unplug", "0:0.05", "--json")
-    told = json.loads(process.stdout.readline())
-    assert (told["sensor"], told["link"], told["port"][:5]) == ("left", str(link), "/dev/")
+    reported = json.loads(process.stdout.readline())
+    assert (reported["sensor"], reported["link"], reported["port"][:5]) == ("left", str(link), "/dev/")
     assert process.stderr.readline().startswith("left is back: /dev/")
     with serial.Serial(str(link), timeout=TIMEOUT_S) as port:
         assert ask(port, b"!Y,0,0,0\n") == 0x010000
@@ -185,7 +185,7 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
         for counter, active in enumerate((1, 1, 0, 1)):
             port.write(b"!A,%d,0,0\n" % active)
             heard = scene if active else silent  # with all effects: determining the relevant ones takes longer
-            words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).words
+            words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).data
             assert is_block(block(port), counter, words)
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
@@ -217,9 +217,9 @@ def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
 
 def captured(port, settings):
     """Configure a device as ``ertis capture`` does, and measure once."""
-    with Sonar.open(port) as sonar:
+    with SonarDriver.open(port) as sonar:
         sonar.configure(Setup.of(settings))
-        return sonar.measure().words
+        return sonar.measure().data
 
 
 def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_path):
@@ -230,7 +230,7 @@ def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_pa
     (sensor,) = Scene.from_toml(SCENE).sensors
     sensor = sensor.replace(call=settings.call, recording=settings.recording, processing=settings.processing)
     scene = Scene.from_toml(SCENE).replace(sensors=(sensor,))
-    assert np.array_equal(words, Engine(scene, sensor, frozenset(EFFECTS)).render().words)
+    assert np.array_equal(words, Engine(scene, sensor, frozenset(EFFECTS)).render().data)
     assert ended(process, signal.SIGTERM)[0] == 143
 
 
@@ -241,7 +241,7 @@ def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_pa
         ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),
     ],
 )
-def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, source, told):
+def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, source, reported):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(*([tmp_path / "scene.toml"] if source == "scene" else [recording, "--sensor", "left"]), "--quiet")
     port = process.stdout.readline().rstrip()
@@ -252,7 +252,7 @@ def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, so
     for _ in range(2):  # the device still holds the call at the second attempt
         with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
             captured(port, settings)
-        assert process.stderr.readline().startswith(f"ertis: warning: {told}")
+        assert process.stderr.readline().startswith(f"ertis: warning: {reported}")
     accepted = settings.replace(call=Call())
     assert len(captured(port, accepted)) == N_SAMPLES
     assert ended(process, signal.SIGTERM) == (143, "", "")
@@ -272,22 +272,22 @@ def test_pulses_wait_until_a_scene_is_rendered(emulate, tmp_path):
     """With a SYNC line, the port exists before anything is rendered, and every pulse has its measurement."""
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--sync-rate", 5)
-    with Sonar.open(process.stdout.readline().rstrip()) as sonar:
+    with SonarDriver.open(process.stdout.readline().rstrip()) as sonar:
         settings = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
         sonar.configure(Setup.of(settings))
         sonar.arm()
         blocks = sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S)
-        words = [next(blocks).words for _ in range(3)]
+        words = [next(blocks).data for _ in range(3)]
     scene = Scene.from_toml(SCENE)
     engine = Engine(scene, scene.sensors[0], frozenset(EFFECTS))
-    assert all(np.array_equal(came, engine.render(index % 2).words) for index, came in enumerate(words))
+    assert all(np.array_equal(came, engine.render(index % 2).data) for index, came in enumerate(words))
     assert "rendering 2 measurements of each sensor as pulses come" in ended(process, signal.SIGINT)[2]
 
 
 def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "links"))
     with pytest.raises(SonarError, match="there is no serial port 'left'"):
-        Sonar.open("left")
+        SonarDriver.open("left")
     command = ["capture", "--port", "left", "-n", "2", "--settings", str(tmp_path / "settings.toml"), "--no-check-bits"]
     command += ["-o", str(tmp_path / "new.h5"), "--mounting", str(tmp_path / "where.toml"), "--json", "--quiet"]
     (tmp_path / "settings.toml").write_text(

@@ -41,12 +41,17 @@ def armed():
 
 def test_it_remembers_what_it_is_told(device, port):
     assert ask(port, b"!Y,0,0,0\n") == 0x010000
-    told = device.registers
-    assert (told.amplifier, told.armed, told.counter) == (1, 0, 0)
+    reported = device.registers
+    assert (reported.amplifier, reported.armed, reported.counter) == (1, 0, 0)
     for line in (b"!F,1,0,0\n", b"!D,500000,0,0\n", b"!I,7,0,0\n", b"!H,1,0,0\n", b"!J,1,2,0\n", b"!K,0,0,0\n"):
         assert ask(port, line) == 1
-    assert (told.n_bytes, told.clock, told.dac_rate_hz, told.emissions) == (4 * N_SAMPLES, 1, 500_000, 7)
-    assert (told.active, told.armed, told.pin, told.amplifier) == (1, 1, 2, 0)
+    assert (reported.n_bytes, reported.clock, reported.dac_rate_hz, reported.emissions) == (
+        4 * N_SAMPLES,
+        1,
+        500_000,
+        7,
+    )
+    assert (reported.active, reported.armed, reported.pin, reported.amplifier) == (1, 1, 2, 0)
     assert device.refused == 0
 
 

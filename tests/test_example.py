@@ -76,8 +76,8 @@ def test_demo_keeps_files_of_an_earlier_one():
     folder = Path("demo")
     folder.mkdir()
     (folder / "image.png").write_text("mine")
-    told = run("demo", code=1).stderr
-    assert "image.png exists; give another folder (-o), or ask to overwrite it (--force)" in told
+    reported = run("demo", code=1).stderr
+    assert "image.png exists; give another folder (-o), or ask to overwrite it (--force)" in reported
     assert (folder / "image.png").read_text() == "mine"
 
 

@@ -233,7 +233,7 @@ def test_log_as_csv_in_the_frame_of_the_platform(log_points, tmp_path, capsys):
     # Turned by half a turn about z, then moved by 1, 2, 3.
     places = [[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in rows]
     np.testing.assert_allclose(places, [[0, 2, 3], [1, 0, 3], [0, 2, 3]], atol=1e-6)
-    assert [float(row["energy"]) for row in rows] == [1.0, 0.5, 1.0]
+    assert [float(row["amplitude"]) for row in rows] == [1.0, 0.5, 1.0]
     assert [each.name for each in tmp_path.iterdir()] == ["points.csv"]
 
 
@@ -263,5 +263,5 @@ def test_what_is_sent_by_ones_own_program_is_stored(tmp_path, capsys):
     assert capsys.readouterr().out == "3 stored\n"
     ((key, held),) = central.held.items()
     assert key[0] == "mine"
-    assert [words for _, words in held.values()] == [each.words.tobytes() for each in given]
+    assert [words for _, words in held.values()] == [each.data.tobytes() for each in given]
     assert [*held] == [0, 1, 2]

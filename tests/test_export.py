@@ -14,11 +14,11 @@ from ertis_cli import export as command
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.interop import FORMATS, TOPICS, export, files_of, format_of
 from ertis_numba.settings import Air
-from ertis_numba.stages.finder import PointFinder
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
 
@@ -38,7 +38,7 @@ def files(tmp_path_factory):
     """A recording of two sensors, one of one, and their energyscapes."""
     folder = tmp_path_factory.mktemp("files")
     both = [
-        Measurement(given.words, SMALL, Stamp(sensor=sensor, sequence=number))
+        Measurement(given.data, SMALL, Stamp(sensor=sensor, sequence=number))
         for sensor in ("left", "right")
         for number, given in enumerate(noise())
     ]
@@ -60,7 +60,7 @@ def test_a_recording_is_processed_with_its_own_settings(files, tmp_path):
     run(files / "rec.h5", "-o", tmp_path / "a.npz")
     with ertis.open_recording(files / "rec.h5") as recording, np.load(tmp_path / "a.npz") as data:
         pipeline = ertis.Pipeline(recording.settings)
-        assert np.array_equal(data["energy"], [pipeline.process(each).energy for each in recording])
+        assert np.array_equal(data["amplitude"], [pipeline.process(each).amplitude for each in recording])
         assert data["sequence"].tolist() == [10, 11, 12]
 
 
@@ -68,7 +68,7 @@ def test_a_recording_is_processed_with_its_own_settings(files, tmp_path):
 def test_measurements_are_chosen(files, tmp_path, places, chosen):
     run(files / "img.h5", "-o", tmp_path / "a.npz", *(() if places is None else ("--measurement", places)))
     with np.load(tmp_path / "a.npz") as data:
-        assert np.array_equal(data["energy"], [image(seed=seed).energy for seed in chosen])
+        assert np.array_equal(data["amplitude"], [image(seed=seed).amplitude for seed in chosen])
 
 
 def test_all_sensors_are_in_the_frame_of_their_platform(files, tmp_path):
@@ -81,7 +81,7 @@ def test_all_sensors_are_in_the_frame_of_their_platform(files, tmp_path):
     for there, here in zip(turned, right, strict=True):  # half a turn about z, and a metre back
         assert float(there["x_m"]) == pytest.approx(-1 - float(here["x_m"]), abs=1e-6)
         assert float(there["y_m"]) == pytest.approx(-float(here["y_m"]), abs=1e-6)
-        assert there["energy"] == here["energy"]
+        assert there["amplitude"] == here["amplitude"]
 
 
 def test_json_and_words(files, tmp_path):
@@ -110,7 +110,7 @@ def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
 
 def test_air_that_changes(tmp_path):
     """Each image is made in the air of its measurement; one NPZ has one axis of ranges only."""
-    words = noise(count=1)[0].words
+    words = noise(count=1)[0].data
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     given = [Measurement(words, settings, Stamp(sequence=n)) for n, settings in enumerate((SMALL, warm, warm))]
     write_recording(tmp_path / "rec.h5", given)
@@ -248,11 +248,11 @@ def test_the_command_knows_the_formats():
 
 def test_the_page_names_what_the_formats_hold():
     table = PAGE[PAGE.index("| format |") :].split("\n\n", 1)[0].splitlines()[2:]
-    told = {}
+    reported = {}
     for line in table:
         name, ending, held, _ = (cell.strip() for cell in line.strip("|").split("|"))
-        told[name.strip("`")] = (ending.strip("`"), tuple(re.findall(r"`(\w+)`", held)))
-    assert told == {name: (each.ending, each.holds) for name, each in FORMATS.items()}
+        reported[name.strip("`")] = (ending.strip("`"), tuple(re.findall(r"`(\w+)`", held)))
+    assert reported == {name: (each.ending, each.holds) for name, each in FORMATS.items()}
 
 
 @pytest.fixture

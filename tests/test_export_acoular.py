@@ -70,14 +70,14 @@ def test_acoular_finds_the_reflectors(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["azimuth_deg"] == -38.0
-    assert told["rate_hz"] == settings.signal_rate_hz
-    assert told["shape"] == [-(-settings.recording.n_samples // settings.decimation), 32]
-    assert np.array_equal(np.transpose(told["mics"]), microphones(settings.array).enabled_positions_m)
-    assert told["metadata"]["sensor"] == "sensor"
-    assert float(told["metadata"]["sound_speed_m_s"]) == speed_m_s
-    assert Settings.from_toml(told["metadata"]["settings"]).call == settings.call
+    reported = json.loads(done.stdout)
+    assert reported["azimuth_deg"] == -38.0
+    assert reported["rate_hz"] == settings.signal_rate_hz
+    assert reported["shape"] == [-(-settings.recording.n_samples // settings.decimation), 32]
+    assert np.array_equal(np.transpose(reported["mics"]), microphones(settings.array).enabled_positions_m)
+    assert reported["metadata"]["sensor"] == "sensor"
+    assert float(reported["metadata"]["sound_speed_m_s"]) == speed_m_s
+    assert Settings.from_toml(reported["metadata"]["settings"]).call == settings.call
     assert {item.name for item in tmp_path.iterdir()} == {"signals.h5", "signals.xml"}  # no cache
 
 
@@ -132,7 +132,7 @@ def test_what_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ArgumentError, match=r"a.xml exists; give another name"):
         export(tmp_path / "a.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]
-    monkeypatch.setattr("ertis_numba.atomic.SPARE_BYTES", 2**62)
+    monkeypatch.setattr("ertis_numba.atomic_files.SPARE_BYTES", 2**62)
     with pytest.raises(DataError, match=r"MB free, wanted .* of it to spare; free some space"):
         export(tmp_path / "b.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]

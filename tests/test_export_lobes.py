@@ -50,7 +50,7 @@ def points(recording, tmp_path, *options):
 
 def test_side_lobes_are_points_that_noise_hardly_moves(recording, tmp_path):
     found = points(recording, tmp_path)
-    strongest = sorted(found, key=lambda row: -float(row["energy"]))
+    strongest = sorted(found, key=lambda row: -float(row["amplitude"]))
     lobes = strongest[2:]
     assert len(lobes) >= 4
     assert min(float(row["uncertainty_range_m"]) for row in lobes) < 2e-6  # noise alone leaves less than 1e-6

@@ -9,13 +9,13 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.interop import TOPICS, export
 from ertis_numba.interop._messages import DEFINITIONS, schema
 from ertis_numba.settings import Processing, Settings
-from ertis_numba.stages.points import PointExtractor
 from tests.files import SMALL, image
 
 TIME_NS = 1_700_000_000_123_456_789
@@ -63,13 +63,15 @@ def bag(tmp_path_factory):
     return read(path)
 
 
-def told(message):
+def reported(message):
     """A message as dicts, lists and numbers."""
     if hasattr(message, "__msgtype__"):
-        return {name: told(value) for name, value in vars(message).items() if name.islower() and name != "__msgtype__"}
+        return {
+            name: reported(value) for name, value in vars(message).items() if name.islower() and name != "__msgtype__"
+        }
     if isinstance(message, np.ndarray):
         return message.tolist()
-    return [told(item) for item in message] if isinstance(message, list) else message
+    return [reported(item) for item in message] if isinstance(message, list) else message
 
 
 def header(given, frame):
@@ -100,8 +102,8 @@ def test_points(bag, given):
     grid = Grid(given.azimuth_rad, given.elevation_rad)
     cloud = PointExtractor(given.settings, grid, top=40, min_level_db=-60.0)(given)
     assert len(cloud) > 1
-    rows = np.column_stack([cloud.position_m, cloud.energy])
-    assert told(message) == {
+    rows = np.column_stack([cloud.position_m, cloud.amplitude])
+    assert reported(message) == {
         "header": header(given, sensor),
         "height": 1,
         "width": len(cloud),
@@ -121,14 +123,14 @@ def test_points(bag, given):
 def test_sonar_image(bag, given):
     sensor = given.stamp.sensor
     message = bag[0][f"{FRAMES[sensor]}/sonar_image", given.stamp.timestamp_ns]
-    energies = message.image.data.view("<f4").reshape(len(given.range_m), len(given.azimuth_rad))
-    assert np.array_equal(energies, given.energy.T)
+    amplitudes = message.image.data.view("<f4").reshape(len(given.range_m), len(given.azimuth_rad))
+    assert np.array_equal(amplitudes, given.amplitude.T)
     assert np.array_equal(message.ranges, given.range_m.astype(np.float32))
     # The frame is z forward, x up, y right; that of the sensor x forward, y left, z up.
     forward, left, up = unit_vectors(given.azimuth_rad, given.elevation_rad).T
     beams = [[beam.x, beam.y, beam.z] for beam in message.beam_directions]
     assert np.array_equal(beams, np.column_stack([up, -left, forward]))
-    rest = told(message)
+    rest = reported(message)
     for name in ("beam_directions", "ranges"):
         rest.pop(name)
     rest["image"].pop("data")
@@ -151,31 +153,31 @@ def test_pictures(bag):
     given = GIVEN[0]
     assert (planar.height, planar.width, planar.step) == (400, 37, 37)
     assert (planar.encoding, planar.is_bigendian) == ("mono8", 0)
-    assert told(planar.header) == header(given, "eRTIS-7")
+    assert reported(planar.header) == header(given, "eRTIS-7")
     pixels = planar.data.reshape(400, 37)
-    level_db = 20 * np.log10(given.energy / given.energy.max())
+    level_db = 20 * np.log10(given.amplitude / given.amplitude.max())
     wanted = np.rint(255 * np.clip(1 + level_db / 40, 0, 1)).T[::-1, ::-1]
     assert np.abs(pixels - wanted).max() <= 1
     assert pixels.max() == 255
-    skewed = given.energy.copy()
+    skewed = given.amplitude.copy()
     skewed[5, 30] = 1.0  # to the right of the middle and near
     assert given.azimuth_rad[5] < 0
-    row, column = np.unravel_index(_pixels(given.replace(energy=skewed)).argmax(), (400, 37))
+    row, column = np.unravel_index(_pixels(given.replace(amplitude=skewed)).argmax(), (400, 37))
     assert (row, column) == (400 - 1 - 30, 37 - 1 - 5)
 
 
 def _pixels(given):
     from ertis_numba.interop._picture import Picture  # noqa: PLC0415  as the file has it
 
-    return Picture(given)(given.energy)
+    return Picture(given)(given.amplitude)
 
 
 @pytest.mark.parametrize("direction", [0, 17, 33, 59])
 def test_map_of_directions(direction):
     given = spatial()
-    energy = np.full_like(given.energy, 0.001)
-    energy[direction, 20] = 1.0
-    pixels = _pixels(given.replace(energy=energy))
+    amplitude = np.full_like(given.amplitude, 0.001)
+    amplitude[direction, 20] = 1.0
+    pixels = _pixels(given.replace(amplitude=amplitude))
     rows, columns = np.nonzero(pixels == 255)
     height, width = pixels.shape
     azimuth_rad = np.interp(columns.mean(), [0, width - 1], [given.azimuth_rad.max(), given.azimuth_rad.min()])
@@ -198,8 +200,8 @@ def test_maps_of_few_directions(azimuth_deg, elevation_deg, shape):
 @pytest.mark.parametrize("azimuth_deg", [np.arange(150, 211, 10), [150, 160, 170, 180, -170, -160, -150]])
 def test_the_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_deg):
     """It is 210°, wherever azimuths are said to begin."""
-    energy = np.geomspace(0.1, 1.0, 7, dtype=np.float32)[:, None].repeat(50, axis=1)  # the farther left, the louder
-    pixels = _pixels(image(azimuth_deg, range_m=np.linspace(0.5, 1.5, 50)).replace(energy=energy))
+    amplitude = np.geomspace(0.1, 1.0, 7, dtype=np.float32)[:, None].repeat(50, axis=1)  # the farther left, the louder
+    pixels = _pixels(image(azimuth_deg, range_m=np.linspace(0.5, 1.5, 50)).replace(amplitude=amplitude))
     assert pixels.shape == (50, 7)
     assert (np.diff(pixels[0].astype(int)) < 0).all()
 
@@ -215,7 +217,7 @@ def test_a_map_of_what_is_behind_the_sensor_is_that_of_what_is_ahead():
 
 def test_static_transforms(bag):
     message = bag[0]["/tf_static", TIME_NS]
-    found = {each.child_frame_id: (each.header.frame_id, told(each.transform)) for each in message.transforms}
+    found = {each.child_frame_id: (each.header.frame_id, reported(each.transform)) for each in message.transforms}
     assert set(found) == {"eRTIS-7", "eRTIS-7_sonar", "2.right", "2.right_sonar"}
     parent, transform = found["eRTIS-7"]
     assert parent == "base_link"

@@ -16,7 +16,7 @@ def images(count=3):
             stamp=Stamp(
                 sensor="eRTIS-7",
                 sequence=2**40 + seed,
-                epoch=2**62 + seed,
+                session_id=2**62 + seed,
                 sync_count=5 + seed,
                 timestamp_ns=-seed,
                 timestamp_uncertainty_ns=400 + seed,
@@ -32,12 +32,12 @@ def test_all_comes_back(tmp_path, given):
     (path,) = export(tmp_path / "a.npz", given)
     with np.load(path, allow_pickle=False) as data:
         assert tuple(data) == FORMATS["npz"].holds
-        assert data["energy"].dtype == np.float32
-        assert np.array_equal(data["energy"], [each.energy for each in wanted])
+        assert data["amplitude"].dtype == np.float32
+        assert np.array_equal(data["amplitude"], [each.amplitude for each in wanted])
         for name in ("azimuth_rad", "elevation_rad", "range_m"):
             assert np.array_equal(data[name], getattr(wanted[0], name))
             assert data[name].dtype == np.float64
-        names = ("epoch", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns")
+        names = ("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns")
         columns = zip(*(data[name].tolist() for name in names), strict=True)
         back = [Stamp(sensor=str(data["sensor"]), **dict(zip(names, row, strict=True))) for row in columns]
         assert back == [each.stamp for each in wanted]

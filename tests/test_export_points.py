@@ -9,11 +9,11 @@ import pytest
 from pypcd4 import PointCloud as Pcd
 
 import ertis_numba as ertis
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import Grid
 from ertis_numba.interop import FORMATS, export
-from ertis_numba.stages.points import PointExtractor
 from tests.files import image
 
 REFLECTORS = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
@@ -29,7 +29,7 @@ def images(sensor="eRTIS-7", count=2, **stamp):
                 sensor=sensor,
                 **{
                     "sequence": 4_000_000_000 + seed,
-                    "epoch": 2**62 + seed,
+                    "session_id": 2**62 + seed,
                     "sync_count": 2**40 + seed,
                     "timestamp_ns": 1_700_000_000_123_456_789 + seed,
                 }
@@ -74,7 +74,7 @@ def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
     where = np.concatenate([cloud.on_platform_m() for cloud in clouds])
     assert np.array_equal(np.column_stack([points[axis] for axis in "xyz"]), where)
     assert points["x"].dtype == np.float32
-    assert np.array_equal(points["intensity"], np.concatenate([cloud.energy for cloud in clouds]))
+    assert np.array_equal(points["intensity"], np.concatenate([cloud.amplitude for cloud in clouds]))
     uncertainty_m = np.column_stack([points["uncertainty_range"], points["uncertainty_across"]])
     assert np.array_equal(uncertainty_m, np.concatenate([cloud.uncertainty_m for cloud in clouds]))
     assert np.ptp(uncertainty_m[:, 1]) > 0
@@ -95,13 +95,13 @@ def test_csv_comes_back(tmp_path):
     columns = dict(zip(head, zip(*rows, strict=True), strict=True))
     assert set(columns["sensor"]) == {'left, and"right'}
     stamps = [cloud.stamp for cloud in clouds for _ in range(len(cloud))]
-    for name in ("epoch", "sequence", "sync_count", "timestamp_ns"):
+    for name in ("session_id", "sequence", "sync_count", "timestamp_ns"):
         assert [int(cell) for cell in columns[name]] == [getattr(stamp, name) for stamp in stamps]
     where = np.concatenate([cloud.position_m for cloud in clouds])
     uncertainty_m = np.concatenate([cloud.uncertainty_m for cloud in clouds])
-    energy = np.concatenate([cloud.energy for cloud in clouds])
-    wanted = np.column_stack([where, energy, uncertainty_m])
-    names = ("x_m", "y_m", "z_m", "energy", "uncertainty_range_m", "uncertainty_across_m")
+    amplitude = np.concatenate([cloud.amplitude for cloud in clouds])
+    wanted = np.column_stack([where, amplitude, uncertainty_m])
+    names = ("x_m", "y_m", "z_m", "amplitude", "uncertainty_range_m", "uncertainty_across_m")
     assert np.array_equal(np.column_stack([np.array(columns[name], dtype=np.float32) for name in names]), wanted)
 
 
@@ -129,7 +129,7 @@ def test_the_nearest_reflector_is_where_it_is(tmp_path):
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
 def test_silence_is_a_cloud_without_points(tmp_path, kind, read, text):
-    silent = image().replace(energy=np.zeros_like(image().energy))
+    silent = image().replace(amplitude=np.zeros_like(image().amplitude))
     (path,) = export(tmp_path / f"a.{kind}", [silent], text=text)
     if kind == "pcd" and text:  # which that reader cannot read
         assert path.read_text().endswith("POINTS 0\nDATA ascii\n")

@@ -15,8 +15,8 @@ def test_recording(tmp_path, engine, settings):
     given = noise(settings)
     path = write_recording(tmp_path / "rec.h5", given)
     with xarray.open_dataset(path, group="/sensors/eRTIS-7", engine=engine) as data:
-        assert data["pdm"].dims == ("time", "sample", "word")[: given[0].words.ndim + 1]
-        assert np.array_equal(data["pdm"].values, [each.words for each in given])
+        assert data["pdm"].dims == ("time", "sample", "word")[: given[0].data.ndim + 1]
+        assert np.array_equal(data["pdm"].values, [each.data for each in given])
         assert data["microphone_position"].dims == ("microphone", "axis")
         assert data["time"].values[0] == np.datetime64(1_700_000_000_123_456_789, "ns")
         assert {*data.variables} == {variable.name for variable in RECORDING}
@@ -26,11 +26,11 @@ def test_recording(tmp_path, engine, settings):
 def test_energyscapes(tmp_path, engine):
     path = write_energyscapes(tmp_path / "img.h5", [image(), image(seed=2)])
     with xarray.open_dataset(path, group="/sensors/sensor", engine=engine) as data:
-        assert data["energy"].dims == ("time", "direction", "range")
-        assert np.array_equal(data["energy"].values, [image().energy, image(seed=2).energy])
+        assert data["amplitude"].dims == ("time", "direction", "range")
+        assert np.array_equal(data["amplitude"].values, [image().amplitude, image(seed=2).amplitude])
         assert {*data.coords} == {"azimuth", "elevation", "range", "time"}
         assert data["range"].attrs["units"] == "m"
-        nearest = data["energy"].isel(time=0).max("direction").idxmax("range")
+        nearest = data["amplitude"].isel(time=0).max("direction").idxmax("range")
         assert float(nearest) == image().range_m[200]
         assert {*data.variables} == {variable.name for variable in ENERGYSCAPE}
 
@@ -39,4 +39,4 @@ def test_float16_is_read_by_h5netcdf(tmp_path):
     """netCDF-C crashes on it; docs/formats.md says so."""
     path = write_energyscapes(tmp_path / "img.h5", [image()], dtype="float16")
     with xarray.open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
-        np.testing.assert_allclose(data["energy"].values[0], image().energy, rtol=2**-10, atol=1e-7)
+        np.testing.assert_allclose(data["amplitude"].values[0], image().amplitude, rtol=2**-10, atol=1e-7)

@@ -46,7 +46,7 @@ IMAGES = {
     "one elevation": image(np.linspace(-30, 30, 7), np.full(7, 20.0)),
     "one azimuth": image(np.zeros(5), np.linspace(-30, 30, 5)),
     "two raised directions": image([0.0, 10.0], [5.0, 5.0]),
-    "silence": image().replace(energy=np.zeros((37, 400), np.float32)),
+    "silence": image().replace(amplitude=np.zeros((37, 400), np.float32)),
 }
 
 
@@ -90,11 +90,11 @@ def brightest_m(figure):
 @pytest.mark.parametrize(("azimuth_deg", "range_m"), [(-60.0, 1.0), (0.0, 4.5), (45.0, 3.0)])
 def test_a_reflector_is_where_it_should_be(azimuth_deg, range_m):
     given = image()
-    energy = np.full_like(given.energy, 1e-4)
-    energy[
+    amplitude = np.full_like(given.amplitude, 1e-4)
+    amplitude[
         np.argmin(np.abs(np.degrees(given.azimuth_rad) - azimuth_deg)), np.argmin(np.abs(given.range_m - range_m))
     ] = 1
-    across_m, ahead_m = brightest_m(plot(given.replace(energy=energy)))
+    across_m, ahead_m = brightest_m(plot(given.replace(amplitude=amplitude)))
     azimuth_rad = np.radians(azimuth_deg)
     assert across_m == pytest.approx(-range_m * np.sin(azimuth_rad), abs=0.03)  # left is positive azimuth
     assert ahead_m == pytest.approx(range_m * np.cos(azimuth_rad), abs=0.03)
@@ -114,7 +114,7 @@ def test_sphere_raster_is_blank_where_nothing_is_known():
     given = solid("3d:200")
     directions = unit_vectors(given.azimuth_rad, given.elevation_rad)
     raster = _sampling.sphere_raster(
-        given.energy.max(axis=1),
+        given.amplitude.max(axis=1),
         directions,
         azimuth_rad=np.radians([0.0, 80.0]),
         elevation_rad=np.radians([0.0]),

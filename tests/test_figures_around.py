@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import figures
-from ertis_numba.figures._hearing import Heard
+from ertis_numba.figures._hearing import MicrophoneTraces
 from ertis_numba.figures._signals import spectrogram
 from ertis_numba.figures._words import number, span
 from ertis_numba.frames import Peak
@@ -99,7 +99,7 @@ def test_spectrogram_of_a_long_record_has_all_echoes():
     time_s = np.arange(500_000) / settings.signal_rate_hz
     starts_s = 0.05 + 0.123 * np.arange(20)
     signal = sum(call_at(settings.call, time_s - start_s) for start_s in starts_s)
-    given = Heard(np.asarray(signal, dtype=np.float32)[None], time_s, np.array([0]))
+    given = MicrophoneTraces(np.asarray(signal, dtype=np.float32)[None], time_s, np.array([0]))
     power, frequency_hz, times_s = spectrogram(given, settings)
     assert len(times_s) == 600
     swept = power[(frequency_hz > 28e3) & (frequency_hz < 46e3)]

@@ -40,8 +40,8 @@ def with_reflector(azimuth_deg, elevation_deg, range_m):
     middle = looks[np.argmax(looks @ unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg)))]
     beam = np.exp(-0.5 * (np.linalg.norm(looks - middle, axis=1) / 0.05) ** 2)
     pulse = np.exp(-0.5 * ((given.range_m - range_m) / 0.01) ** 2)
-    energy = (beam[:, None] * pulse + 1e-4).astype(np.float32)
-    return given.replace(energy=energy), range_m * middle
+    amplitude = (beam[:, None] * pulse + 1e-4).astype(np.float32)
+    return given.replace(amplitude=amplitude), range_m * middle
 
 
 def test_slices_show_a_reflector_where_it_is():
@@ -186,8 +186,8 @@ def test_beam_width_is_that_of_the_array(frequency_hz, wanted_deg):
 
 def test_beam_width_of_the_mean_power_of_the_band():
     axes = figures.array(Settings()).axes[1]
-    told = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert told[2].startswith("25–50 kHz, mean power: 7.")
+    reported = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert reported[2].startswith("25–50 kHz, mean power: 7.")
     assert width_deg(*axes.lines[2].get_data(), 0.0) == pytest.approx(7.1, abs=0.1)
 
 
@@ -233,14 +233,14 @@ def test_an_image_of_nothing_says_so(draw):
     """Its colours alone would not."""
     given = image()
     assert "silence" not in words_of_page(draw(given))
-    assert "silence: all values are 0" in words_of_page(draw(given.replace(energy=np.zeros_like(given.energy))))
-    faint = given.energy * np.float32(1e-6 / given.energy.max())
-    assert "the strongest is −120 dB of full scale" in words_of_page(draw(given.replace(energy=faint)))
+    assert "silence: all values are 0" in words_of_page(draw(given.replace(amplitude=np.zeros_like(given.amplitude))))
+    faint = given.amplitude * np.float32(1e-6 / given.amplitude.max())
+    assert "the strongest is −120 dB of full scale" in words_of_page(draw(given.replace(amplitude=faint)))
 
 
 def test_bits_that_never_change_are_told():
     still = heard()
-    still = Measurement(np.zeros_like(still.words), still.settings, still.stamp)
+    still = Measurement(np.zeros_like(still.data), still.settings, still.stamp)
     assert "dB of full scale" in words_of_page(figures.matched_filter(still))
     assert "dB of full scale" not in words_of_page(figures.matched_filter(heard()))
 

@@ -23,13 +23,13 @@ ERTIS = [sys.executable, "-m", "ertis_cli"]
 
 def seconds(command, *, times, promised_s, **options):
     """The quickest of some runs, the last of which keeps the promise if any does, and what that one said."""
-    said = []
+    stated = []
 
     def once():
         done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=True, **options)
-        said.append(done.stderr)
+        stated.append(done.stderr)
 
-    return best_s(once, times=times, promised_s=promised_s), said[-1]
+    return best_s(once, times=times, promised_s=promised_s), stated[-1]
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +56,8 @@ def test_first_run_takes_less_than_12_s_and_says_why(recording, tmp_path):
     for run in ("first", "again"):  # nothing of the first one is left to the other
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / run)}
         command = [*ERTIS, "process", recording, "-o", tmp_path / f"{run}.h5", "--directions", "3000"]
-        taken_s, said = seconds(command, times=1, promised_s=12, env=environment)
-        assert "a first run compiles kernels" in said
+        taken_s, stated = seconds(command, times=1, promised_s=12, env=environment)
+        assert "a first run compiles kernels" in stated
         if taken_s < 12:
             break
     assert taken_s < 12
@@ -69,7 +69,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
     settings = Settings.from_preset("default_25_50").replace(
         processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
     )
-    words = noise(settings).words
+    words = noise(settings).data
     path = tmp_path / "long.h5"
     ertis.write_recording(path, (Measurement(words, settings, Stamp(sequence=n)) for n in range(700)))
     code = (
@@ -93,7 +93,7 @@ def real(request):
     axes = ertis.Pipeline(settings)
     some = np.unique(np.linspace(0, len(axes.grid) - 1, 24).astype(int))
     directions = unit_vectors(axes.grid.azimuth_rad[some], axes.grid.elevation_rad[some])
-    return measurement, some, reference.exact(measurement.words, settings, directions, axes.range_m)
+    return measurement, some, reference.exact(measurement.data, settings, directions, axes.range_m)
 
 
 @pytest.mark.parametrize("budget", ["draft", "standard", "fine", "exact"])
@@ -102,5 +102,5 @@ def test_images_of_the_real_measurement_are_as_exact_as_asked_for(real, budget):
     measurement, some, exact = real
     budget_db = {"draft": -20, "standard": -35, "fine": -60, "exact": -100}[budget]
     pipeline = ertis.Pipeline(measurement.settings, max_error_db=None if budget == "standard" else budget_db)
-    image = pipeline.process(measurement).energy[some]
+    image = pipeline.process(measurement).amplitude[some]
     assert reference.error_db(image, exact) < budget_db

@@ -77,7 +77,7 @@ def test_first_hour(tmp_path, monkeypatch):
     scene = (tmp_path / "scene.toml").read_text().replace('name = "mine"\n', f'name = "mine"\n{PCM}')
     (tmp_path / "pcm.toml").write_text(scene)
     wavfile.write(
-        tmp_path / "echoes.wav", 192_000, np.array(Simulator(load_scene(tmp_path / "pcm.toml")).render().words)
+        tmp_path / "echoes.wav", 192_000, np.array(Simulator(load_scene(tmp_path / "pcm.toml")).render().data)
     )
     with contextlib.ExitStack() as background:
         for command in commands_in(text):

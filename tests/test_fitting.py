@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from ertis_numba.settings import INTERPOLATIONS, Call, Settings
 from ertis_numba.stages.fitting import DelayFit, Spectrum, fit, weights_of
-from ertis_numba.waveform import matched_spectrum
+from ertis_numba.waveform import matched_noise_spectrum
 
 RATE_HZ = 45_000.0  # of the default ranges
 FLOOR = 1e-12  # power by which the fit is regularised
@@ -23,7 +23,7 @@ rates = st.floats(1.8, 50.0)  # by the bandwidth; plans have 1.8 and more
 
 
 def spectrum_of(call):
-    return Spectrum(*matched_spectrum(Settings(call=call), n_waves=40))
+    return Spectrum(*matched_noise_spectrum(Settings(call=call), n_waves=40))
 
 
 def step_s_of(call, rate):
@@ -147,12 +147,12 @@ def test_no_other_weights_and_no_other_gain_err_less():
     def error(gain, weights):
         return float(power @ np.sum(np.abs(targets - gain[:, None] * (taps @ weights)) ** 2, axis=1))
 
-    least = error(gain, weights)
-    assert least > 0.1
+    smallest = error(gain, weights)
+    assert smallest > 0.1
     for _ in range(50):
         step = 1e-3 * random.standard_normal((2, *weights.shape)) @ np.eye(3)
-        assert error(gain, weights + step[0] + 1j * step[1]) > least
-        assert error(gain * (1 + 1e-3 * np.exp(2j * np.pi * random.random(12))), weights) > least - 1e-3 * least
+        assert error(gain, weights + step[0] + 1j * step[1]) > smallest
+        assert error(gain * (1 + 1e-3 * np.exp(2j * np.pi * random.random(12))), weights) > smallest - 1e-3 * smallest
 
 
 def test_real_weights_are_the_best_real_ones():

@@ -199,7 +199,7 @@ def test_foolish_commands_are_refused_in_one_line(line, folder, monkeypatch):
     assert time.monotonic() - began_s < TIMEOUT_S
     assert done.exit_code in {1, 2}, (done.stdout, done.stderr)
     assert isinstance(done.exception, SystemExit), done.exception
-    (told,) = done.stderr.strip().splitlines()
-    assert told.startswith("ertis: error: ")
-    assert len(told) < MAX_LENGTH
+    (reported,) = done.stderr.strip().splitlines()
+    assert reported.startswith("ertis: error: ")
+    assert len(reported) < MAX_LENGTH
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before

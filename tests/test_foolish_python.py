@@ -61,45 +61,49 @@ CALLS = {
     "Pipeline(max_error str)": lambda given: ertis.Pipeline(given.settings, max_error_db="lots"),
     "Pipeline(recording file)": lambda given: ertis.Pipeline(RECORDING),
     "process(None)": lambda given: given.pipeline.process(None),
-    "process(array)": lambda given: given.pipeline.process(given.measurement.words),
+    "process(array)": lambda given: given.pipeline.process(given.measurement.data),
     "process(image)": lambda given: given.pipeline.process(given.image),
     "process(path)": lambda given: given.pipeline.process(RECORDING),
     "process(short)": lambda given: given.pipeline.process(
-        replace(given.measurement, words=given.measurement.words[:10])
+        replace(given.measurement, data=given.measurement.data[:10])
     ),
     "process(float words)": lambda given: given.pipeline.process(
-        replace(given.measurement, words=given.measurement.words.astype(float))
+        replace(given.measurement, data=given.measurement.data.astype(float))
     ),
     "process(2d words)": lambda given: given.pipeline.process(
-        replace(given.measurement, words=given.measurement.words.reshape(2, -1))
+        replace(given.measurement, data=given.measurement.data.reshape(2, -1))
     ),
     "process list": lambda given: given.pipeline.process([given.measurement]),
     "process_batch(one)": lambda given: given.pipeline.process_batch(given.measurement),
     "process_batch([None])": lambda given: list(given.pipeline.process_batch([None])),
     "Measurement(None)": lambda given: ertis.Measurement(None, given.settings),
     "Measurement(list)": lambda given: ertis.Measurement([1, 2, 3], given.settings),
-    "Measurement(settings None)": lambda given: ertis.Measurement(given.measurement.words, None),
-    "Measurement(settings str)": lambda given: ertis.Measurement(given.measurement.words, "default_25_50"),
+    "Measurement(settings None)": lambda given: ertis.Measurement(given.measurement.data, None),
+    "Measurement(settings str)": lambda given: ertis.Measurement(given.measurement.data, "default_25_50"),
     "Energyscape shapes": lambda given: ertis.Energyscape(
-        given.image.energy[:5], given.image.azimuth_rad, given.image.elevation_rad, given.image.range_m, given.settings
+        given.image.amplitude[:5],
+        given.image.azimuth_rad,
+        given.image.elevation_rad,
+        given.image.range_m,
+        given.settings,
     ),
     "Energyscape lists": lambda given: ertis.Energyscape([[1]], [0], [0], [1], given.settings),
     "Energyscape nan": lambda given: ertis.find_peaks(
-        given.image.replace(energy=np.full_like(given.image.energy, np.nan))
+        given.image.replace(amplitude=np.full_like(given.image.amplitude, np.nan))
     ),
-    "image.replace energy shape": lambda given: given.image.replace(energy=given.image.energy.T),
-    "image.replace typo": lambda given: given.image.replace(enrgy=given.image.energy),
+    "image.replace energy shape": lambda given: given.image.replace(amplitude=given.image.amplitude.T),
+    "image.replace typo": lambda given: given.image.replace(enrgy=given.image.amplitude),
     "image.replace range": lambda given: given.image.replace(range_m=given.image.range_m[:-1]),
     "image.replace azimuth": lambda given: given.image.replace(azimuth_rad=given.image.azimuth_rad[:-1]),
     "cloud.replace position": lambda given: given.cloud.replace(position_m=given.cloud.position_m[:-1]),
     "cloud.replace 2 columns": lambda given: given.cloud.replace(position_m=given.cloud.position_m[:, :2]),
-    "cloud.replace energy": lambda given: given.cloud.replace(energy=given.cloud.energy[:-1]),
+    "cloud.replace energy": lambda given: given.cloud.replace(amplitude=given.cloud.amplitude[:-1]),
     "cloud.replace typo": lambda given: given.cloud.replace(levels=1),
     "cloud.replace uncertainty": lambda given: given.cloud.replace(uncertainty_m=np.zeros((1, 1))),
     "PointCloud wrong": lambda given: ertis.PointCloud(np.zeros((3, 2)), np.zeros(3), given.settings, ertis.Stamp()),
     "PointCloud lists": lambda given: ertis.PointCloud([[0, 0, 0]], [1], given.settings, ertis.Stamp()),
     "find_peaks(None)": lambda given: ertis.find_peaks(None),
-    "find_peaks(array)": lambda given: ertis.find_peaks(given.image.energy),
+    "find_peaks(array)": lambda given: ertis.find_peaks(given.image.amplitude),
     "find_peaks top 0": lambda given: ertis.find_peaks(given.image, top=0),
     "find_peaks top -1": lambda given: ertis.find_peaks(given.image, top=-1),
     "find_peaks top 2.5": lambda given: ertis.find_peaks(given.image, top=2.5),
@@ -108,7 +112,7 @@ CALLS = {
     "find_peaks level nan": lambda given: ertis.find_peaks(given.image, min_level_db=np.nan),
     "find_peaks where shape": lambda given: ertis.find_peaks(given.image, where=np.ones(3, bool)),
     "find_peaks where list": lambda given: ertis.find_peaks(given.image, where=[True]),
-    "find_peaks where float": lambda given: ertis.find_peaks(given.image, where=np.ones(given.image.energy.shape)),
+    "find_peaks where float": lambda given: ertis.find_peaks(given.image, where=np.ones(given.image.amplitude.shape)),
     "find_peaks alarm 2": lambda given: ertis.find_peaks(given.image, false_alarm=2),
     "find_peaks alarm 0": lambda given: ertis.find_peaks(given.image, false_alarm=0),
     "cfar alarm": lambda given: ertis.cfar_peaks(given.image, false_alarm=5),
@@ -172,7 +176,7 @@ CALLS = {
     "export noext": lambda given: ertis.export(given.folder / "d", [given.image]),
     "export path": lambda given: ertis.export(given.folder / "f.ply", RECORDING),
     "plot None": lambda given: ertis.plot(None),
-    "plot array": lambda given: ertis.plot(given.image.energy),
+    "plot array": lambda given: ertis.plot(given.image.amplitude),
     "plot range 0": lambda given: ertis.plot(given.image, dynamic_range_db=0),
     "plot range nan": lambda given: ertis.plot(given.image, dynamic_range_db=np.nan),
     "plot theme": lambda given: ertis.plot(given.image, theme="blue"),
@@ -204,8 +208,8 @@ CALLS = {
     "SensorNode": lambda given: ertis.SensorNode("127.0.0.1"),
     "KeyPair": lambda given: ertis.KeyPair("a", "b", "c"),
     "ClientKeys": lambda given: ertis.ClientKeys(None, "x"),
-    "Sonar None": lambda given: ertis.Sonar(None),
-    "Sonar str": lambda given: ertis.Sonar("/dev/ttyACM0"),
+    "Sonar None": lambda given: ertis.SonarDriver(None),
+    "Sonar str": lambda given: ertis.SonarDriver("/dev/ttyACM0"),
     "Emulator empty": lambda given: ertis.Emulator([]),
     "Emulator None": lambda given: ertis.Emulator(None),
     "Emulator floats": lambda given: ertis.Emulator([np.zeros(8)]),

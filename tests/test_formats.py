@@ -37,13 +37,13 @@ def rows(first):
         ("time", SHARED),
         ("temperature", [variable for variable in EITHER if variable not in SHARED]),
         ("scene", TRUTH),
-        ("energy", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
+        ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
     ],
 )
 def test_tables(first, table):
-    told = list(rows(first))
-    assert [row[0] for row in told] == [variable.name for variable in table]
-    for (_, axes, kinds, unit), variable in zip(told, table, strict=True):
+    reported = list(rows(first))
+    assert [row[0] for row in reported] == [variable.name for variable in table]
+    for (_, axes, kinds, unit), variable in zip(reported, table, strict=True):
         assert (axes, unit) == (variable.dims, variable.units)
         if variable.dtype:
             assert kinds == ["text" if variable.dtype == "str" else np.dtype(variable.dtype).name]

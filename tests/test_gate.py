@@ -8,7 +8,7 @@ import zmq
 
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.network import sockets
-from ertis_numba.network.gate import EVERYBODY, Gate
+from ertis_numba.network.zap_authenticator import EVERYBODY, ZapAuthenticator
 from tests.door import DESK, LISTED, LOOPBACK, PATIENCE_S, ROBOT, STRANGER, VIEWER, Door
 
 
@@ -35,7 +35,7 @@ def test_a_listed_key_is_let_in_as_what_it_is_listed(door, pair, sends, receives
 
 def test_an_unknown_key_is_refused_counted_and_told(door):
     client = door.knock(STRANGER)
-    assert door.told(client).startswith("the central node does not know this key; have it listed")
+    assert door.reported(client).startswith("the central node does not know this key; have it listed")
     assert door.monitors[client].final
     assert door.admits(STRANGER) is None
     assert (door.came, +door.gate.refused) == ([], {"unknown key": 2})
@@ -43,14 +43,14 @@ def test_an_unknown_key_is_refused_counted_and_told(door):
 
 def test_a_node_that_expects_another_central_node_says_nothing_to_this_one(door):
     client = door.knock(ROBOT, server=STRANGER.public)
-    assert "another key than --server-key says" in door.told(client)
+    assert "another key than --server-key says" in door.reported(client)
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 
 
 def test_a_node_without_a_key_is_refused_and_counted(door):
     client = door.knock(None)
-    assert door.told(client).endswith("give --key and --server-key")
+    assert door.reported(client).endswith("give --key and --server-key")
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 
@@ -63,7 +63,7 @@ def test_a_password_is_no_key(door):
 def test_a_node_with_keys_says_nothing_to_one_without(tmp_path):
     with Door(tmp_path, with_keys=False) as door:
         client = door.knock(ROBOT)
-        assert "key" in door.told(client)
+        assert "key" in door.reported(client)
         assert not door.came
 
 
@@ -98,20 +98,20 @@ def test_a_message_that_came_past_the_gate_is_nobodys(door):
 # The gate fails
 
 
-class _Raises(Gate):
+class _Raises(ZapAuthenticator):
     def _decide(self, request):
         raise KeyError(request)
 
 
-class _LetsIn(Gate):
+class _LetsIn(ZapAuthenticator):
     def _decide(self, request):  # noqa: ARG002
         return self._mark + STRANGER.public, ""
 
 
 def test_a_gate_that_fails_lets_nobody_in_and_goes_on(tmp_path):
     with Door(tmp_path, gate=_Raises) as door:
-        assert "does not know this key" in door.told(door.knock(ROBOT))
-        assert "does not know this key" in door.told(door.knock(ROBOT))
+        assert "does not know this key" in door.reported(door.knock(ROBOT))
+        assert "does not know this key" in door.reported(door.knock(ROBOT))
         assert (door.came, +door.gate.refused) == ([], {"gate: KeyError": 2})
 
 
@@ -181,11 +181,11 @@ def test_a_self_test_fails_where_a_node_without_a_key_is_let_in(door):
 
 
 def test_a_self_test_fails_where_nothing_answers(door, monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.gate._SELF_TEST_S", 0.2)
+    monkeypatch.setattr("ertis_numba.network.zap_authenticator._SELF_TEST_S", 0.2)
     with pytest.raises(NetworkError, match=r"did not refuse a node with no key within 0\.2 s; start it when"):
         door.gate.self_test("tcp://127.0.0.1:1")
 
 
 def test_a_context_has_one_gate(door):
     with pytest.raises(ArgumentError, match="has a gate already; make one for each"):
-        Gate(door.context, door.keys)
+        ZapAuthenticator(door.context, door.keys)

@@ -7,8 +7,8 @@ import zmq
 
 from ertis_numba.errors import SettingsError
 from ertis_numba.network.allow_list import Permission
-from ertis_numba.network.gate import Gate
 from ertis_numba.network.keys import ServerKeys
+from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from tests.door import CENTRAL, DESK, LISTED, ROBOT, STRANGER, Door
 
 
@@ -116,4 +116,4 @@ def test_a_list_that_cannot_be_used_at_the_start_is_told(tmp_path, text):
     if text is not None:
         path.write_text(text)
     with zmq.Context() as context, pytest.raises(SettingsError, match=r"allow\.toml"):
-        Gate(context, ServerKeys(CENTRAL, path))
+        ZapAuthenticator(context, ServerKeys(CENTRAL, path))

@@ -91,11 +91,11 @@ PARTS = {
 @pytest.fixture
 def report(monkeypatch, tmp_path):
     """What a run writes whose parts end as above, and what it says."""
-    said = []
+    stated = []
     monkeypatch.setattr(gpu, "part", lambda name: {"status": "done", "rows": [GPU]} if name == "machine" else None)
     monkeypatch.setattr(gpu, "parts", lambda: {name: dict(part).copy for name, part in PARTS.items()})
-    report = gpu.run(results=tmp_path / "results", say=said.append)
-    return report, said
+    report = gpu.run(results=tmp_path / "results", say=stated.append)
+    return report, stated
 
 
 def test_without_a_gpu_it_is_told_in_a_line_and_nothing_is_written(tmp_path):
@@ -115,14 +115,14 @@ def test_simulator_is_refused(tmp_path, monkeypatch):
 
 
 def test_results_are_a_file_named_for_gpu_and_time(report, tmp_path):
-    found, said = report
+    found, stated = report
     (path,) = (tmp_path / "results").iterdir()
     assert path.name.startswith("nvidia-test-gpu-20")
     assert json.loads(path.read_text("utf-8")) == found
     assert found["gpu"] == GPU
     assert list(found["parts"]) == list(PARTS)
     assert {"revision", "date", "machine", "source", "wall_s"} <= set(found)
-    assert "memcheck: not available: no compute-sanitizer on PATH or in CUDA_HOME" in said
+    assert "memcheck: not available: no compute-sanitizer on PATH or in CUDA_HOME" in stated
 
 
 def test_newest_results_make_the_tables_without_a_gpu(report, tmp_path):
@@ -183,7 +183,7 @@ def test_part_that_hangs_is_ended_with_its_children():
     script = "import subprocess, sys; print('begun', flush=True); subprocess.run(['sleep', '60'])"
     done = gpu.execute([sys.executable, "-c", script], 1.5)
     assert time.monotonic() - begin_s < 10
-    assert done == gpu.Done(None, "begun\n")
+    assert done == gpu.FinishedProcess(None, "begun\n")
 
 
 def test_rows_before_a_failure_are_kept(monkeypatch):
@@ -251,7 +251,7 @@ def test_array_operations_make_the_same_image(monkeypatch, name):
     found = rivals.tables_of(plan, measurement)
     out = np.full_like(found.image, np.nan)
     monkeypatch.setattr(rivals, "_GATHERED_BYTES", 2**18)  # some directions at a time
-    rivals.ArrayChain(found, rivals.numpy_library())(measurement.words.reshape(len(measurement.words), -1), out)
+    rivals.ArrayChain(found, rivals.numpy_library())(measurement.data.reshape(len(measurement.data), -1), out)
     assert verification.error_db(out, found.image) < -120
 
 

@@ -28,16 +28,16 @@ class Platform:
 
     def pulse(self, number, *, without=(), late=0):
         at_ns = 10**12 + number * INTERVAL_NS
-        for sensor, epoch in self.runs.items():
+        for sensor, session_id in self.runs.items():
             if sensor in without:
                 continue
             measured = data(
                 sensor,
                 number,
-                epoch=epoch,
+                session_id=session_id,
                 sync_count=number + self.shift.get(sensor, 0),
                 timestamp_ns=10**18 + at_ns + self.ahead.get(sensor, 0),
-                monotonic_ns=at_ns + 1000 * epoch * INTERVAL_NS,
+                monotonic_ns=at_ns + 1000 * session_id * INTERVAL_NS,
             )
             self.closed += self.groups.add(measured, at_ns + LATENCY_NS + late)
         return at_ns
@@ -45,7 +45,7 @@ class Platform:
     def wait(self, number):
         self.closed += self.groups.tick(10**12 + number * INTERVAL_NS)
 
-    def told(self):
+    def reported(self):
         return [(group.group, group.sensors, group.flags) for group in self.closed]
 
 
@@ -65,12 +65,12 @@ def test_no_group_is_whole_while_sensors_still_come():
     platform.pulse(0, without=("a",))
     assert not platform.closed
     platform.wait(25)
-    assert platform.told() == [(0, ("a", "b"), ())]
+    assert platform.reported() == [(0, ("a", "b"), ())]
 
 
 def test_a_group_is_closed_when_all_have_come(four):
     four.pulse(0)
-    assert four.told() == [(0, ("a", "b", "c", "d"), ())]
+    assert four.reported() == [(0, ("a", "b", "c", "d"), ())]
     assert four.closed[0].members == tuple((name, 1, 0) for name in "abcd")
     assert (four.closed[0].missing, four.closed[0].spread_ns) == ((), 0)
     assert four.groups.closed == {"complete": 1}
@@ -81,7 +81,7 @@ def test_a_group_that_lacks_a_sensor_is_closed_after_a_while_and_says_so(four):
         four.pulse(number, without=("c",) if number == 1 else ())
     assert [group.group for group in four.closed] == [0, 2]
     four.wait(20)
-    assert four.told()[-1] == (1, ("a", "b", "d"), ("incomplete",))
+    assert four.reported()[-1] == (1, ("a", "b", "d"), ("incomplete",))
     assert four.closed[-1].missing == ("c",)
 
 
@@ -90,7 +90,7 @@ def test_a_sensor_that_has_left_is_not_waited_for(four):
     for number in range(1, 80):
         four.pulse(number, without=("d",))
         four.wait(number)
-    assert four.told()[-1] == (79, ("a", "b", "c"), ())
+    assert four.reported()[-1] == (79, ("a", "b", "c"), ())
 
 
 def test_a_clock_that_steps_by_an_hour_flags_the_group_and_moves_nothing(four):
@@ -110,7 +110,7 @@ def test_counts_of_several_runs_are_aligned_by_time():
     for number in range(20):
         platform.pulse(number)
     platform.wait(40)
-    assert platform.told() == [(number, ("a", "b"), ()) for number in range(20)]
+    assert platform.reported() == [(number, ("a", "b"), ()) for number in range(20)]
 
 
 @pytest.mark.parametrize("shift", [-1, 1])
@@ -121,10 +121,10 @@ def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
         platform.shift["b"] = shift if number >= 20 else 0
         platform.pulse(number)
     platform.wait(90)
-    told = platform.told()
+    reported = platform.reported()
     # Some groups are flagged while nobody can know yet.
-    flagged = [group for group, _, flags in told if flags]
-    assert any("pulse" in flags for _, _, flags in told)
+    flagged = [group for group, _, flags in reported if flags]
+    assert any("pulse" in flags for _, _, flags in reported)
     assert all(19 <= group <= 30 for group in flagged)
     for group in platform.closed:
         pulses = {sensor: sequence for sensor, _, sequence in group.members}
@@ -143,7 +143,7 @@ def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
         platform.pulse(number)
     platform.wait(50)
     assert [group.group for group in platform.closed] == list(range(30))
-    assert platform.told()[-1] == (29, ("a", "b"), ("clock",))
+    assert platform.reported()[-1] == (29, ("a", "b"), ("clock",))
 
 
 def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
@@ -155,7 +155,7 @@ def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
     for number in range(10, 30):
         platform.pulse(number)
     platform.wait(50)
-    assert platform.told()[-1] == (29, ("a", "b"), ("clock",))
+    assert platform.reported()[-1] == (29, ("a", "b"), ("clock",))
 
 
 def test_a_measurement_that_comes_too_late_is_counted(four):
@@ -167,12 +167,12 @@ def test_a_measurement_that_comes_too_late_is_counted(four):
 
 
 def test_runs_that_come_and_go_are_forgotten(four):
-    for epoch in range(2, 80):
-        four.runs = dict.fromkeys("abcd", epoch)
+    for session_id in range(2, 80):
+        four.runs = dict.fromkeys("abcd", session_id)
         for number in range(3):
-            four.pulse(3 * epoch + number)
+            four.pulse(3 * session_id + number)
     four.wait(250)  # who comes after all others have gone is compared by the interval, after a while
-    assert four.told()[-1] == (233, ("a", "b", "c", "d"), ())
+    assert four.reported()[-1] == (233, ("a", "b", "c", "d"), ())
 
 
 def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
@@ -185,7 +185,7 @@ def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
     for number in range(10, 60):
         platform.pulse(number)
     platform.wait(90)
-    assert platform.told()[-1] == (59, ("a", "b"), ("clock",))
+    assert platform.reported()[-1] == (59, ("a", "b"), ("clock",))
     assert sum(group.sensors == ("a", "b") for group in platform.closed) >= 25
 
 
@@ -196,7 +196,7 @@ def test_a_node_that_catches_up_keeps_its_own_times():
         platform.pulse(number, without=("b",))
     for number in range(40):  # b sends what it has kept, ten times as fast
         at_ns = 10**12 + number * INTERVAL_NS
-        old = data("b", number, epoch=2, sync_count=number, timestamp_ns=10**18 + at_ns, monotonic_ns=at_ns)
+        old = data("b", number, session_id=2, sync_count=number, timestamp_ns=10**18 + at_ns, monotonic_ns=at_ns)
         platform.groups.add(old, 10**12 + (400 + number) * INTERVAL_NS // 10)
     assert platform.groups.closed["measurement too late"] > 20
 
@@ -220,7 +220,7 @@ def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
     for number in range(600):
         at_ns = 10**12 + number * INTERVAL_NS
         values |= {"sync_count": number, "timestamp_ns": 10**18 + at_ns, "monotonic_ns": at_ns}
-        evil = data("evil", number, epoch=9, **(values | wrong(number)))
+        evil = data("evil", number, session_id=9, **(values | wrong(number)))
         platform.closed += platform.groups.add(evil, at_ns + LATENCY_NS)
         platform.pulse(number)
         platform.wait(number + 0.5) if number % 4 == 0 else None

@@ -112,15 +112,15 @@ def test_own_array(place):
     numbers = np.random.default_rng(1).integers(-300, 300, (3_192, 8), dtype=np.int16)
     wavfile.write(place / "echoes.wav", 192_000, numbers)
     np.zeros(2 * 65_536, "<u4").tofile(place / "ring.bin")
-    told = [run_here(place, command) for command in commands_in(text)]
-    assert re.search(r"\+14\.\d+ .* 1\.23\d ", told[2])  # 1.2 m ahead and 0.3 m to the left
-    assert re.search(r"\+14\.\d+ .* 1\.23\d ", told[6])
+    reported = [run_here(place, command) for command in commands_in(text)]
+    assert re.search(r"\+14\.\d+ .* 1\.23\d ", reported[2])  # 1.2 m ahead and 0.3 m to the left
+    assert re.search(r"\+14\.\d+ .* 1\.23\d ", reported[6])
     assert len(open_recording(place / "words.h5")) == 2
     assert ertis_numba.load_layout(place / "ring8.toml").word_bits == 8
-    assert (open_recording(place / "echoes.h5")[0].words == numbers[192:]).all()
+    assert (open_recording(place / "echoes.h5")[0].data == numbers[192:]).all()
     (code,) = python_in(text)
     run(place, sys.executable, "-W", "error", "-c", code)
-    assert open_recording(place / "mine.h5")[0].words.dtype == "u4"
+    assert open_recording(place / "mine.h5")[0].data.dtype == "u4"
 
 
 @pytest.mark.parametrize("name", ["accuracy", "beamformers"])
@@ -133,8 +133,8 @@ def test_commands_of_a_page(place, name):
 def test_python_on_concepts(place):
     run_here(place, "example reflectors")
     (code,) = python_in(page("concepts"))
-    told = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.energy.shape[0])")
-    assert told.stdout.strip() == "81"
+    reported = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.energy.shape[0])")
+    assert reported.stdout.strip() == "81"
 
 
 def test_commands_on_cuda():
@@ -158,7 +158,7 @@ def test_python_on_cuda():
     given = {"measurements": measurements, "measurement": measurements[0], "settings": measurements[0].settings}
     exec(compile(code.replace('"cuda"', '"cuda"' if "cuda" in kernels.usable() else '"cpu"'), "cuda.md", "exec"), given)
     assert len(given["images"]) == len(measurements)
-    assert (given["images"][0].energy == given["image"].energy).all()
+    assert (given["images"][0].amplitude == given["image"].amplitude).all()
 
 
 def test_python_on_formats(place):
@@ -166,8 +166,8 @@ def test_python_on_formats(place):
     (place / "REC.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
     (code,) = python_in(page("formats"))
     (*_, last) = code.splitlines()
-    told = run(place, sys.executable, "-c", code.replace(last, f"print(dict({last}.sizes))")).stdout
-    assert "'sample'" in told
+    reported = run(place, sys.executable, "-c", code.replace(last, f"print(dict({last}.sizes))")).stdout
+    assert "'sample'" in reported
 
 
 def test_python_on_the_network(place):

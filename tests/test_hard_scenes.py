@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import (
@@ -21,7 +22,6 @@ from ertis_numba.simulation import (
 from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.detect import find_peaks
 from tests.hard_cases.forced import EIGHT, FULL, forced, image_of
 from tests.scenes import bits_of, heard, only, scene_of, seen, sorted_ways
 
@@ -41,7 +41,7 @@ def test_two_targets_in_one_place_add_up():
 def test_two_targets_in_antiphase_cancel():
     """They stand a quarter of a wavelength apart for one frequency; energy is missing, and nothing else happens."""
     scene = scene_of(Point(range_m=0.4), Point(range_m=0.4023), sensor=EIGHT)
-    assert image_of(scene).energy.max() > 0
+    assert image_of(scene).amplitude.max() > 0
 
 
 @pytest.mark.parametrize("diameter_m", [0.0, 0.02])
@@ -60,7 +60,7 @@ def test_a_target_behind_the_array(diameter_m):
 
 def test_no_targets_at_all():
     image = image_of(scene_of(sensor=EIGHT))
-    assert image.energy.max() < 1e-3  # the modulators' noise
+    assert image.amplitude.max() < 1e-3  # the modulators' noise
     assert Simulator(forced(scene_of(sensor=EIGHT))).reflectors() == []
 
 
@@ -92,7 +92,7 @@ def test_every_effect_with_everything_there():
         ambient=Ambient(),
         count=3,
     )
-    assert image_of(scene, index=2).energy.max() > 0
+    assert image_of(scene, index=2).amplitude.max() > 0
     assert len(seen(scene, *EFFECTS, sensor="other")) > 0
 
 

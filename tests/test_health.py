@@ -6,10 +6,10 @@ import functools
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.health import health, merge
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import Electronics, Point, Tone
-from ertis_numba.stages.health import health, merge
 from ertis_numba.storage import open_recording
 from tests import cases, rings
 from tests.health_recordings import (
@@ -36,7 +36,7 @@ def test_shipped_recordings_are_in_order(name):
 
 @pytest.mark.parametrize("n_samples", [163_840, 65_536, 40_961])
 def test_real_measurement_is_in_order(n_samples):
-    report = health(dataclasses.replace(real(), words=real().words[:n_samples]))
+    report = health(dataclasses.replace(real(), data=real().data[:n_samples]))
     assert (report.faults, report.tones_hz, report.unknown) == ({}, (), ())
     assert -65 < report.noise_dbfs < -45
     assert 75 < report.dynamic_range_db < 95
@@ -98,7 +98,7 @@ def test_faults_by_hand(name):
 
 
 def test_all_silent():
-    report = health(dataclasses.replace(sound(), words=np.zeros_like(sound().words)))
+    report = health(dataclasses.replace(sound(), data=np.zeros_like(sound().data)))
     assert report.verdict() == "stuck at 0: every channel"
     assert (report.noise_dbfs, report.dynamic_range_db) == (None, None)
 
@@ -113,34 +113,34 @@ def numbers():
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
 def test_numbers_have_no_full_scale(scale):
     """Pascal, for one, goes as high as the sound; what was cut off before is told at any scale."""
-    words = numbers().words * np.float32(scale)
-    assert health(dataclasses.replace(numbers(), words=words)).faults == {}
+    words = numbers().data * np.float32(scale)
+    assert health(dataclasses.replace(numbers(), data=words)).faults == {}
     words[:, 5] = np.clip(words[:, 5], -0.4 * np.abs(words).max(), 0.4 * np.abs(words).max())
-    assert health(dataclasses.replace(numbers(), words=words)).faults == {"saturated": (5,)}
+    assert health(dataclasses.replace(numbers(), data=words)).faults == {"saturated": (5,)}
 
 
 def test_levels_of_numbers_beyond_1_refer_to_the_highest():
-    words = numbers().words
+    words = numbers().data
     noise = np.random.default_rng(1).standard_normal(words.shape)
     noisy = 0.1 * words / np.abs(words).max() + 1e-4 * noise
 
-    def told(peak):
+    def reported(peak):
         given = (peak / np.abs(noisy).max() * noisy).astype(np.float32)
-        report = health(dataclasses.replace(numbers(), words=given))
+        report = health(dataclasses.replace(numbers(), data=given))
         return report.noise_dbfs, report.dynamic_range_db
 
-    at_full_scale = told(1.0)
+    at_full_scale = reported(1.0)
     for peak in (3e5, 3e12):
-        assert told(peak) == pytest.approx(at_full_scale, abs=0.01)
+        assert reported(peak) == pytest.approx(at_full_scale, abs=0.01)
     quieter = (at_full_scale[0] - 20, at_full_scale[1] + 20)  # full scale is 1 where nothing goes beyond it
-    assert told(0.1) == pytest.approx(quieter, abs=0.01)
+    assert reported(0.1) == pytest.approx(quieter, abs=0.01)
     assert at_full_scale[0] < -60
 
 
 def test_calibrated_gains_make_no_microphone_dead():
     gain = (1.0, 2.0, 0.5, 3.0, 0.7, 3.0, 0.2, 3.0)
-    words = numbers().words * np.float32(gain)
-    assert health(dataclasses.replace(numbers(), words=words)).faults == {"dead": (6,)}
+    words = numbers().data * np.float32(gain)
+    assert health(dataclasses.replace(numbers(), data=words)).faults == {"dead": (6,)}
     settings = numbers().settings.replace(array=rings.RING.replace(gain=gain))
     assert health(Measurement(words, settings)).faults == {}
     words[:, 3] *= np.float32(0.2)

@@ -12,7 +12,7 @@ from ertis_bench.health.faults import FAULTS
 from ertis_bench.health.scenes import base
 from ertis_cli.main import cli
 
-from ertis_numba.stages.health.kinds import KINDS
+from ertis_numba.analysis.health.kinds import KINDS
 from ertis_numba.storage import write_recording
 
 
@@ -44,7 +44,7 @@ def test_health_names_the_fault(name):
 def test_gain_faults_have_the_gain_of_their_name(gain_db):
     healthy = base("one echo", 0, is_pdm=False)
     measurement, [channel] = FAULTS[f"gain {gain_db:+g} dB"].put_into(healthy, np.random.default_rng(0))
-    peak = np.abs(measurement.words[:, channel].astype(float)).max() / 32768
+    peak = np.abs(measurement.data[:, channel].astype(float)).max() / 32768
     assert 20 * np.log10(peak / np.abs(healthy.signals[channel]).max()) == pytest.approx(gain_db, abs=0.3)
 
 

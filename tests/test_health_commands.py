@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.analysis.health import limits
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
-from ertis_numba.stages.health import limits
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests import files
 from tests.health_recordings import (
@@ -31,7 +31,7 @@ def run(*arguments, code=0):
 @pytest.fixture
 def sick(tmp_path):
     """Ten measurements; the last one alone has a stuck bit."""
-    words = [real().words] * 9 + [real().words & ~np.uint32(1 << 4)]
+    words = [real().data] * 9 + [real().data & ~np.uint32(1 << 4)]
     given = [Measurement(each, REAL, Stamp(sequence=number)) for number, each in enumerate(words)]
     return write_recording(tmp_path / "rec.h5", given)
 
@@ -60,9 +60,9 @@ def test_info_tells_the_health(sick, tmp_path):
 @pytest.fixture
 def faulty(tmp_path):
     """A recording whose first measurement has two stuck bits."""
-    words = real().words & ~np.uint32(1 << 4) | np.uint32(1 << 9)
+    words = real().data & ~np.uint32(1 << 4) | np.uint32(1 << 9)
     second = dataclasses.replace(real(), stamp=Stamp(sequence=1))
-    return write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), words=words), second])
+    return write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), data=words), second])
 
 
 # Converter noise is a larger part of so small an image than the default budget permits, which `process` reports, too.
@@ -101,9 +101,9 @@ def test_process_says_nothing_of_what_is_in_order(tmp_path):
 
 
 def test_silence_is_no_fault_of_single_microphones(tmp_path):
-    path = write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), words=0 * real().words)])
-    told = run("process", path, "-o", tmp_path / "img.h5", *FAST).stderr
-    assert "(stuck at 0: every channel); check its cable and supply, or see" in told
+    path = write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), data=0 * real().data)])
+    reported = run("process", path, "-o", tmp_path / "img.h5", *FAST).stderr
+    assert "(stuck at 0: every channel); check its cable and supply, or see" in reported
 
 
 def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
@@ -119,7 +119,7 @@ def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
 
 def test_page_has_the_limits():
     page = (ROOT / "docs" / "health.md").read_text()
-    for told in (
+    for reported in (
         f"less than {100 * limits.MIN_CHANGES:g} % of",
         f"more than {100 * limits.MAX_SATURATED:g} % of",
         f"more than {limits.MAX_OFFSET:g} |",
@@ -138,4 +138,4 @@ def test_page_has_the_limits():
         f"{1e6 * limits.MAX_SHIFT_S:g} µs",
         f"{limits.MAX_SWAP_DB:g} dB |",
     ):
-        assert told in page, told
+        assert reported in page, reported

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.analysis.health import health, merge
 from ertis_numba.settings import Call, Recording
-from ertis_numba.stages.health import health, merge
 from tests import cases
 from tests.health_recordings import (
     BY_HAND,
@@ -22,10 +22,10 @@ from tests.health_recordings import (
 @pytest.mark.parametrize("n_samples", [0, 1, 2, 33, 255, 256, 257, 4000, 17_000])
 @pytest.mark.parametrize("bits", ["silent", "alternating", "real"])
 def test_short_records(n_samples, bits):
-    rows = {"silent": 0 * real().words, "alternating": np.arange(163_840) % 2 * 0xFFFFFFFF, "real": real().words}
+    rows = {"silent": 0 * real().data, "alternating": np.arange(163_840) % 2 * 0xFFFFFFFF, "real": real().data}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        report = health(dataclasses.replace(real(), words=rows[bits].astype("<u4")[:n_samples]))
+        report = health(dataclasses.replace(real(), data=rows[bits].astype("<u4")[:n_samples]))
     json.dumps(dataclasses.asdict(report), allow_nan=False)
     if n_samples < 256:
         assert {item.state for item in report.channels} == {"unknown"}
@@ -53,7 +53,7 @@ def test_a_band_too_narrow_for_the_record_is_told(call):
 @pytest.mark.parametrize("words", [np.zeros(4000, "u4"), np.zeros((4000, 2), "u1"), np.zeros((4000, 1, 1), "u1")])
 def test_words_of_another_array_are_refused(words):
     with pytest.raises(ertis.DataError, match=r"its settings want uint8 of shape \(4000,\): give the settings"):
-        health(dataclasses.replace(sound(), words=words))
+        health(dataclasses.replace(sound(), data=words))
 
 
 def test_noise_of_white_bits_is_what_falls_into_the_band():
@@ -67,9 +67,9 @@ def test_dynamic_range_is_that_of_images(name):
     """A full-scale echo is 1 in an image. What is quietest of a few channels is quieter than their mean."""
     measurements = [cases.noise(cases.CASES[name], seed) for seed in range(4)]
     pipeline = ertis.Pipeline(cases.CASES[name])
-    noise = np.mean([np.mean(pipeline.process(measurement).energy ** 2) for measurement in measurements])
-    told = merge([health(measurement) for measurement in measurements]).dynamic_range_db
-    assert told == pytest.approx(-10 * np.log10(noise), abs=1.2)
+    noise = np.mean([np.mean(pipeline.process(measurement).amplitude ** 2) for measurement in measurements])
+    reported = merge([health(measurement) for measurement in measurements]).dynamic_range_db
+    assert reported == pytest.approx(-10 * np.log10(noise), abs=1.2)
 
 
 def test_several_measurements_are_merged():
@@ -80,7 +80,7 @@ def test_several_measurements_are_merged():
     assert report.channels[3].noise_dbfs == healthy.channels[3].noise_dbfs
     assert report.channels[3].tone_hz == sick.channels[3].tone_hz
     assert merge([healthy]) == healthy
-    quiet = health(dataclasses.replace(sound(), words=np.random.default_rng(1).integers(0, 256, 65_536, np.uint8)))
+    quiet = health(dataclasses.replace(sound(), data=np.random.default_rng(1).integers(0, 256, 65_536, np.uint8)))
     assert merge([quiet, quiet]).unknown == ("dead microphones: no sound stands out of the noise",)
     assert merge([quiet, healthy]).unknown == ()
     assert merge([quiet, healthy]).channels[3].level_db == healthy.channels[3].level_db

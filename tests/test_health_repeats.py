@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.stages.health.repeats import repeated_blocks
+from ertis_numba.analysis.health.repeats import repeated_blocks
 
 CHANNELS = tuple(range(32))
 

@@ -1,9 +1,9 @@
 """Delays of channels: reported only where the envelope and both halves of the band agree."""
 
+from ertis_numba.analysis.health import health
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Electronics, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.health import health
 
 
 def test_health_ignores_the_start_of_modulators_in_silence():

@@ -12,12 +12,12 @@ from ertis_bench.network.hostile_hellos import hostile_texts
 from ertis_numba.documents import MAX_KEY_PARTS
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings, storable
-from ertis_numba.network.central_node import _greetings
-from ertis_numba.network.central_node._greetings import Greeting, Greetings
+from ertis_numba.network.central_node import _validation
 from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.messages import Ack, Hello, Refused, Welcome
 from ertis_numba.network.processing import chain
-from ertis_numba.network.processing.chain import Chain
+from ertis_numba.network.processing.chain import SharedPipeline
 from ertis_numba.settings import MAX_CALL_SAMPLES, Array, Call, Processing, Recording, Settings
 from ertis_numba.stages.memory import predicted_bytes
 from tests.central import Node, running, stored
@@ -134,14 +134,14 @@ def test_workers_refuse_settings_that_need_too_much_memory(changes, megabytes):
     settings = Settings().replace(**changes)
     assert predicted_bytes(settings) / 1e6 == pytest.approx(megabytes, rel=0.02)
     with pytest.raises(ArgumentError, match=r"needs about \d+ MB; the limit is 1000 MB. Give fewer directions"):
-        Chain(settings.to_toml(), "cpu")
+        SharedPipeline(settings.to_toml(), "cpu")
     assert predicted_bytes(Settings()) < chain.MAX_BYTES / 100
 
 
 def test_a_pipeline_has_a_limit_on_the_tables_of_its_plan(monkeypatch):
     monkeypatch.setattr(chain, "MAX_BYTES", predicted_bytes(Settings()) + 1000)
     with pytest.raises(ArgumentError, match="no plan fits into memory"):
-        Chain(Settings().to_toml(), "numpy")
+        SharedPipeline(Settings().to_toml(), "numpy")
 
 
 # The central node
@@ -153,7 +153,7 @@ class _Frame:
 
 
 def _greeting(peer, size=1):
-    hello = Hello(sensor="left", epoch=1, next_sequence=0, settings_crc32=0)
+    hello = Hello(sensor="left", session_id=1, next_sequence=0, settings_crc32=0)
     return Greeting([_Frame(peer)], hello, [bytes(size)], "")
 
 
@@ -179,8 +179,8 @@ def test_greetings_let_peers_take_turns():
 
 
 def test_greetings_have_limits(monkeypatch):
-    monkeypatch.setattr(_greetings, "MAX_WAITING_OF_PEER", 3)
-    monkeypatch.setattr(_greetings, "MAX_WAITING_BYTES", 1000)
+    monkeypatch.setattr(_validation, "MAX_WAITING_OF_PEER", 3)
+    monkeypatch.setattr(_validation, "MAX_WAITING_BYTES", 1000)
     greetings = Greetings(lambda *_: None)
     for _ in range(3):
         greetings.offer(_greeting(b"a"))
@@ -200,7 +200,7 @@ def test_a_central_node_acknowledges_others_while_it_reads_a_long_hello(tmp_path
         node.measure(given[0])
         node.hear_settled(10)
         begun_s = time.monotonic()
-        hello = Hello(sensor="bad", epoch=1, next_sequence=0, settings_crc32=zlib.crc32(text))
+        hello = Hello(sensor="bad", session_id=1, next_sequence=0, settings_crc32=zlib.crc32(text))
         for _ in range(4):
             other.send(hello, text)
         node.measure(given[1])

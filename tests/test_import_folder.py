@@ -56,7 +56,7 @@ def test_words_and_numbers(tmp_path):
     reader = open_rtis_folder(folder_of(tmp_path, names=("m_9.bin", "m_10.bin", "m_12.bin")), sensor="left")
     assert len(reader) == 3
     for (number, sequence), measurement in zip(enumerate((9, 10, 12)), reader, strict=True):
-        assert np.array_equal(measurement.words, words(number))
+        assert np.array_equal(measurement.data, words(number))
         assert (measurement.stamp.sensor, measurement.stamp.sequence) == ("left", sequence)
         assert measurement.stamp.timestamp_ns == 0
         assert measurement.settings is reader.settings
@@ -138,7 +138,7 @@ def test_the_measurement_that_comes_with_rtisdev(tmp_path):
     folder = folder_of(tmp_path, names=(), recording=recording, processing=processing)
     (folder / "simulate.bin").write_bytes(real.read_bytes())
     (measurement,) = open_rtis_folder(folder)
-    assert np.array_equal(measurement.words, np.fromfile(real, dtype="<u4"))
+    assert np.array_equal(measurement.data, np.fromfile(real, dtype="<u4"))
     assert measurement.settings.processing.directions == "2d:181"
     assert measurement.stamp.sequence == 0
 

@@ -57,7 +57,7 @@ def test_wav_of_every_kind(tmp_path, kind):
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", made(given)), PCM)
     (measurement,) = reader
     assert reader.settings.recording == Recording(sample_rate_hz=RATE_HZ, n_samples=3_000, encoding=encoding)
-    assert np.abs(measurement.words / reader.settings.recording.full_scale - given).max() <= error
+    assert np.abs(measurement.data / reader.settings.recording.full_scale - given).max() <= error
 
 
 def test_wav_of_24_bits_keeps_them_all(tmp_path):
@@ -68,13 +68,13 @@ def test_wav_of_24_bits_keeps_them_all(tmp_path):
         file.setframerate(RATE_HZ)
         file.writeframes(b"".join(int(x).to_bytes(3, "little", signed=True) for x in given.ravel()))
     (measurement,) = ertis.open_pcm(tmp_path / "a.wav", PCM.replace(processing=Processing(range_m=(0.1, 0.2))))
-    assert (measurement.words * 2.0**23 == given).all()
+    assert (measurement.data * 2.0**23 == given).all()
 
 
 def test_one_channel(tmp_path):
     one = PCM.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
     (measurement,) = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()[:, 0].astype(np.float32)), one)
-    assert measurement.words.shape == (3_000, 1)
+    assert measurement.data.shape == (3_000, 1)
     Pipeline(measurement.settings).process(measurement)
 
 
@@ -86,7 +86,7 @@ def test_emissions_in_a_row(tmp_path):
     assert len(reader) == len(measurements) == 5
     assert [item.stamp.sequence for item in measurements] == [0, 1, 2, 3, 4]
     starts = [1_000, 3_500, 6_000, 1_000, 3_500]
-    assert all((m.words == given[s : s + 2_500]).all() for m, s in zip(measurements, starts, strict=True))
+    assert all((m.data == given[s : s + 2_500]).all() for m, s in zip(measurements, starts, strict=True))
     assert reader.rest_s == pytest.approx(1_500 / RATE_HZ)
 
 
@@ -97,7 +97,7 @@ def test_periods_of_no_whole_number_of_samples_do_not_drift(tmp_path):
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", given), PCM, length_s=1 / 70, start_ns=5 * 10**18)
     measurements = list(reader)
     assert len(measurements) == len(reader) >= 99
-    assert all(item.words[0, 0] == 1_000 for item in measurements)
+    assert all(item.data[0, 0] == 1_000 for item in measurements)
     assert measurements[70].stamp.timestamp_ns == 5 * 10**18 + 10**9
 
 
@@ -106,13 +106,13 @@ def test_a_disabled_channel_may_hold_no_numbers(tmp_path):
     given[100:, 3] = np.nan
     settings = PCM.replace(array=RING.replace(enabled=tuple(channel != 3 for channel in range(8))))
     (measurement,) = ertis.open_pcm(write_wav(tmp_path / "a.wav", given), settings)
-    assert np.array_equal(measurement.words, np.where(np.isnan(given), 0, given))
+    assert np.array_equal(measurement.data, np.where(np.isnan(given), 0, given))
 
 
 def test_files_of_other_lengths_are_one_measurement_each(tmp_path):
     paths = [write_wav(tmp_path / f"{n}.wav", numbers(n)) for n in (6_000, 2_800)]
     reader = ertis.open_pcm(paths, PCM)
-    assert [len(item.words) for item in reader] == [2_800, 2_800]
+    assert [len(item.data) for item in reader] == [2_800, 2_800]
     assert reader.rest_s == pytest.approx(3_200 / RATE_HZ)
 
 
@@ -121,12 +121,12 @@ def test_large_files_stay_on_the_disk(tmp_path):
     next(iter(ertis.open_pcm(path, PCM)))  # loads what reads WAV
     tracemalloc.start()
     try:
-        n_samples = sum(len(item.words) for item in ertis.open_pcm(path, PCM, length_s=0.02))
-        _, most = tracemalloc.get_traced_memory()
+        n_samples = sum(len(item.data) for item in ertis.open_pcm(path, PCM, length_s=0.02))
+        _, largest = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert n_samples == 499_200
-    assert most < path.stat().st_size / 4
+    assert largest < path.stat().st_size / 4
 
 
 @pytest.mark.parametrize("rate_hz", [110_000, 192_000, 500_000, 1_000_000])
@@ -287,7 +287,7 @@ def test_what_was_exported_comes_back(tmp_path):
     image = Pipeline(reader.settings, max_error_db="fine").process(measurement)
     wanted = Pipeline(settings, max_error_db="fine").process(given)
     assert image.range_m == pytest.approx(wanted.range_m)
-    assert error_db(image.energy, wanted.energy) < -40
+    assert error_db(image.amplitude, wanted.amplitude) < -40
 
 
 def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
@@ -296,7 +296,7 @@ def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
         file["time_data"] = given
         file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
     (measurement,) = ertis.open_pcm(tmp_path / "a.h5", PCM)
-    assert np.array_equal(measurement.words, given)
+    assert np.array_equal(measurement.data, given)
     with pytest.raises(ArgumentError, match="give settings"):
         ertis.open_pcm(tmp_path / "a.h5")
 
@@ -304,12 +304,14 @@ def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
 def test_numbers_of_acoular_have_one_full_scale(tmp_path, kind):
     given = numbers()
-    most = 1.0 if kind.startswith("f") else -float(np.iinfo(kind).min)
+    largest = 1.0 if kind.startswith("f") else -float(np.iinfo(kind).min)
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["time_data"] = (np.rint(given * most).clip(-most, most - 1) if most > 1 else given).astype(kind)
+        file["time_data"] = (np.rint(given * largest).clip(-largest, largest - 1) if largest > 1 else given).astype(
+            kind
+        )
         file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
     (measurement,) = reader = ertis.open_pcm(tmp_path / "a.h5", PCM)
-    signals = measurement.words / reader.settings.recording.full_scale
+    signals = measurement.data / reader.settings.recording.full_scale
     assert np.abs(signals - given).max() <= (2.0**-7 if kind == "int8" else 2.0**-15)
 
 
@@ -367,7 +369,7 @@ def command(*arguments):
 
 
 def test_from_wav_to_reflectors(tmp_path, measurement):
-    write_wav(tmp_path / "echoes.wav", measurement.words)
+    write_wav(tmp_path / "echoes.wav", measurement.data)
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
     command("import", tmp_path / "echoes.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
     command("process", tmp_path / "rec.h5", "-o", tmp_path / "img.h5")

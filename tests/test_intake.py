@@ -8,14 +8,14 @@ import pytest
 
 from ertis_numba.network.central_node import _admission, _intake
 from ertis_numba.network.central_node._intake import Intake
-from ertis_numba.network.central_node._items import Forgotten, Run, Stored
+from ertis_numba.network.central_node._received_items import Forgotten, SensorSession, Stored
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.messages import Ack, Gap, Hello, Refused
 from ertis_numba.settings import Air
 from tests.central import data_of
 from tests.journals import EPOCH, TINY, entries
 
-RUN = Run("left", EPOCH)
+RUN = SensorSession("left", EPOCH)
 
 
 class Store:
@@ -24,7 +24,7 @@ class Store:
     def __init__(self):
         self.items = []
 
-    def settled(self, _):
+    def acked_through(self, _):
         return -1
 
     def offer(self, item):
@@ -50,19 +50,19 @@ class Taken:
 
     def __init__(self, *, store=True):
         self.store, self.viewer = Store() if store else None, Viewer()
-        self.sent, self.told = [], []
+        self.sent, self.reported = [], []
         self.intake = Intake(
             store=self.store,
             viewer=self.viewer,
             send=lambda _, message: self.sent.append(message),
-            tell=lambda event, **more: self.told.append((event, more)),
+            notify=lambda event, **more: self.reported.append((event, more)),
             on_stored=None,
-            most_bytes=100_000,
+            max_bytes=100_000,
         )
 
-    def greet(self, peer=b"a", *, settings=TINY, epoch=EPOCH, key="", first=0):
+    def greet(self, peer=b"a", *, settings=TINY, session_id=EPOCH, key="", first=0):
         text = settings.to_toml().encode()
-        hello = Hello(sensor="left", epoch=epoch, next_sequence=first, settings_crc32=zlib.crc32(text))
+        hello = Hello(sensor="left", session_id=session_id, next_sequence=first, settings_crc32=zlib.crc32(text))
         return self.intake.greet(peer, hello, self.intake.read(hello, [text]), key)
 
     def measure(self, *given):
@@ -130,12 +130,12 @@ def test_gaps_that_wait_are_bounded_too(first, monkeypatch):
     taken = Taken()
     taken.greet(first=first)
     for number in range(first, first + 100):
-        taken.intake.miss(b"a", Gap(sensor="left", epoch=EPOCH, first=number, last=number, reason="lost"))
+        taken.intake.miss(b"a", Gap(sensor="left", session_id=EPOCH, first=number, last=number, reason="lost"))
     assert 0 < len(taken.store.items) < 10
     reached = taken.store.items[-1].last
     taken.store_of(*taken.store.items)
-    assert taken.acks()[-1].settled == reached
-    taken.intake.miss(b"a", Gap(sensor="left", epoch=EPOCH, first=reached + 1, last=2_000, reason="lost"))
+    assert taken.acks()[-1].acked_through == reached
+    taken.intake.miss(b"a", Gap(sensor="left", session_id=EPOCH, first=reached + 1, last=2_000, reason="lost"))
     assert taken.store.items[-1].last == 2_000
 
 
@@ -143,7 +143,7 @@ def test_reasons_of_gaps_are_bounded():
     taken = Taken(store=False)
     taken.greet()
     for number in range(100):
-        gap = Gap(sensor="left", epoch=EPOCH, first=number, last=number, reason=f"reason {number}")
+        gap = Gap(sensor="left", session_id=EPOCH, first=number, last=number, reason=f"reason {number}")
         taken.intake.miss(b"a", gap)
     missing = taken.intake.tracks["left"].missing
     assert len(missing) < 40
@@ -167,34 +167,34 @@ def test_a_sensor_that_another_node_sends_with_other_settings_is_refused():
     taken, other = Taken(), TINY.replace(air=Air(temperature_c=5.0))
     taken.greet(b"a")
     with pytest.raises(Unwanted, match="another sensor node sends sensor left, with other settings") as refused:
-        taken.greet(b"b", settings=other, epoch=9)
-    assert isinstance(refused.value.answer(Ack(sensor="left", epoch=9, settled=0, status="stored")), Refused)
+        taken.greet(b"b", settings=other, session_id=9)
+    assert isinstance(refused.value.answer(Ack(sensor="left", session_id=9, acked_through=0, status="stored")), Refused)
     taken.greet(b"a", settings=other)  # its own may change
     taken.intake.bye(b"a")
-    taken.greet(b"b", epoch=9)  # and who has left is in nobody's way
+    taken.greet(b"b", session_id=9)  # and who has left is in nobody's way
 
 
 def test_a_sensor_that_two_live_nodes_send_is_told_once():
     taken = Taken()
     taken.greet(b"a")
-    taken.greet(b"b", epoch=9)
+    taken.greet(b"b", session_id=9)
     taken.intake.tick(time.monotonic())
-    assert "shared" not in dict(taken.told)  # the first may have gone, and be the second
+    assert "shared" not in dict(taken.reported)  # the first may have gone, and be the second
     for peer in (b"a", b"b"):
         taken.intake.ping(peer)
     for _ in range(2):
         taken.intake.tick(time.monotonic())
-    assert [more["sensor"] for event, more in taken.told if event == "shared"] == ["left"]
+    assert [more["sensor"] for event, more in taken.reported if event == "shared"] == ["left"]
 
 
 def test_a_key_has_fewer_peers_than_there_are_of_all(monkeypatch):
     monkeypatch.setattr(_admission, "_PEERS_OF_KEY", 2)
     taken = Taken()
     for peer in (b"a", b"b"):
-        taken.greet(peer, epoch=peer[0], key="one")
+        taken.greet(peer, session_id=peer[0], key="one")
     with pytest.raises(Unwanted, match="2 sensor nodes have this key"):
         taken.greet(b"c", key="one")
-    taken.greet(b"a", epoch=8, key="one")
-    taken.greet(b"c", epoch=7, key="another")
+    taken.greet(b"a", session_id=8, key="one")
+    taken.greet(b"c", session_id=7, key="another")
     for peer in (b"d", b"e", b"f"):  # where there are no keys
-        taken.greet(peer, epoch=peer[0])
+        taken.greet(peer, session_id=peer[0])

@@ -13,15 +13,15 @@ N_BYTES = 4 * 65_536
 
 
 def test_measurements_come_in_the_order_of_the_files(tmp_path):
-    words = [measurement.words for measurement in noise(SHORT)]
+    words = [measurement.data for measurement in noise(SHORT)]
     (tmp_path / "one.bin").write_bytes(words[0].tobytes())
     (tmp_path / "two.bin").write_bytes(words[1].tobytes() + words[2].tobytes())
     raw = open_raw([tmp_path / "one.bin", str(tmp_path / "two.bin")], SHORT, sensor="left")
     assert len(raw) == 3
     for _ in range(2):  # it can be read again
         for index, (measurement, given) in enumerate(zip(raw, words, strict=True)):
-            assert measurement.words.dtype == np.uint32
-            assert np.array_equal(measurement.words, given)
+            assert measurement.data.dtype == np.uint32
+            assert np.array_equal(measurement.data, given)
             assert measurement.settings is SHORT
             assert (measurement.stamp.sensor, measurement.stamp.sequence) == ("left", index)
 
@@ -29,16 +29,16 @@ def test_measurements_come_in_the_order_of_the_files(tmp_path):
 @pytest.mark.parametrize("settings", [line(8, 8), line(70, 16), line(64, 64)], ids=["8", "70 in 16", "64"])
 def test_words_of_any_size(tmp_path, settings):
     (given,) = noise(settings, 1)
-    (tmp_path / "raw.bin").write_bytes(given.words.tobytes())
+    (tmp_path / "raw.bin").write_bytes(given.data.tobytes())
     (back,) = open_raw(tmp_path / "raw.bin", settings)
-    assert np.array_equal(back.words, given.words)
+    assert np.array_equal(back.data, given.data)
 
 
 def test_word_is_little_endian_and_bit_0_is_channel_0(tmp_path):
     settings = SHORT.replace(recording=Recording(n_samples=1))
     (tmp_path / "raw.bin").write_bytes(b"\x01\x00\x00\x80")
     (measurement,) = open_raw(tmp_path / "raw.bin", settings)
-    assert measurement.words.tolist() == [0x80000001]
+    assert measurement.data.tolist() == [0x80000001]
 
 
 @pytest.mark.parametrize(

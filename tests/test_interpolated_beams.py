@@ -25,7 +25,7 @@ SHAPE_NAMES = sized(
 )
 SOME = "few directions" if SIMULATED else "prime"
 WINDOWS = sized([(0, 151), (3, 151), (17, 18), (5, 60), (5, 116)], [(0, 64), (40, 104), (130, 151), (150, 151)])
-MOST_BLOCKS = 4
+MAX_BLOCKS = 4
 
 
 @pytest.fixture(params=KERNELS)
@@ -95,7 +95,7 @@ def test_beams_of_nodes_fill_their_window_and_nothing_else(kernel_set, window):
 @pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
 def test_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(kernel_set, name):
     beams, n_ranges = beam_input(name), SHAPES[name][3]
-    counts = (*range(1, MOST_BLOCKS + 1), SHAPES[name][5] + 3)  # blocks without a direction as well
+    counts = (*range(1, MAX_BLOCKS + 1), SHAPES[name][5] + 3)  # blocks without a direction as well
     images = {image_of(kernel_set, beams, (0, n_ranges), n_ranges, count).tobytes() for count in counts}
     assert len(images) == 1
 
@@ -173,7 +173,7 @@ def test_whole_beams_of_nodes_end_where_they_should(whole_kernel_set, stop):
 
 @pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
 def test_whole_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(whole_kernel_set, name):
-    n_ranges, counts = SHAPES[name][3], (*range(1, MOST_BLOCKS + 1), SHAPES[name][5] + 3)
+    n_ranges, counts = SHAPES[name][3], (*range(1, MAX_BLOCKS + 1), SHAPES[name][5] + 3)
     tiles, beams = whole_input(name, whole_kernel_set.tile_ranges)
     images = {whole_image(whole_kernel_set, tiles, beams, n_ranges, n_ranges, count).tobytes() for count in counts}
     assert len(images) == 1

@@ -10,7 +10,7 @@ import pytest
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import TABLES, VERSION, Gap, Journal
+from ertis_numba.journal import TABLES, VERSION, Journal, JournalGap
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 from ertis_numba.settings import Array, Recording, Settings
 from tests.files import line
@@ -31,7 +31,7 @@ def test_measurements_come_back(tmp_path):
         right = [given[1], given[4]]
         assert all(same(*pair) for pair in zip(journal.entries("right"), right, strict=True))
         assert [key[1:] for key in journal.index("right")] == [("right", EPOCH, 0), ("right", EPOCH, 1)]
-        assert not next(journal.entries()).measurement.words.flags.writeable
+        assert not next(journal.entries()).measurement.data.flags.writeable
     assert [path.name for path in tmp_path.iterdir()] == ["rec.h5.journal"]
 
 
@@ -42,8 +42,8 @@ def test_all_kinds_of_words(tmp_path, settings):
     with create(tmp_path, given, settings=settings) as journal:
         back = list(journal.entries())
     for came, wanted in zip(back, given, strict=True):
-        assert came.measurement.words.dtype == wanted.measurement.words.dtype
-        assert np.array_equal(came.measurement.words, wanted.measurement.words)
+        assert came.measurement.data.dtype == wanted.measurement.data.dtype
+        assert np.array_equal(came.measurement.data, wanted.measurement.data)
 
 
 def test_a_layout_file_is_not_needed_any_more(tmp_path):
@@ -62,12 +62,12 @@ def test_a_layout_file_is_not_needed_any_more(tmp_path):
 
 def test_gaps_are_kept(tmp_path):
     with create(tmp_path) as journal:
-        journal.note_gap("left", 3, 3, "footer", epoch=EPOCH)
-        journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged", epoch=2**63 - 1)
+        journal.note_gap("left", 3, 3, "footer", session_id=EPOCH)
+        journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged", session_id=2**63 - 1)
     with Journal.open(journal.path) as journal:
         assert journal.gaps == (
-            Gap("left", 3, 3, "footer", EPOCH),
-            Gap("left", 0, 2**63 - 1, "the sensor was unplugged", 2**63 - 1),
+            JournalGap("left", 3, 3, "footer", EPOCH),
+            JournalGap("left", 0, 2**63 - 1, "the sensor was unplugged", 2**63 - 1),
         )
 
 
@@ -87,7 +87,7 @@ def test_numbers_rise_within_an_epoch(tmp_path):
                 ArgumentError, match=r"measurement \d+ of sensor left comes after 12; give them in order"
             ):
                 journal.append([late])
-        journal.append(entries(1, first=0, epoch=9))
+        journal.append(entries(1, first=0, session_id=9))
         journal.append(entries(1, first=13))
     with Journal.open(journal.path) as journal:
         with pytest.raises(ArgumentError, match="measurement 13 of sensor left comes after 13"):
@@ -122,28 +122,28 @@ BAD = {
         "sensor 'right' is not in .*rec.h5.journal; add it first",
     ),
     "gap of it": (
-        lambda journal: journal.note_gap("right", 1, 2, "x", epoch=1),
+        lambda journal: journal.note_gap("right", 1, 2, "x", session_id=1),
         "sensor 'right' is not in .*; add it first",
     ),
     "entries of it": (lambda journal: list(journal.entries("right")), "sensor 'right' is not in .*; add it first"),
     "gap backwards": (
-        lambda journal: journal.note_gap("left", 2, 1, "x", epoch=1),
+        lambda journal: journal.note_gap("left", 2, 1, "x", session_id=1),
         "last missing sequence number is 1; give",
     ),
     "gap of no run": (
-        lambda journal: journal.note_gap("left", 1, 2, "x", epoch=-1),
+        lambda journal: journal.note_gap("left", 1, 2, "x", session_id=-1),
         "epoch is -1; give a whole number from 0",
     ),
     "no reason": (
-        lambda journal: journal.note_gap("left", 1, 2, "", epoch=1),
+        lambda journal: journal.note_gap("left", 1, 2, "", session_id=1),
         "reason of a gap is ''; give a line of 1 to 64",
     ),
     "two lines": (
-        lambda journal: journal.note_gap("left", 1, 2, "a\nb", epoch=1),
+        lambda journal: journal.note_gap("left", 1, 2, "a\nb", session_id=1),
         "reason of a gap is .*; give a line",
     ),
     "long reason": (
-        lambda journal: journal.note_gap("left", 1, 2, "é" * 33, epoch=1),
+        lambda journal: journal.note_gap("left", 1, 2, "é" * 33, session_id=1),
         "reason of a gap is .*; give a line",
     ),
     "sensor twice": (
@@ -175,8 +175,8 @@ BAD = {
         lambda journal: journal.append([spoilt(words=np.zeros(4096, np.int16))]),
         "a measurement of sensor left holds int16; give uint8",
     ),
-    "epoch": (
-        lambda journal: journal.append([spoilt(epoch=2**63)]),
+    "session_id": (
+        lambda journal: journal.append([spoilt(session_id=2**63)]),
         "epoch is 9223372036854775808; give a whole number from 0",
     ),
     "stamp": (
@@ -191,7 +191,7 @@ def spoilt(words=None, **changes):
     (entry,) = entries(1, first=99)
     measurement = entry.measurement
     stamp = replace(measurement.stamp, **changes)
-    return replace(entry, measurement=Measurement(measurement.words if words is None else words, TINY, stamp))
+    return replace(entry, measurement=Measurement(measurement.data if words is None else words, TINY, stamp))
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -218,7 +218,7 @@ def test_threads_may_share_a_journal(tmp_path):
             journal.add_sensor(name, TINY)
             for entry in entries(8, sensor=name):
                 journal.append([entry])
-                journal.note_gap(name, 0, 1, "x", epoch=EPOCH)
+                journal.note_gap(name, 0, 1, "x", session_id=EPOCH)
 
         threads = [threading.Thread(target=work, args=(name,)) for name in names]
         for thread in threads:
@@ -234,11 +234,11 @@ def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
         wanted = {"synchronous": 2, "journal_mode": "wal", "locking_mode": "exclusive"}
         assert {name: journal._database.execute(f"PRAGMA {name}")[0][0] for name in wanted} == wanted  # noqa: SLF001  nobody else can ask
         journal.add_sensor("right", Settings())
-        most = 0
+        largest = 0
         for entry in entries(20, sensor="right", settings=Settings()):
             journal.append([entry])
-            most = max(most, (tmp_path / "rec.h5.journal-wal").stat().st_size)
-        assert LOG_BYTES / 2 < most < LOG_BYTES + 1_000_000
+            largest = max(largest, (tmp_path / "rec.h5.journal-wal").stat().st_size)
+        assert LOG_BYTES / 2 < largest < LOG_BYTES + 1_000_000
         assert not (tmp_path / "rec.h5.journal-shm").exists()
 
 
@@ -263,7 +263,7 @@ def test_long_commits_do_without_the_log(tmp_path):
 @pytest.mark.skipif(not COUNTS.exists(), reason="only Linux counts what a process writes")
 def test_all_but_a_little_is_written_once(tmp_path):
     given = entries(32, settings=Settings())
-    words_bytes = sum(entry.measurement.words.nbytes for entry in given)
+    words_bytes = sum(entry.measurement.data.nbytes for entry in given)
     with create(tmp_path, [], settings=Settings()) as journal:
         journal.add_sensor("left", Settings())
         before = written_bytes()
@@ -320,7 +320,7 @@ def test_tables_are_documented():
     page = page[page.index("## Journal") :]
     assert f"version {VERSION}" in page
     for table, columns in TABLES.items():
-        told = re.findall(rf"^\| `{table}` \| `(\w+)` \| (\w+) \|([^|]*)\|", page, re.MULTILINE)
-        assert [(name, kind, units.strip()) for name, kind, units in told] == [
+        reported = re.findall(rf"^\| `{table}` \| `(\w+)` \| (\w+) \|([^|]*)\|", page, re.MULTILINE)
+        assert [(name, kind, units.strip()) for name, kind, units in reported] == [
             (column.name, column.kind, column.units) for column in columns
         ]

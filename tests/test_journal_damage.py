@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
+from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
 from ertis_numba.journal import Journal
 from ertis_numba.journal._database import PAGE_BYTES, Database
 from ertis_numba.journal._tables import row_crc32
@@ -86,7 +86,7 @@ UNREADABLE = {
 def test_a_damaged_journal_is_refused(tmp_path, name):
     statement, message = UNREADABLE[name]
     with create(tmp_path) as journal:
-        journal.note_gap("left", 1, 1, "x", epoch=7)
+        journal.note_gap("left", 1, 1, "x", session_id=7)
     spoil(tmp_path / "rec.h5.journal", statement)
     with pytest.raises(DamagedError, match=message), Journal.open(tmp_path / "rec.h5.journal") as journal:
         _ = journal.gaps
@@ -104,14 +104,14 @@ def test_measurements_may_be_deleted_from_the_front(tmp_path, count):
 
 def root_page(path, tree):
     """The number of the first page of a table or an index."""
-    told = python(
+    reported = python(
         "import sqlite3, sys\n"
         "connection = sqlite3.connect(sys.argv[1])\n"
         "print(*connection.execute('SELECT rootpage FROM sqlite_schema WHERE name = ?', sys.argv[2:]).fetchone())",
         path,
         tree,
     )
-    return int(told.stdout)
+    return int(reported.stdout)
 
 
 @pytest.mark.parametrize("discarded", [0, 3])
@@ -158,16 +158,16 @@ def test_a_page_that_sqlite_cannot_read(tmp_path, discarded):
 def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
     """Built by hand as docs/formats.md says."""
     create(tmp_path, entries(1)).close()
-    told = python(
+    reported = python(
         "import sqlite3, sys\n"
         "(row,) = sqlite3.connect(sys.argv[1]).execute('SELECT epoch, sequence, row_crc32 FROM measurements')\n"
         "(header,) = sqlite3.connect(sys.argv[1]).execute('SELECT created, row_crc32 FROM journal')\n"
         "print(*row, *header)",
         tmp_path / "rec.h5.journal",
     ).stdout.split()
-    assert (told[0], told[1]) == ("5", "10")
-    header = b"B\x06\0\0\0rec.h5" + b"T\x04\0\0\0test" + b"T\x14\0\0\0" + told[3].encode()
-    assert zlib.crc32(header) == int(told[4])
+    assert (reported[0], reported[1]) == ("5", "10")
+    header = b"B\x06\0\0\0rec.h5" + b"T\x04\0\0\0test" + b"T\x14\0\0\0" + reported[3].encode()
+    assert zlib.crc32(header) == int(reported[4])
     row = b"I\x03\0\0\0-12" + b"R\x08\0\0\0\0\0\0\0\0\0\xf8\xbf" + b"N\0\0\0\0" + b"T\x02\0\0\0\xc3\xa9"
     assert row_crc32((-12, -1.5, None, "é")) == zlib.crc32(row)
     page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
@@ -186,7 +186,7 @@ def test_what_the_disk_cannot_read_now_is_not_damaged(tmp_path, monkeypatch):
             return execute(self, statement, values)
         error = sqlite3.OperationalError("disk I/O error")
         error.sqlite_errorcode = sqlite3.SQLITE_IOERR_READ
-        with self._told():
+        with self._reported():
             raise error
 
     with monkeypatch.context() as patch:
@@ -271,7 +271,7 @@ def test_a_copy_without_its_log(tmp_path):
 def test_a_journal_that_was_removed_takes_no_more(tmp_path):
     with create(tmp_path, entries(2)) as journal:
         journal.path.unlink()
-        with pytest.raises(InUseError, match="was removed or replaced by another process; look again"):
+        with pytest.raises(JournalInUseError, match="was removed or replaced by another process; look again"):
             journal.append(entries(1, first=20))
 
 
@@ -332,7 +332,7 @@ def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, aga
         return execute(self, statement, values)
 
     monkeypatch.setattr(Database, "execute", too_late)
-    with pytest.raises(InUseError, match="was removed or replaced by another process; look again"):
+    with pytest.raises(JournalInUseError, match="was removed or replaced by another process; look again"):
         Journal.open(path)
     assert path.exists() == again
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 from ertis_bench import kills
 
-from ertis_numba.errors import InUseError
+from ertis_numba.errors import JournalInUseError
 from ertis_numba.journal import Journal
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.storage.sealing import seal
@@ -27,7 +27,7 @@ except InUseError as error:
 def test_nobody_else_can_open_it(tmp_path):
     message = "is in use by another process, a capture or its sealing; wait until that has ended"
     with create(tmp_path) as journal:
-        with pytest.raises(InUseError, match=message):
+        with pytest.raises(JournalInUseError, match=message):
             Journal.open(journal.path)
         assert message in python(OPEN, journal.path).stdout
         journal.append(entries(1, first=20))
@@ -49,7 +49,7 @@ def test_a_killed_process_holds_nothing(tmp_path):
         [sys.executable, "-c", HOLD, tmp_path], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout.readline() == "ready\n"
-        with pytest.raises(InUseError):
+        with pytest.raises(JournalInUseError):
             Journal.open(tmp_path / "rec.h5.journal")
         process.send_signal(signal.SIGKILL)
     with Journal.open(tmp_path / "rec.h5.journal") as journal:

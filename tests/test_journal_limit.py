@@ -35,7 +35,7 @@ def failing_sync(monkeypatch, *, folders):
 
 def test_open_deletes_rows_above_the_limit(tmp_path):
     path = crashed(tmp_path, entries(5))
-    Journal.give_up(path, {("left", EPOCH): 12})
+    Journal.abandon(path, {("left", EPOCH): 12})
     with Journal.open(path) as journal:
         assert numbers(journal) == [10, 11, 12]
         assert len(journal) == 3
@@ -48,10 +48,10 @@ def test_open_deletes_rows_above_the_limit(tmp_path):
 
 def test_open_deletes_gaps_and_runs_that_were_never_acknowledged(tmp_path):
     with create(tmp_path) as journal:
-        journal.note_gap("left", 13, 13, "kept", epoch=EPOCH)
-        journal.note_gap("left", 14, 15, "given up", epoch=EPOCH)
-        journal.append(entries(2, first=0, epoch=EPOCH + 1))
-    Journal.give_up(journal.path, {("left", EPOCH): 13})
+        journal.note_gap("left", 13, 13, "kept", session_id=EPOCH)
+        journal.note_gap("left", 14, 15, "given up", session_id=EPOCH)
+        journal.append(entries(2, first=0, session_id=EPOCH + 1))
+    Journal.abandon(journal.path, {("left", EPOCH): 13})
     with Journal.open(journal.path) as journal:
         assert numbers(journal) == [10, 11, 12]
         assert [gap.reason for gap in journal.gaps] == ["kept"]
@@ -59,7 +59,7 @@ def test_open_deletes_gaps_and_runs_that_were_never_acknowledged(tmp_path):
 
 def test_recording_of_a_limited_journal_holds_acknowledged_measurements(tmp_path):
     path = crashed(tmp_path, entries(4))
-    Journal.give_up(path, {("left", EPOCH): 11})
+    Journal.abandon(path, {("left", EPOCH): 11})
     sealed = seal_apart(path)
     assert sealed.measurements == 2
     with open_recording(sealed.recording, sensor="left") as recording:
@@ -69,7 +69,7 @@ def test_recording_of_a_limited_journal_holds_acknowledged_measurements(tmp_path
 
 def test_give_up_without_acknowledgements_removes_the_journal(tmp_path):
     path = crashed(tmp_path)
-    Journal.give_up(path, {})
+    Journal.abandon(path, {})
     assert not list(tmp_path.iterdir())
 
 
@@ -83,7 +83,7 @@ def test_open_refuses_a_damaged_limit(tmp_path, text):
 
 def test_one_flipped_bit_in_a_limit_is_refused_or_harmless(tmp_path):
     path = crashed(tmp_path)
-    Journal.give_up(path, {("left", EPOCH): 11})
+    Journal.abandon(path, {("left", EPOCH): 11})
     limit = path.with_name(f"{path.name}-limit")
     sound = limit.read_bytes()
     assert json.loads(sound)["runs"] == [["left", EPOCH, 11]]

@@ -64,7 +64,7 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
     path = crashed(tmp_path, given, settings=LARGE)
     if not counted:
         tally_of(path).unlink()
-    words = given[4].measurement.words.tobytes()
+    words = given[4].measurement.data.tobytes()
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == 3, done.stderr
@@ -83,7 +83,7 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
         ("end", 3, "3 measurements, 999988 missing, up to 999988 of them stored, then lost"),
     ],
 )
-def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damaged, code, told):
+def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damaged, code, reported):
     given = [*entries(3, settings=LARGE), *entries(1, first=1_000_000, settings=LARGE)]
     path = crashed(tmp_path, given, settings=LARGE)
     n_bytes = log_of(path).stat().st_size
@@ -91,13 +91,13 @@ def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damage
         with log_of(path).open("r+b") as file:
             file.truncate(n_bytes - 100)
     elif damaged == "words":
-        flip(log_of(path), log_of(path).read_bytes().rindex(given[-1].measurement.words.tobytes()[-64:]))
+        flip(log_of(path), log_of(path).read_bytes().rindex(given[-1].measurement.data.tobytes()[-64:]))
     else:
         flip(log_of(path), n_bytes - FRAME_BYTES + 20)
     done = CliRunner().invoke(cli, ["recover", str(path)])
     assert done.exit_code == code
     ending = " in the journal's damaged log" if code else ""
-    assert f"rec.h5: {told}{ending}\n" in done.stderr
+    assert f"rec.h5: {reported}{ending}\n" in done.stderr
 
 
 def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
@@ -128,7 +128,7 @@ def test_damaged_last_commit_is_noticed_by_the_tally(tmp_path):
     """After a power cut, it could not be told from one that was torn."""
     given = entries(COUNT, settings=LARGE)
     path = crashed(tmp_path, given, settings=LARGE)
-    words = given[-1].measurement.words.tobytes()
+    words = given[-1].measurement.data.tobytes()
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
     numbers, gaps = stored(path)
     assert numbers == list(range(10, 9 + COUNT))
@@ -213,7 +213,7 @@ def test_repair_changes_nothing_in_an_undamaged_log(tmp_path):
 def test_tally_is_removed_with_the_log(tmp_path):
     with create(tmp_path) as journal:
         assert tally_of(journal.path).exists()
-        journal.note_gap("left", 13, 20, "x", epoch=EPOCH)
+        journal.note_gap("left", 13, 20, "x", session_id=EPOCH)
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
 
 

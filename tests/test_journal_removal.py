@@ -24,7 +24,7 @@ def test_what_others_hold_can_be_discarded(tmp_path):
     given = both()
     with create(tmp_path, given) as journal:
         for last, run in ((9, EPOCH), (11, EPOCH), (50, EPOCH + 1)):
-            journal.note_gap("left", 3, last, "x", epoch=run)
+            journal.note_gap("left", 3, last, "x", session_id=run)
         assert journal.find("left", EPOCH, 12)[1:] == ("left", EPOCH, 12)
         assert journal.discard("left", EPOCH, 10) == 1
         assert journal.discard("left", EPOCH, 9) == 0
@@ -39,7 +39,7 @@ def test_what_others_hold_can_be_discarded(tmp_path):
     with Journal.open(journal.path) as journal:
         assert len(journal) == 4
         assert [same(*pair) for pair in zip(journal.entries(), given[1:], strict=True)] == [True] * 4
-        assert [(gap.last, gap.epoch) for gap in journal.gaps] == [(11, EPOCH), (50, EPOCH + 1)]
+        assert [(gap.last, gap.session_id) for gap in journal.gaps] == [(11, EPOCH), (50, EPOCH + 1)]
         journal.discard("left", EPOCH, 11)  # 12 stays, and the 0 and 1 of the right one before and after it
         assert [key[1:] for key in journal.index()] == [("right", EPOCH, 0), ("left", EPOCH, 12), ("right", EPOCH, 1)]
         assert journal.discard("left", EPOCH, 99) + journal.discard("right", EPOCH, 99) == 3

@@ -94,7 +94,7 @@ def test_a_commit_that_fails_when_all_is_written(tmp_path, monkeypatch, times):
         acts = (
             lambda: journal.append(more),
             lambda: journal.add_sensor("right", TINY),
-            lambda: journal.note_gap("left", 30, 31, "x", epoch=EPOCH),
+            lambda: journal.note_gap("left", 30, 31, "x", session_id=EPOCH),
         )
         for act in acts:
             left[0] = times
@@ -191,7 +191,7 @@ from ertis_numba.storage import open_recording
 from ertis_numba.storage.sealing import seal
 sealed = seal(journal.path)
 with open_recording(sealed.recording) as recording:
-    assert [m.words.tobytes() for m in recording] == [entry.measurement.words.tobytes() for entry in given[:number]]
+    assert [m.data.tobytes() for m in recording] == [entry.measurement.data.tobytes() for entry in given[:number]]
 assert os.listdir(sys.argv[1]) == ["rec.h5"]
 """
 

@@ -231,13 +231,13 @@ def test_multiply_and_fold(kernel_set, n_bins, first_bin, n_band, n_phases, n_ou
 def test_delay_and_sum_and_envelope(kernel_set, name):
     signals, offsets, weights, shape = beam_input(name)
     expected = reference.delay_and_sum(signals, offsets, weights, shape[1])
-    beams, energy, fused = filled(*shape, dtype=np.complex64), filled(*shape), filled(*shape)
+    beams, amplitude, fused = filled(*shape, dtype=np.complex64), filled(*shape), filled(*shape)
     kernel_set.delay_and_sum(signals, offsets, weights, beams)
-    kernel_set.envelope(beams, energy)
+    kernel_set.envelope(beams, amplitude)
     kernel_set.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], fused)
     bound = FLOAT32 * np.abs(expected).max()
     assert np.abs(beams - expected).max() < bound
-    assert np.abs(energy - np.abs(expected)).max() < bound
+    assert np.abs(amplitude - np.abs(expected)).max() < bound
     assert np.abs(fused - np.abs(expected)).max() < bound
 
 
@@ -319,7 +319,7 @@ def test_pipeline_gives_the_same_bits_every_time(precision):
         accuracy=cases.SHORT.accuracy.replace(precision=precision),
     )
     pipeline, measurement = Pipeline(settings), cases.noise(settings)
-    assert len({pipeline.process(measurement).energy.tobytes() for _ in range(30)}) == 1
+    assert len({pipeline.process(measurement).amplitude.tobytes() for _ in range(30)}) == 1
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
@@ -329,12 +329,12 @@ def test_results_do_not_depend_on_the_number_of_threads():
     results = []
     for count in range(1, cpu.max_threads + 1):
         with cpu.threads(count):
-            energy, demodulated = filled(*shape), filled(len(channels), 300)
-            cpu.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], energy)
+            amplitude, demodulated = filled(*shape), filled(len(channels), 300)
+            cpu.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], amplitude)
             cpu.demodulate_words(
                 words, channels, np.arange(-30, 31, dtype=np.int16), np.float32(1), 10, 20, 300, demodulated
             )
-        results.append(energy.tobytes() + demodulated.tobytes())
+        results.append(amplitude.tobytes() + demodulated.tobytes())
     assert len(set(results)) == 1
 
 

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.network import addresses
 from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.gate import Gate
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys, default_folder, public_key
+from ertis_numba.network.zap_authenticator import ZapAuthenticator
 
 PAIR = KeyPair.new("robot")
 
@@ -173,11 +173,11 @@ def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatc
     ],
     ids=["empty", "no_keys", "not_its_own", "path", "no_toml"],
 )
-def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, told):
+def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, reported):
     path = tmp_path / "robot.secret.toml"
     path.write_text(text)
     path.chmod(0o600)
-    with pytest.raises(SettingsError, match=told) as caught:
+    with pytest.raises(SettingsError, match=reported) as caught:
         KeyPair.load(path)
     assert PAIR.secret not in str(caught.value)
 
@@ -286,7 +286,7 @@ def test_a_list_that_others_may_change_is_refused(tmp_path, what, mode):
     with pytest.raises(SettingsError, match=f"others may change it.* \\(mode {mode:04o}\\); run 'chmod go-w"):
         AllowList.load(path)
     with zmq.Context() as context, pytest.raises(SettingsError, match="others may change"):
-        Gate(context, ServerKeys(PAIR, path))
+        ZapAuthenticator(context, ServerKeys(PAIR, path))
 
 
 def test_a_list_is_its_owners_whatever_files_are_by_default(tmp_path):
@@ -335,8 +335,8 @@ def test_a_key_that_is_allowed_again_has_what_was_said_last():
         ({"name": "a b"}, "cannot be that of a key"),
     ],
 )
-def test_a_permission_that_says_too_much_or_too_little_is_refused(changes, told):
-    with pytest.raises(ArgumentError, match=told):
+def test_a_permission_that_says_too_much_or_too_little_is_refused(changes, reported):
+    with pytest.raises(ArgumentError, match=reported):
         _permission(**changes)
 
 

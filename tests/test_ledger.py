@@ -6,21 +6,21 @@ import zlib
 
 import pytest
 
-from ertis_numba.errors import DataError, FormatVersionError, InUseError
-from ertis_numba.journal import Gap, seal_apart
-from ertis_numba.network.central_node._items import Run
-from ertis_numba.network.central_node._ledger import Ledger, Lock, look
+from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
+from ertis_numba.journal import JournalGap, seal_apart
+from ertis_numba.network.central_node._ledger import Ledger, Lock, read_acked_through
+from ertis_numba.network.central_node._received_items import SensorSession
 from tests.journals import EPOCH, create, entries
 
 
 def test_what_is_saved_is_read(tmp_path):
-    settled = {Run("left", 2**62): 7, Run("left", 3): -1, Run("right", 3): 2**62}
+    acked_through = {SensorSession("left", 2**62): 7, SensorSession("left", 3): -1, SensorSession("right", 3): 2**62}
     ledger = Ledger(tmp_path)
-    assert (ledger.is_new, ledger.settled, ledger.open, ledger.unsealed) == (True, {}, [], [])
-    gaps = [Gap("left", 0, 2**62, "ring overflow", 2**63 - 1)]
-    ledger.save(settled, open_=["a"], unsealed=["b", "c"], gaps=gaps)
+    assert (ledger.is_new, ledger.acked_through, ledger.open, ledger.unsealed) == (True, {}, [], [])
+    gaps = [JournalGap("left", 0, 2**62, "ring overflow", 2**63 - 1)]
+    ledger.save(acked_through, open_=["a"], unsealed=["b", "c"], gaps=gaps)
     read = Ledger(tmp_path)
-    assert (read.is_new, read.settled, read.open, read.unsealed) == (False, settled, ["a"], ["b", "c"])
+    assert (read.is_new, read.acked_through, read.open, read.unsealed) == (False, acked_through, ["a"], ["b", "c"])
     assert read.gaps == ledger.gaps == gaps
 
 
@@ -29,7 +29,7 @@ def test_a_ledger_of_version_1_is_read(tmp_path):
         '{"version": 1, "settled": {"left": {"3": 7}}, "open": ["a"], "unsealed": []}'
     )
     read = Ledger(tmp_path)
-    assert (read.settled, read.open, read.gaps) == ({Run("left", 3): 7}, ["a"], [])
+    assert (read.acked_through, read.open, read.gaps) == ({SensorSession("left", 3): 7}, ["a"], [])
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_ledger_that_cannot_be_read_is_reported_and_left_out(content, tmp_path):
     (tmp_path / ".ertis-ledger").write_bytes(content)
     read = Ledger(tmp_path)
     assert re.fullmatch(r"\S+\.ertis-ledger is damaged: [^\n]*read again from the recordings .*", read.damage)
-    assert (read.is_new, read.settled, read.open, read.unsealed, read.gaps) == (False, {}, [], [], [])
+    assert (read.is_new, read.acked_through, read.open, read.unsealed, read.gaps) == (False, {}, [], [], [])
 
 
 def test_ledger_of_a_newer_version_is_refused(tmp_path):
@@ -59,11 +59,11 @@ def test_ledger_of_a_newer_version_is_refused(tmp_path):
         Ledger(tmp_path)
 
 
-SETTLED = {Run("left", 2**62): 7, Run("left", 3): 5, Run("right", 3): 2**62}
+SETTLED = {SensorSession("left", 2**62): 7, SensorSession("left", 3): 5, SensorSession("right", 3): 2**62}
 
 
 def saved(folder):
-    gaps = [Gap("left", 0, 9, "ring overflow", 4)]
+    gaps = [JournalGap("left", 0, 9, "ring overflow", 4)]
     Ledger(folder).save(SETTLED, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps)
     return (folder / ".ertis-ledger"), gaps
 
@@ -77,7 +77,7 @@ def test_flipped_bit_of_a_ledger_is_noticed_and_raises_no_number(tmp_path):
         path.write_bytes(damaged)
         read = Ledger(tmp_path)
         assert read.damage, damaged
-        assert read.settled.items() <= SETTLED.items()
+        assert read.acked_through.items() <= SETTLED.items()
         assert {*read.open} <= {"a.h5.journal"}
         assert {*read.gaps} <= {*gaps}
 
@@ -91,13 +91,15 @@ def test_ledger_that_was_cut_short_is_noticed(tmp_path):
 
 
 def test_ledger_keeps_the_newest_runs_of_each_sensor(tmp_path):
-    settled = {Run(sensor, epoch): epoch for epoch in range(2_000) for sensor in ("left", "right")}
+    acked_through = {
+        SensorSession(sensor, session_id): session_id for session_id in range(2_000) for sensor in ("left", "right")
+    }
     ledger = Ledger(tmp_path)
-    ledger.save(settled, open_=[], unsealed=[])
+    ledger.save(acked_through, open_=[], unsealed=[])
     assert (tmp_path / ".ertis-ledger").stat().st_size < 10_000
-    kept = Ledger(tmp_path).settled
-    assert list(kept) == list(ledger.settled)
-    assert {run.epoch for run in kept} == set(range(2_000 - 64, 2_000))
+    kept = Ledger(tmp_path).acked_through
+    assert list(kept) == list(ledger.acked_through)
+    assert {run.session_id for run in kept} == set(range(2_000 - 64, 2_000))
 
 
 def test_a_ledger_that_cannot_be_read_is_refused(tmp_path):
@@ -108,7 +110,7 @@ def test_a_ledger_that_cannot_be_read_is_refused(tmp_path):
 
 def test_a_folder_is_for_one(tmp_path):
     lock = Lock(tmp_path)
-    with pytest.raises(InUseError, match="in use by another central node"):
+    with pytest.raises(JournalInUseError, match="in use by another central node"):
         Lock(tmp_path)
     lock.release()
     lock.release()
@@ -118,14 +120,18 @@ def test_a_folder_is_for_one(tmp_path):
 
 
 def test_recordings_are_looked_at(tmp_path):
-    with create(tmp_path, [*entries(3), *entries(2, epoch=9), *entries(1, sensor="right")]) as journal:
-        journal.note_gap("left", 20, 29, "lost", epoch=EPOCH)
+    with create(tmp_path, [*entries(3), *entries(2, session_id=9), *entries(1, sensor="right")]) as journal:
+        journal.note_gap("left", 20, 29, "lost", session_id=EPOCH)
     seal_apart(journal.path)
-    assert look([tmp_path / "rec.h5"]) == {Run("left", EPOCH): 29, Run("left", 9): 11, Run("right", EPOCH): 10}
-    assert look([]) == {}
+    assert read_acked_through([tmp_path / "rec.h5"]) == {
+        SensorSession("left", EPOCH): 29,
+        SensorSession("left", 9): 11,
+        SensorSession("right", EPOCH): 10,
+    }
+    assert read_acked_through([]) == {}
 
 
 def test_a_recording_that_cannot_be_looked_at_is_told(tmp_path):
     (tmp_path / "bad.h5").write_text(json.dumps([]))
     with pytest.raises(DataError, match=r"recordings cannot be looked at .*bad\.h5"):
-        look([tmp_path / "bad.h5"])
+        read_acked_through([tmp_path / "bad.h5"])

@@ -36,7 +36,7 @@ def test_image_of_listed_directions_is_that_of_the_same_grid(method):
         for each in (SHORT, listed(grid))
     ]
     np.testing.assert_allclose(images[1].azimuth_rad, images[0].azimuth_rad)
-    np.testing.assert_array_equal(images[1].energy, images[0].energy)
+    np.testing.assert_array_equal(images[1].amplitude, images[0].amplitude)
 
 
 def test_listed_directions_survive_files(tmp_path):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli._heard import Heard
+from ertis_cli._heard import MicrophoneTable
 from ertis_cli.main import cli
 
 from ertis_numba.network.keys import KeyPair
@@ -62,7 +62,12 @@ def test_events_of_every_product():
     assert [each["event"] for each in came] == ["energyscape", "points", "raw", "group", "status"]
     assert [each["number"] for each in came] == [0, 1, 2, 3, 4]
     assert came[0]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 0.0, "range_m": pytest.approx(1.5, abs=1e-3)}
-    assert (came[0]["sensor"], came[0]["epoch"], came[0]["sequence"], came[0]["made_in_ms"]) == ("front", 7, 1, 12.0)
+    assert (came[0]["sensor"], came[0]["session_id"], came[0]["sequence"], came[0]["made_in_ms"]) == (
+        "front",
+        7,
+        1,
+        12.0,
+    )
     stamp = ("sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
     assert all(isinstance(each[name], int) for each in came[:3] for name in stamp)
     assert came[1]["nearest"] == {"azimuth_deg": 0.0, "elevation_deg": 90.0, "range_m": 2.0}
@@ -81,7 +86,7 @@ def test_saves_energyscapes_of_several_sensors(tmp_path):
     assert sensor_names(path) == ("front", "left")
     with open_energyscapes(path, sensor="front") as images:
         assert [each.stamp for each in images] == [sent[0].stamp, sent[2].stamp]
-        np.testing.assert_array_equal(images[1].energy, sent[2].energy)
+        np.testing.assert_array_equal(images[1].amplitude, sent[2].amplitude)
         np.testing.assert_array_equal(images.translation_m, Publisher.translation_m)
 
 
@@ -93,7 +98,7 @@ def test_saves_measurements_as_a_recording_with_their_place(tmp_path):
     with open_recording(path) as recording:
         assert [each.stamp for each in recording] == [each.stamp for each in sent]
         assert [(gap.first, gap.last) for gap in recording.gaps] == [(2, 2)]
-        np.testing.assert_array_equal(recording[1].words, sent[1].words)
+        np.testing.assert_array_equal(recording[1].data, sent[1].data)
         assert recording[1].settings.air.temperature_c == 25.0
         np.testing.assert_array_equal(recording.translation_m, Publisher.translation_m)
     assert [each.name for each in tmp_path.iterdir()] == ["raw.h5"]
@@ -107,10 +112,10 @@ def test_ctrl_c_ends_it_and_keeps_what_came(tmp_path, options, code):
         with subprocess.Popen(
             [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
         ) as process:
-            told = [json.loads(process.stdout.readline())["event"] for _ in range(2)]
+            reported = [json.loads(process.stdout.readline())["event"] for _ in range(2)]
             process.send_signal(signal.SIGINT)
             rest, errors = process.communicate()
-    assert told == ["subscribed", "energyscape"]
+    assert reported == ["subscribed", "energyscape"]
     assert json.loads(rest)["event"] == "listened"
     assert process.returncode == code, errors
     with open_energyscapes(path) as images:
@@ -119,7 +124,7 @@ def test_ctrl_c_ends_it_and_keeps_what_came(tmp_path, options, code):
 
 def test_what_does_not_fit_into_a_file_ends_it_and_keeps_what_came(tmp_path):
     path = tmp_path / "image.h5"
-    shorter = image(2).replace(energy=image(2).energy[:, :50].copy(), range_m=image(2).range_m[:50])
+    shorter = image(2).replace(amplitude=image(2).amplitude[:, :50].copy(), range_m=image(2).range_m[:50])
     with Publisher(describes_each=True) as publisher, publisher.playing([image(1), shorter, image(3)]):
         done = listen(publisher.address, "-n", 3, "--save", path)
     assert done.exit_code == 1
@@ -158,7 +163,7 @@ def test_where_nobody_answers_that_is_told_once(monkeypatch):
 
 def test_points_are_found_in_the_directions_of_each_image(capsys):
     """Also where a part of what came before is kept."""
-    heard, flat = Heard(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
+    heard, flat = MicrophoneTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
     raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
     for item in (flat, raised):
         heard.product(Arrival(item, SimpleNamespace(number=0), 0, 0, 0), SimpleNamespace(dropped=0))
@@ -167,7 +172,7 @@ def test_points_are_found_in_the_directions_of_each_image(capsys):
 
 
 def test_who_comes_late_is_told_of(capsys):
-    heard = Heard(as_json=False, quiet=False)
+    heard = MicrophoneTable(as_json=False, quiet=False)
     heard.unanswered("tcp://127.0.0.1:1", 2.0)
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
     heard.note("connected")
@@ -175,7 +180,7 @@ def test_who_comes_late_is_told_of(capsys):
 
 
 def test_who_answers_at_once_is_not_told_of(capsys):
-    heard = Heard(as_json=False, quiet=False)
+    heard = MicrophoneTable(as_json=False, quiet=False)
     heard.note("connected")
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
     assert capsys.readouterr().err == ""
@@ -202,13 +207,13 @@ def test_a_file_that_cannot_be_is_refused_at_once(product, folder):
 
 def test_a_time_and_a_key_that_cannot_be(tmp_path):
     secret, _ = KeyPair.new("me").save(tmp_path / "keys")
-    for arguments, told in (
+    for arguments, reported in (
         (("--duration", "0"), "--duration is 0; give a number above 0"),
         (("--key", secret, "--server-key", "abc"), "--server-key: 'abc' is neither a public key nor a file of one"),
     ):
         done = listen("tcp://127.0.0.1:1", *arguments)
         assert done.exit_code == 1
-        assert told in done.stderr
+        assert reported in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -228,11 +233,13 @@ def test_refuses_usage(arguments, match):
 @pytest.mark.parametrize(("n_received", "lines"), [(0, 1), (3, 0)])
 def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
     monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.0)
-    heard = Heard(as_json=False, quiet=False)
+    heard = MicrophoneTable(as_json=False, quiet=False)
     heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet, which is reported elsewhere
     heard.subscribed("tcp://here", (), ("energyscape",))
     for _ in range(2):
         heard.silent("tcp://here", ("energyscape",), n_received)
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == lines
-    assert all("no energyscape has come from tcp://here yet; does 'ertis capture --to' run?" in line for line in told)
+    reported = capsys.readouterr().err.splitlines()
+    assert len(reported) == lines
+    assert all(
+        "no energyscape has come from tcp://here yet; does 'ertis capture --to' run?" in line for line in reported
+    )

@@ -11,11 +11,11 @@ from ertis_cli.main import cli
 
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.simulation.ab_render import ABRender
 from ertis_numba.simulation.loudness import LOUD, peak_bound
 from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import make_plan
-from ertis_numba.simulation.rehearsal import Rehearsal
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR, only, scene_of
 
@@ -111,16 +111,16 @@ def test_sensor_without_an_image_leaves_the_others_to_ab_renders():
     beyond = Processing(directions="2d:31", range_m=(5.0, 6.0))
     blind = sensor.replace(name="blind", position_m=(0.0, 5.0, 0.0), processing=beyond)
     active = frozenset({"propagation", "modulation"})
-    changed_db = Rehearsal(scene.replace(sensors=(blind, sensor))).change_db(0, active, "spreading")
-    assert changed_db == pytest.approx(Rehearsal(scene).change_db(0, active, "spreading"))
-    assert Rehearsal(scene.replace(sensors=(blind,))).change_db(0, active, "spreading") is None
+    changed_db = ABRender(scene.replace(sensors=(blind, sensor))).change_db(0, active, "spreading")
+    assert changed_db == pytest.approx(ABRender(scene).change_db(0, active, "spreading"))
+    assert ABRender(scene.replace(sensors=(blind,))).change_db(0, active, "spreading") is None
 
 
 def test_scenes_in_motion_keep_what_changes_half_of_the_tolerance(monkeypatch):
     """Of their measurements a few are rendered, and others may change by more."""
     scene = beside_an_emitter(-75.0, PCM).replace(effects={"absorption": False}, count=9)
     moving = scene.replace(points=(*scene.points[1:], scene.points[0].replace(velocity_m_s=(0.5, 0.0, 0.0))))
-    monkeypatch.setattr(Rehearsal, "change_db", lambda *_: 0.07)
+    monkeypatch.setattr(ABRender, "change_db", lambda *_: 0.07)
     monkeypatch.setitem(ESTIMATES, "doppler", lambda _: Estimate(change_db=0.05, reason="a test", sure=20.0))
     assert "doppler" not in make_plan(scene).active
     assert "doppler" in make_plan(moving).active

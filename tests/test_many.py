@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.campaign import Campaign, Options, Source, campaign, find, made, work
+from ertis_numba.campaign import Campaign, CampaignOptions, Source, campaign, existing_output, find, work
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
@@ -55,9 +55,9 @@ def states(folder):
 
 
 def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
-    found, crew = run_here(monkeypatch, [runs], out, Options(settings=narrow))
+    found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
-    assert [order.about["warm"] for order in crew.given if order.do == "plan"] == [True, False]  # one for each air
+    assert [order.about["warm"] for order in pool.given if order.do == "plan"] == [True, False]  # one for each air
     assert found["a.h5"].made["measurements"] == 3
     for name in "abcd":
         single = out / "single.h5"
@@ -67,7 +67,7 @@ def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
 
 
 def test_one_is_told_of_like_many(runs, out, monkeypatch):
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, explain=True, verify=True))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True))
     arguments = [str(runs / "a.h5"), "--range", "0.5:0.8", "--explain", "--verify", "--json"]
     single = json.loads(CliRunner().invoke(cli, ["process", *arguments]).stdout)
     many = found["a.h5"].made
@@ -88,17 +88,17 @@ def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
     def on_paper(settings):
         return settings.replace(processing=settings.processing.replace(method="paper"))
 
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=on_paper, explain=True))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=on_paper, explain=True))
     assert "a plan is asked for, and method 'paper' has none; give 'fast'" in found["a.h5"].error
 
 
 def test_what_is_there_is_left_alone(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs], out, Options(settings=narrow))
+    run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     before = states(out)
     (out / "b.energy.h5").unlink()
-    found, crew = run_here(monkeypatch, [runs], out, Options(settings=narrow, overwrite=True))
+    found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
-    assert [order.about["path"] for order in crew.given if order.do == "make"] == [str(runs / "b.h5")]
+    assert [order.about["path"] for order in pool.given if order.do == "make"] == [str(runs / "b.h5")]
     after = states(out)
     assert {name: after[name] for name in after if name != "b.energy.h5"} == {
         name: before[name] for name in before if name != "b.energy.h5"
@@ -108,22 +108,22 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [
-        (Options(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
-        (Options(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
-        (Options(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
-        (Options(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
+        (CampaignOptions(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
+        (CampaignOptions(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
+        (CampaignOptions(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
+        (CampaignOptions(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
     ],
 )
-def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, said):
-    run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, Options(settings=narrow))
+def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, stated):
+    run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, CampaignOptions(settings=narrow))
     before = states(out)
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
     for event in found.values():
         assert event.outcome == "failed"
         assert f"output {event.output} exists and " in event.error
-        assert re.search(said, event.error)
+        assert re.search(stated, event.error)
     assert states(out) == before
-    replaced = Options(settings=wanted.settings, dtype=wanted.dtype, overwrite=True)
+    replaced = CampaignOptions(settings=wanted.settings, dtype=wanted.dtype, overwrite=True)
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, replaced)
     assert set(outcomes(found).values()) == {"made"}
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
@@ -131,25 +131,25 @@ def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wan
 
 
 def test_another_recording_of_the_same_name(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     write_recording(runs / "a.h5", noise(count=3, seed=9), overwrite=True)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made of another recording" in found["a.h5"].error
 
 
 def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     with h5py.File(runs / "a.h5", "r+") as file:
         file.attrs["remark"] = "written to"
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made of another file of the same recording" in found["a.h5"].error
 
 
 def test_another_version(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     newer = {"ertis-numba": "99.0"}
-    monkeypatch.setattr(made, "software_versions", lambda: newer)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    monkeypatch.setattr(existing_output, "software_versions", lambda: newer)
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made by ertis-numba 0" in found["a.h5"].error
     assert "this is 99.0" in found["a.h5"].error
 
@@ -160,9 +160,9 @@ def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, cont
     recording = content is None
     content = (runs / "b.h5").read_bytes() if recording else content
     (out / "a.energy.h5").write_bytes(content)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(overwrite=recording))
-    said = "is a recording; give another folder" if recording else "is no energyscape file that can be read"
-    assert f"exists and {said}" in found["a.h5"].error
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(overwrite=recording))
+    stated = "is a recording; give another folder" if recording else "is no energyscape file that can be read"
+    assert f"exists and {stated}" in found["a.h5"].error
     assert (out / "a.energy.h5").read_bytes() == content
 
 
@@ -173,11 +173,11 @@ def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
         return settings.replace(processing=settings.processing.replace(range_m=RANGE_M, directions="grid.csv"))
 
     grid.write_text("-10,0\n10,0\n")
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
     assert outcomes(found) == {"a.h5": "there"}
     grid.write_text("-10,0\n11,0\n")
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=by_file))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
     assert "other settings (grid of sensor eRTIS-7)" in found["a.h5"].error
 
 
@@ -185,7 +185,7 @@ def test_one_that_fails_does_not_stop_the_rest(runs, out, monkeypatch):
     with h5py.File(runs / "b.h5", "r+") as file:
         file["sensors/eRTIS-7/pdm"][1, 777] ^= 1 << 9
     (runs / "c.h5").write_bytes((runs / "c.h5").read_bytes()[:50_000])
-    found, _ = run_here(monkeypatch, [runs, runs / "none.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs, runs / "none.h5"], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made", "none.h5": "failed"}
     assert "b.h5: measurement 1 has CRC-32" in found["b.h5"].error
     assert "c.h5 is cut short or damaged" in found["c.h5"].error
@@ -197,17 +197,17 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
     def hopeless(settings):
         return narrow(settings).replace(accuracy=settings.accuracy.replace(max_error_db=-199.0))
 
-    found, crew = run_here(monkeypatch, [runs], out, Options(settings=hopeless))
+    found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=hopeless))
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
         assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, and the best")
-    assert [order.do for order in crew.given].count("plan") == 2  # each tried once
+    assert [order.do for order in pool.given].count("plan") == 2  # each tried once
     assert names_in(out) == []
 
 
 def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], runs, Options(settings=narrow))  # beside the recordings
-    found, _ = run_here(monkeypatch, [runs], runs, Options(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # beside the recordings
+    found, _ = run_here(monkeypatch, [runs], runs, CampaignOptions(settings=narrow))
     assert found["a.energy.h5"].outcome == "passed over"
     assert outcomes(found)["a.h5"] == "there"
     found, _ = run_here(monkeypatch, [runs / "a.energy.h5"], out)
@@ -218,20 +218,20 @@ def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
     left = (replace(each, stamp=replace(each.stamp, sensor="left")) for each in noise(line(8, 8), count=2, seed=5))
     several = [*noise(count=2), *left]
     write_recording(tmp_path / "two.h5", several)
-    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, CampaignOptions(settings=narrow))
     assert [row["sensor"] for row in found["two.h5"].made["sensors"]] == ["eRTIS-7", "left"]
-    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, Options(settings=narrow, sensor="left"))
+    found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, CampaignOptions(settings=narrow, sensor="left"))
     assert "exists and holds sensor eRTIS-7, left, wanted left" in found["two.h5"].error
 
 
 def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
     measurements = noise(count=2)
     for measurement in measurements:
-        measurement.words[:] &= np.uint32(0xFFFFFFFE)
+        measurement.data[:] &= np.uint32(0xFFFFFFFE)
     write_recording(tmp_path / "worn.h5", measurements)
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow, strict=True))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow, strict=True))
     assert "stuck at 0: channel 0" in found["worn.h5"].error
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow))
     assert "stuck at 0: channel 0" in found["worn.h5"].made["warnings"][0]
 
 
@@ -248,15 +248,15 @@ def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, 
     for number in range(12):  # each has air of its own, and so a pipeline of its own
         settings = SMALL.replace(air=Air(temperature_c=float(number)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
-    found, crew = run_here(monkeypatch, [tmp_path], out, Options(settings=narrow))
+    found, pool = run_here(monkeypatch, [tmp_path], out, CampaignOptions(settings=narrow))
     assert set(outcomes(found).values()) == {"made"}
     assert max(most_kept) == 1
     place = {"look": 0, "make": 0}
-    for order in crew.given:
+    for order in pool.given:
         if order.do in place:
             place[order.do] += 1
             most_in_hand.append(place["look"] - place["make"])
-    assert max(most_in_hand) <= crew.size + 3
+    assert max(most_in_hand) <= pool.size + 3
 
 
 def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
@@ -266,7 +266,9 @@ def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
         return chances.pop() if do == "plan" and chances else work.follow(do, *arguments)
 
     monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
-    found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "c.h5"], out, Options(settings=narrow))  # in the same air
+    found, _ = run_here(
+        monkeypatch, [runs / "a.h5", runs / "c.h5"], out, CampaignOptions(settings=narrow)
+    )  # in the same air
     assert outcomes(found) == {"a.h5": "failed", "c.h5": "made"}
     assert found["a.h5"].error == "no memory"
 
@@ -277,8 +279,8 @@ def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(work, "sensor_names", fails)
-    told = work.follow("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
-    assert told == {"error": str(error) or "MemoryError", "by_chance": True}
+    reported = work.follow("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
+    assert reported == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
 def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(runs, out, monkeypatch):
@@ -292,18 +294,18 @@ def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(run
     monkeypatch.setattr("tests.campaigns.follow", died_of_c)
     monkeypatch.setattr(campaign, "clear_parts", lambda _, names: searched.append(set(names)))
     (runs / "b.h5").write_bytes(b"no recording")
-    found, _ = run_here(monkeypatch, [runs], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made"}
     assert searched[1:-1] == [{"c.energy.h5"}]  # between what is done before all and after it
 
 
 def test_a_pipeline_that_another_thread_has_made_again_is_closed(monkeypatch):
-    made = []
+    existing_output = []
 
     class Counted:
         def __init__(self, settings, **_):
             self.settings, self.closed = settings, 0
-            made.append(self)
+            existing_output.append(self)
 
         def close(self):
             self.closed += 1
@@ -314,7 +316,7 @@ def test_a_pipeline_that_another_thread_has_made_again_is_closed(monkeypatch):
     with borrow([SMALL], "cpu", 1) as (first,), borrow([SMALL], "cpu", 1) as (second,):
         assert first is not second
     with borrow([SMALL], "cpu", 1) as (again,):
-        assert [each.closed for each in made] == [again is not each for each in made]
+        assert [each.closed for each in existing_output] == [again is not each for each in existing_output]
 
 
 class Watched(Here):
@@ -336,34 +338,34 @@ class Watched(Here):
 
 
 @pytest.mark.parametrize(("workers", "most"), [(None, 1), (3, 3)])
-def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, most):
+def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest):
     """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
 
     def on_a_gpu(*arguments):
         return {name: "cuda" if name == "device" else value for name, value in work.follow(*arguments).items()}
 
-    crew = Watched(3)
+    pool = Watched(3)
     write_recordings(tmp_path / "many", "abcdefghi", count=1)
     monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
-    monkeypatch.setattr(Campaign, "_crew", lambda _: crew)
-    found = ended(Campaign(find([tmp_path / "many"]), out, Options(settings=narrow), workers=workers).run())
+    monkeypatch.setattr(Campaign, "_crew", lambda _: pool)
+    found = ended(Campaign(find([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run())
     assert set(outcomes(found).values()) == {"made"}
-    assert max(crew.in_hand) == most
-    assert crew.size == most
+    assert max(pool.in_hand) == largest
+    assert pool.size == largest
     if workers is None:
-        assert crew.limited_at[0] > 1  # so that there is something to wait for
+        assert pool.limited_at[0] > 1  # so that there is something to wait for
 
 
 @pytest.mark.parametrize(
     ("wanted", "workers", "count", "found"),
     [
-        (Options(), None, 9, 4),
-        (Options(), None, 3, 3),
-        (Options(), 6, 9, 6),
-        (Options(threads=2), None, 9, 2),
-        (Options(threads=9), None, 9, 1),
-        (Options(device="cuda"), None, 9, 1),
-        (Options(device="cuda"), 2, 9, 2),
+        (CampaignOptions(), None, 9, 4),
+        (CampaignOptions(), None, 3, 3),
+        (CampaignOptions(), 6, 9, 6),
+        (CampaignOptions(threads=2), None, 9, 2),
+        (CampaignOptions(threads=9), None, 9, 1),
+        (CampaignOptions(device="cuda"), None, 9, 1),
+        (CampaignOptions(device="cuda"), 2, 9, 2),
     ],
 )
 def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
@@ -376,7 +378,7 @@ def test_half_files_go_before_and_after(runs, out, monkeypatch):
     out.mkdir()
     (out / "a.energy.h5.0123abcd.part").write_bytes(b"half")
     (out / "z.energy.h5.0123abcd.part").write_bytes(b"of another campaign")
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert names_in(out) == ["a.energy.h5", "z.energy.h5.0123abcd.part"]
     with open_energyscapes(out / "a.energy.h5") as images:
         assert len(images) == 3
@@ -387,12 +389,12 @@ def test_a_folder_that_cannot_be_written_is_told_with_the_remedy(monkeypatch, tm
         raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
 
     monkeypatch.setitem(vars(work)["_ORDERS"], "make", refused)
-    told = work.follow("make", {})
+    reported = work.follow("make", {})
     assert (
-        told["error"]
+        reported["error"]
         == f"{tmp_path / 'a.energy.h5'}: Read-only file system; see who may use it and its folder, or choose another"
     )
-    assert told["by_chance"]
+    assert reported["by_chance"]
 
 
 def test_other_errors_of_settings_end_the_campaign(runs, out, monkeypatch):
@@ -400,5 +402,5 @@ def test_other_errors_of_settings_end_the_campaign(runs, out, monkeypatch):
         raise KeyError("a mistake in the program")
 
     with pytest.raises(KeyError, match="a mistake in the program"):
-        run_here(monkeypatch, [runs], out, Options(settings=wrong))
+        run_here(monkeypatch, [runs], out, CampaignOptions(settings=wrong))
     assert names_in(out) == []

@@ -19,8 +19,8 @@ def _small(monkeypatch):
 
 
 def test_all_crews_are_timed_and_compared(tmp_path, monkeypatch):
-    crew = Campaign._crew  # noqa: SLF001
-    chosen = lambda campaign: crew(campaign) if vars(campaign)["_scheduler"] else Here()  # noqa: E731
+    pool = Campaign._pool  # noqa: SLF001
+    chosen = lambda campaign: pool(campaign) if vars(campaign)["_scheduler"] else Here()  # noqa: E731
     monkeypatch.setattr(Campaign, "_crew", chosen)  # of processes, which take long to start, other tests know
     target = tmp_path / "page.md"
     target.write_text("<!-- ertis bench many -->\nold\n<!-- /ertis bench many -->\n", "utf-8")
@@ -40,7 +40,7 @@ def test_all_crews_are_timed_and_compared(tmp_path, monkeypatch):
 def test_more_cores_have_more_crews(monkeypatch):
     monkeypatch.setattr(many, "_cores", lambda: 4)
     crews = many._crews  # noqa: SLF001
-    assert [tuple(crew.values()) for crew in crews("tcp://x:1").values()] == [
+    assert [tuple(pool.values()) for pool in crews("tcp://x:1").values()] == [
         (1, 1),
         (1, 4),
         (4, 1),

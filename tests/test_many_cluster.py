@@ -14,8 +14,8 @@ from distributed import Client, LocalCluster
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
-from ertis_numba.campaign import Advanced, Begun, Campaign, Options, find, members
-from ertis_numba.campaign.orders import Order
+from ertis_numba.campaign import Advanced, Begun, Campaign, CampaignOptions, find, members
+from ertis_numba.campaign.orders import WorkOrder
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -30,7 +30,7 @@ def narrow(settings):
     return settings.replace(processing=settings.processing.replace(range_m=(0.5, 0.8), directions="2d:300"))
 
 
-WANTED = Options(settings=narrow, batch=1)
+WANTED = CampaignOptions(settings=narrow, batch=1)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -131,9 +131,9 @@ def test_other_versions_are_told(monkeypatch):
         address = "tcp://far:1"
 
     monkeypatch.setattr(cluster, "worker", Elsewhere)
-    told = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
-    assert "worker tcp://far:1 has numpy " in told["error"]
-    assert "wanted 0.1; install the same everywhere" in told["error"]
+    reported = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
+    assert "worker tcp://far:1 has numpy " in reported["error"]
+    assert "wanted 0.1; install the same everywhere" in reported["error"]
 
 
 class Dwindling:
@@ -168,21 +168,21 @@ def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     monkeypatch.setattr(members, "_LOOK_S", 0.0)
-    crew = members.Members("tcp://far:1")
-    for number in range(crew.free):
-        crew.give(Order(number, "look", {}))
-    assert (crew.size, crew.free) == (3, 0)
-    crew.wait(0.0)
-    assert (crew.size, crew.free) == (2, 0)
+    pool = members.Members("tcp://far:1")
+    for number in range(pool.free):
+        pool.give(WorkOrder(number, "look", {}))
+    assert (pool.size, pool.free) == (3, 0)
+    pool.wait(0.0)
+    assert (pool.size, pool.free) == (2, 0)
 
 
 def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
-    crew = members.Members("tcp://far:1")
+    pool = members.Members("tcp://far:1")
     assert not any(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
-    crew.close()
+    pool.close()
     assert all(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
 
 

@@ -53,17 +53,17 @@ def test_commands_in_their_order(place):
     (place / "runs" / "left.h5").unlink()
     (place / "runs" / "torn.h5").write_bytes((place / "runs" / "front.h5").read_bytes()[:90_000])
     shutil.rmtree(place / "images")
-    told = [json.loads(line) for line in run(as_json[0], code=1).stdout.splitlines()]
+    reported = [json.loads(line) for line in run(as_json[0], code=1).stdout.splitlines()]
     wanted = [json.loads(line.replace(", …}", "}").replace(" …", "")) for line in as_json[1].splitlines()]
     for mine, theirs in zip(
-        sorted(told[:-1], key=lambda one: one["recording"]),
+        sorted(reported[:-1], key=lambda one: one["recording"]),
         sorted(wanted[:-1], key=lambda one: one["recording"]),
         strict=True,
     ):
         assert mine.items() >= {key: value for key, value in theirs.items() if key != "error"}.items()
         assert mine.get("error", "").startswith(theirs.get("error", ""))
-    assert told[-1] | {"seconds": 0} == wanted[-1] | {"seconds": 0}
-    assert list(told[-1]) == list(wanted[-1])
+    assert reported[-1] | {"seconds": 0} == wanted[-1] | {"seconds": 0}
+    assert list(reported[-1]) == list(wanted[-1])
 
 
 def test_python_lines(place):

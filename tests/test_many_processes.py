@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Advanced, Campaign, Options, find, processes
-from ertis_numba.campaign.orders import Order
-from ertis_numba.campaign.processes import Processes
+from ertis_numba.campaign import Advanced, Campaign, CampaignOptions, find, processes
+from ertis_numba.campaign.orders import WorkOrder
+from ertis_numba.campaign.processes import ProcessPool
 from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -43,13 +43,13 @@ def long_runs(runs):
 @pytest.fixture
 def crews(monkeypatch):
     """All that are started."""
-    made, begin = [], Processes.__init__
+    made, begin = [], ProcessPool.__init__
 
     def kept(self, size):
         made.append(self)
         begin(self, size)
 
-    monkeypatch.setattr(Processes, "__init__", kept)
+    monkeypatch.setattr(ProcessPool, "__init__", kept)
     return made
 
 
@@ -71,7 +71,7 @@ def gone(pid):
 
 
 def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
-    wanted = Options(settings=narrow, batch=2)
+    wanted = CampaignOptions(settings=narrow, batch=2)
     run_here(monkeypatch, [runs], tmp_path / "here", wanted)
     found = ended(Campaign(find([runs]), tmp_path / "out", wanted, workers=2).run())
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
@@ -80,11 +80,11 @@ def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
 
 def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, crews):
     out, killed, found = tmp_path / "out", [], {}
-    campaign = Campaign(find([long_runs]), out, Options(settings=narrow, batch=1), workers=2)
+    campaign = Campaign(find([long_runs]), out, CampaignOptions(settings=narrow, batch=1), workers=2)
     for event in campaign.run():
         if isinstance(event, Advanced) and event.recording.name == "b.h5" and not killed:
-            (crew,) = crews
-            (pid,) = [pid for pid, path in crew.doing.items() if path.endswith("b.h5")]
+            (pool,) = crews
+            (pid,) = [pid for pid, path in pool.doing.items() if path.endswith("b.h5")]
             os.kill(pid, signal.SIGKILL)
             killed.append(pid)
         found |= ended([event])
@@ -92,13 +92,13 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
     assert f"{long_runs / 'b.h5'}: the process that worked on it was ended by SIGKILL" in found["b.h5"].error
     assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
-    again = ended(Campaign(find([long_runs]), out, Options(settings=narrow), workers=1).run())
+    again = ended(Campaign(find([long_runs]), out, CampaignOptions(settings=narrow), workers=1).run())
     assert outcomes(again) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
 
 
 def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
     """However far it is: processes that stand still would never be done with theirs."""
-    events = Campaign(find([long_runs]), tmp_path / "out", Options(settings=narrow, batch=1), workers=2).run()
+    events = Campaign(find([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2).run()
     next(event for event in events if isinstance(event, Advanced))
     pids = list(crews[0].doing)
     for pid in pids:
@@ -109,57 +109,57 @@ def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
 
 
 def test_a_worker_that_dies_of_nothing_is_replaced():
-    crew = Processes(1)
+    pool = ProcessPool(1)
     try:
-        (pid,) = crew.doing
+        (pid,) = pool.doing
         os.kill(pid, signal.SIGKILL)
         assert gone(pid)
-        crew.give(Order(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
+        pool.give(WorkOrder(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
         news = []
         while not (news and news[-1].result):
-            news += crew.wait(PATIENCE_S)
+            news += pool.wait(PATIENCE_S)
         assert "none.h5: No such file" in news[-1].result["error"]
     finally:
-        crew.close()
+        pool.close()
 
 
 def test_fewer_are_wanted_after_all():
-    crew = Processes(3)
+    pool = ProcessPool(3)
     try:
-        pids = list(crew.doing)
-        crew.limit(1)
-        assert (crew.size, crew.free, list(crew.doing)) == (1, 1, pids[:1])
+        pids = list(pool.doing)
+        pool.limit(1)
+        assert (pool.size, pool.free, list(pool.doing)) == (1, 1, pids[:1])
         assert all(gone(pid) for pid in pids[1:])
     finally:
-        crew.close()
+        pool.close()
 
 
 @pytest.mark.parametrize("size", [1, 2])
 def test_fewer_are_wanted_while_all_are_busy(size):
     """Never more orders in hand than there were, and soon no more than are wanted, by as many processes."""
-    crew, numbers, in_hand, seen = Processes(3), iter(range(12)), set(), []
+    pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
     try:
 
         def feed():
-            while crew.free > 0 and (number := next(numbers, None)) is not None:
-                crew.give(Order(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
+            while pool.free > 0 and (number := next(numbers, None)) is not None:
+                pool.give(WorkOrder(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
                 in_hand.add(number)
             return len(in_hand)
 
         assert feed() == 3
-        crew.limit(size)
-        assert crew.free == 0
+        pool.limit(size)
+        assert pool.free == 0
         while feed():
-            seen.append((len(in_hand), len(crew.doing)))
-            in_hand -= {news.number for news in crew.wait(PATIENCE_S) if news.result is not None}
+            seen.append((len(in_hand), len(pool.doing)))
+            in_hand -= {news.number for news in pool.wait(PATIENCE_S) if news.result is not None}
         assert next(numbers, None) is None
         assert seen == sorted(seen, reverse=True)
         assert seen[0] == (3, 3)
         assert (size, size) in seen
         assert max(processes for given, processes in seen if given <= size) == size
-        assert len(crew.doing) == size
+        assert len(pool.doing) == size
     finally:
-        crew.close()
+        pool.close()
 
 
 def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
@@ -196,7 +196,7 @@ def until_a_part_grows(out):
 
 
 def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp_path, monkeypatch):
-    run_here(monkeypatch, [long_runs], tmp_path / "here", Options(settings=narrow, batch=1))
+    run_here(monkeypatch, [long_runs], tmp_path / "here", CampaignOptions(settings=narrow, batch=1))
     wanted, out = contents(tmp_path / "here"), tmp_path / "out"
     for wait_s in (0.0, 0.15):
         with started(long_runs, out) as process:
@@ -210,11 +210,11 @@ def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp
         assert set(left) < set(wanted)
         (out / "b.energy.h5").unlink(missing_ok=True)
     with started(long_runs, out) as process:
-        told = [json.loads(line) for line in process.stdout]
+        reported = [json.loads(line) for line in process.stdout]
         assert process.wait(PATIENCE_S) == 0
     assert contents(out) == wanted
-    assert told[-1]["made"] + told[-1]["there"] == 4
-    assert told[-1]["there"] == len(left) - ("b.energy.h5" in left)
+    assert reported[-1]["made"] + reported[-1]["there"] == 4
+    assert reported[-1]["there"] == len(left) - ("b.energy.h5" in left)
 
 
 def test_ctrl_c_ends_all_at_once(long_runs, tmp_path):
@@ -225,9 +225,9 @@ def test_ctrl_c_ends_all_at_once(long_runs, tmp_path):
         for pid in workers:  # which would never be done with what they have
             os.kill(pid, signal.SIGSTOP)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=PATIENCE_S)
+        _, stated = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
-    assert said.splitlines()[-1] == "ertis: error: interrupted"
+    assert stated.splitlines()[-1] == "ertis: error: interrupted"
     assert len(workers) == 2
     assert all(gone(pid) for pid in workers)
     for name in names_in(out):

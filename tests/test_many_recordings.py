@@ -64,9 +64,9 @@ def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
     ("given", "said"),
     [("runs/*.hdf", "no file is named like runs/"), ("empty", r"folder empty has no \*\.h5 in it")],
 )
-def test_nothing_meant(given, said):
+def test_nothing_meant(given, stated):
     Path("empty").mkdir()
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=stated):
         find([given])
 
 
@@ -82,8 +82,8 @@ def test_each_has_its_own_output():
         (["runs"], "none/out", r"output none/out: there is no folder none"),
     ],
 )
-def test_refused_before_anything_is_made(place, given, folder, said):
-    with pytest.raises(ArgumentError, match=said):
+def test_refused_before_anything_is_made(place, given, folder, stated):
+    with pytest.raises(ArgumentError, match=stated):
         Campaign(find(given), folder)
     assert names_in(place) == ["more", "odd[1].h5", "runs"]
 

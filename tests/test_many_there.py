@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import verification
-from ertis_numba.campaign import Options, made
+from ertis_numba.campaign import CampaignOptions, existing_output
 from ertis_numba.storage import write_recording
 from tests.campaigns import outcomes, run_here, write_recordings
 from tests.files import noise
@@ -47,13 +47,13 @@ def spoil_head(file):
 
 
 @pytest.mark.parametrize(("spoil", "said"), [(spoil_energy, "is damaged"), (spoil_head, "is damaged")])
-def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, said):
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
+def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, stated):
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     whole = (out / "a.energy.h5").read_bytes()
     spoil(out / "a.energy.h5")
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
-    assert f"exists and {said}; give another folder, or ask to replace it (--force)" in found["a.h5"].error
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, overwrite=True))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
+    assert f"exists and {stated}; give another folder, or ask to replace it (--force)" in found["a.h5"].error
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "made"}
     assert (out / "a.energy.h5").read_bytes() == whole
 
@@ -62,37 +62,39 @@ def test_a_library_that_stumbles_over_a_file_does_not_hold_up_its_replacement(ru
     def stumbles(_):
         raise RuntimeError("Unable to read attribute")
 
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow))
-    monkeypatch.setattr(made, "file_kind", stumbles)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, overwrite=True))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
+    monkeypatch.setattr(existing_output, "file_kind", stumbles)
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "made"}
 
 
 def test_strict_holds_for_what_is_there(tmp_path, out, monkeypatch):
     measurements = noise(count=2)
     for measurement in measurements:
-        measurement.words[:] &= np.uint32(0xFFFFFFFE)
+        measurement.data[:] &= np.uint32(0xFFFFFFFE)
     write_recording(tmp_path / "worn.h5", measurements)
-    run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow))
+    run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow))
     before = state(out / "worn.energy.h5")
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow, strict=True))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow, strict=True))
     assert "stuck at 0: channel 0" in found["worn.h5"].error
-    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, Options(settings=narrow))
+    found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == {"worn.h5": "there"}
     assert state(out / "worn.energy.h5") == before
 
 
 def test_what_is_there_is_measured_by_the_plan_that_it_was_made_by(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=exact))
+    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=exact))
     before = state(out / "a.energy.h5")
-    found, crew = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, explain=True, verify=True))
+    found, pool = run_here(
+        monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True)
+    )
     assert outcomes(found) == {"a.h5": "there"}
-    assert [order.do for order in crew.given] == ["look", "plan", "check"]
+    assert [order.do for order in pool.given] == ["look", "plan", "check"]
     (sensor,) = found["a.h5"].made["sensors"]
     assert sensor["plan"]["accuracy"]["oversampling"] == 48
     assert sensor["verified"]["error_db"] <= -35.0
     refused = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: refused)
-    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, Options(settings=narrow, verify=True))
+    found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, verify=True))
     assert "image of sensor eRTIS-7 errs by -30.0 dB" in found["a.h5"].error
     assert state(out / "a.energy.h5") == before

@@ -35,7 +35,7 @@ FINITE = st.floats(allow_nan=False)
 REASONS = st.text(st.characters(codec="utf-8"), min_size=1, max_size=64)
 WHOLE = Data(
     sensor="front",
-    epoch=7,
+    session_id=7,
     sequence=41,
     sync_count=-3,
     timestamp_ns=2**60,
@@ -58,7 +58,7 @@ def test_each_message_of_the_table_has_its_own_kind():
     st.builds(
         Data,
         sensor=NAMES,
-        epoch=COUNTS,
+        session_id=COUNTS,
         sequence=NUMBERS,
         sync_count=INT64,
         timestamp_ns=INT64,
@@ -72,7 +72,7 @@ def test_each_message_of_the_table_has_its_own_kind():
     | st.builds(
         Hello,
         sensor=NAMES,
-        epoch=COUNTS,
+        session_id=COUNTS,
         next_sequence=NUMBERS,
         settings_crc32=UINT32,
         translation_m=st.tuples(FINITE, FINITE, FINITE),
@@ -80,8 +80,8 @@ def test_each_message_of_the_table_has_its_own_kind():
     | st.builds(
         Ack,
         sensor=NAMES,
-        epoch=COUNTS,
-        settled=st.integers(-1, 2**48),
+        session_id=COUNTS,
+        acked_through=st.integers(-1, 2**48),
         status=st.sampled_from(["stored", "accepted"]),
         dropped=st.lists(st.tuples(NUMBERS, REASONS), max_size=8).map(tuple),
     )
@@ -120,8 +120,8 @@ def test_a_header_as_it_stands_on_the_wire():
         (encode(Ping()) + b"\0", "cannot be read"),
     ],
 )
-def test_what_is_no_header_is_refused_in_a_line(header, told):
-    with pytest.raises(DataError, match=told) as caught:
+def test_what_is_no_header_is_refused_in_a_line(header, reported):
+    with pytest.raises(DataError, match=reported) as caught:
         decode(header)
     assert ";" in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
@@ -147,8 +147,8 @@ def test_a_message_that_is_not_expected_is_refused():
         ("sensor", "front\n"),
         ("sensor", "f" * 65),
         ("sensor", 7),
-        ("epoch", -1),
-        ("epoch", 2**63),
+        ("session_id", -1),
+        ("session_id", 2**63),
         ("sequence", 2**48 + 1),
         ("sequence", -1),
         ("sequence", 1.5),
@@ -218,10 +218,10 @@ def _spoiled(random_, header):
 
 def _one_of_each():
     """Each message of the table, with the least that its fields may be."""
-    return [msgspec.convert({"kind": kind.__struct_config__.tag, **_least(kind)}, kind) for kind in KINDS]
+    return [msgspec.convert({"kind": kind.__struct_config__.tag, **_smallest(kind)}, kind) for kind in KINDS]
 
 
-def _least(kind):
+def _smallest(kind):
     values = {}
     for field in msgspec.structs.fields(kind):
         if field.required:

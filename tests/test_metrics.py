@@ -93,7 +93,9 @@ def lines():
 
 def test_an_event_is_one_line_that_programs_can_take_apart(lines):
     stream = lines()
-    log.logger("central_node").warning("conflict", sensor="front", epoch=7, sequence=41, text="both are kept", of=None)
+    log.logger("central_node").warning(
+        "conflict", sensor="front", session_id=7, sequence=41, text="both are kept", of=None
+    )
     time, *rest = stream.getvalue().rstrip("\n").split(" ", 1)
     assert rest == ['warning conflict sensor=front epoch=7 sequence=41 text="both are kept"']
     assert len(time) == len("2026-11-22T04:31:00.123Z")
@@ -103,9 +105,9 @@ def test_an_event_is_one_line_that_programs_can_take_apart(lines):
 def test_an_event_as_json(lines):
     stream = lines(as_json=True)
     log.logger("central_node").error("fault", sensor="front", text='a "b"\nc')
-    told = json.loads(stream.getvalue())
-    assert told.pop("time").endswith("Z")
-    assert told == {"level": "error", "event": "fault", "sensor": "front", "text": 'a "b"\nc'}
+    reported = json.loads(stream.getvalue())
+    assert reported.pop("time").endswith("Z")
+    assert reported == {"level": "error", "event": "fault", "sensor": "front", "text": 'a "b"\nc'}
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a=b", 'say "x"', "", "tab\t", "\x1b[31m", "\u2028line"])

@@ -42,9 +42,9 @@ def met_s(leaves_s, start_m, place_m, velocity_m_s):
     )
 
 
-def arrives_s(leaves_s, mouth, *others):
+def arrives_s(leaves_s, transmitter, *others):
     """Solve for when what leaves an emitter has met all others, each a place and a velocity."""
-    place_m = mouth[0] + leaves_s * mouth[1]
+    place_m = transmitter[0] + leaves_s * transmitter[1]
     for other in others:
         leaves_s = met_s(leaves_s, place_m, *other)
         place_m = other[0] + leaves_s * other[1]
@@ -79,11 +79,11 @@ def test_delay_and_stretch_over_a_target(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_delay_and_stretch_straight_from_another_sensor(seed):
-    mouth_m, mouth_m_s, ear_m, ear_m_s = np.random.default_rng(seed).uniform(-4, 4, (4, 3))
-    ear = EAR.replace(position_m=vector(ear_m), velocity_m_s=vector(ear_m_s), emitter=Emitter(silent=True))
-    mouth = EAR.replace(name="mouth", position_m=vector(mouth_m), velocity_m_s=vector(mouth_m_s))
-    [direct] = ways(Scene(sensors=(ear, mouth)), "doppler", "cross_emission")
-    delay_s, stretch = brute_force((mouth_m, mouth_m_s), (ear_m, ear_m_s))
+    mouth_m, mouth_m_s, receiver_m, ear_m_s = np.random.default_rng(seed).uniform(-4, 4, (4, 3))
+    receiver = EAR.replace(position_m=vector(receiver_m), velocity_m_s=vector(ear_m_s), emitter=Emitter(silent=True))
+    transmitter = EAR.replace(name="mouth", position_m=vector(mouth_m), velocity_m_s=vector(mouth_m_s))
+    [direct] = ways(Scene(sensors=(receiver, transmitter)), "doppler", "cross_emission")
+    delay_s, stretch = brute_force((mouth_m, mouth_m_s), (receiver_m, ear_m_s))
     assert abs(direct.delay_s[0, 0] - delay_s) < 2e-12
     assert direct.stretch[0, 0] == pytest.approx(stretch, abs=1e-9)
 

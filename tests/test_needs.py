@@ -71,12 +71,12 @@ def test_verdicts_hold_in_images_from_bits():
             continue
         sensor = loud.sensors[0]
         pipeline = Pipeline(sensor.settings())
-        bits = pipeline.process(Simulator(loud, plan=plan).render()).energy.astype(float)
+        bits = pipeline.process(Simulator(loud, plan=plan).render()).amplitude.astype(float)
         shown = Sight(snapshot(loud, sensor, 0.0), plan.active)
         sure = shown.shown & (shown.levels(shown.heard) > 300 * shown.noise)
         echo_ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
         for name in {verdict.name for verdict in plan.verdicts if not verdict.on and verdict.estimate_db is not None}:
-            turned = pipeline.process(Simulator(loud, plan=with_one(plan, name, on=True)).render()).energy
+            turned = pipeline.process(Simulator(loud, plan=with_one(plan, name, on=True)).render()).amplitude
             for range_m in echo_ranges_m:
                 near = np.abs(pipeline.range_m - range_m) < SAME_RANGE_M
                 change_db = 20 * np.log10(turned[:, near].max() / bits[:, near].max())

@@ -13,14 +13,16 @@ PAGE = (Path(__file__).parents[1] / "docs" / "network.md").read_text("utf-8")
 
 def test_the_table_of_messages_is_complete():
     rows = [line.split("|") for line in PAGE.splitlines() if re.match(r"\| `\w+` \| \w+.* → ", line)]
-    told = {row[1].strip(" `"): re.findall(r"`(\w+)`", row[4]) for row in rows}
+    reported = {row[1].strip(" `"): re.findall(r"`(\w+)`", row[4]) for row in rows}
     kinds = [kind for kind in vars(messages).values() if isinstance(kind, type) and kind.__name__ in messages.__all__]
     spoken = {
         kind.__name__.lower(): [field.name for field in msgspec.structs.fields(kind)]
         for kind in kinds
         if issubclass(kind, messages.Message) and kind is not messages.Message
     }
-    assert {kind: set(fields) for kind, fields in told.items()} == {kind: set(names) for kind, names in spoken.items()}
+    assert {kind: set(fields) for kind, fields in reported.items()} == {
+        kind: set(names) for kind, names in spoken.items()
+    }
 
 
 def test_the_version_and_the_limits_are_those_of_the_code():

@@ -21,11 +21,11 @@ from ertis_bench.network import (
     tables,
     zmtp,
 )
-from ertis_bench.network.diary import Diary, Key, Row
+from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.oracle import Sent, compare, read_diaries, read_folder
 from ertis_bench.network.processes import central
 from ertis_bench.network.receiver import Received, read_received
-from ertis_bench.network.sender import SMALL, Job, words_of
+from ertis_bench.network.sender import SMALL, SenderJob, words_of
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
@@ -55,9 +55,9 @@ if "record" in sys.argv:
             if sequence == 3:
                 continue
             if sequence == 5:
-                words = entry.measurement.words.copy()
+                words = entry.measurement.data.copy()
                 words[1000] ^= 1
-                measurement = replace(entry.measurement, words=words)
+                measurement = replace(entry.measurement, data=words)
                 entry = Entry(measurement, entry.monotonic_ns, zlib.crc32(words.data))
             kept.append(entry)
         append(self, kept)
@@ -75,7 +75,7 @@ def wrong_in(part, found):
 def test_killed_central_nodes(tmp_path):
     found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"], rate_hz=faults.SHORT.rate_hz)
     assert wrong_in("centrals", found) == {}
-    assert (found["orphans"], found["unsettled"]) == (0, 0)
+    assert (found["orphans"], found["unacked"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
 
 
@@ -99,7 +99,7 @@ def test_killed_workers(tmp_path):
         "unbalanced": 0, "uncounted": 0, "untold": 0, "disordered": 0, "foreign": 0,
     }  # fmt: skip
     assert found["respawned"] >= found["kills"] == N_KILLS["workers"]
-    assert found["settled"]
+    assert found["acked_through"]
     assert set(found["dropped"]) <= {"superseded", "failed twice", "the workers were getting ready"}
     assert found["images"] > found["sent"] / 10
     assert found["orphans"] == 0
@@ -173,9 +173,9 @@ def test_a_node_that_loses_and_spoils_is_found_out(tmp_path, monkeypatch):
     (tmp_path / "spoiling").mkdir()
     (tmp_path / "spoiling" / "sitecustomize.py").write_text(SPOILING)
     monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
-    record = faults_kills.Record(tmp_path)
+    record = faults_kills.RestartedRecorder(tmp_path)
     diary = tmp_path / "sender.ndjson"
-    with Job(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
+    with SenderJob(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
         sender.wait_for("begun")
         record.finish([sender])
     found = faults_kills.judged(tmp_path, record.archive, [diary])
@@ -191,12 +191,12 @@ def sent(tmp_path_factory):
     path = tmp_path_factory.mktemp("sent") / "sender.ndjson"
     diary, measurements = Diary(path), []
     for number, made in enumerate(noise(SMALL, 6, SEED)):
-        stamp = Stamp(sensor="front", sequence=number, epoch=7, sync_count=number, timestamp_ns=1_000 + number)
-        measurements.append(Measurement(words_of(made.words, 7, number), SMALL, stamp))
-        key = Key("front", 7, number)
+        stamp = Stamp(sensor="front", sequence=number, session_id=7, sync_count=number, timestamp_ns=1_000 + number)
+        measurements.append(Measurement(words_of(made.data, 7, number), SMALL, stamp))
+        key = DiaryKey("front", 7, number)
         diary.offered(key, Row.of(measurements[-1]), 5)
         diary.kept(key)
-    diary.settled("front", 7, 3, "stored", 9)
+    diary.acked_through("front", 7, 3, "stored", 9)
     return path, measurements
 
 
@@ -206,12 +206,12 @@ def stored(folder, measurements, *, name="rec.h5", gaps=()):
         for measurement in measurements:
             writer.write(measurement)
         for first, last, reason in gaps:
-            writer.note_gap("front", first, last, reason, epoch=7)
+            writer.note_gap("front", first, last, reason, session_id=7)
 
 
 def judged(path, folder):
-    told = read_diaries([path])
-    found = compare(told, read_folder(folder), told.kept)
+    reported = read_diaries([path])
+    found = compare(reported, read_folder(folder), reported.kept)
     return {name: count for name, count in found.items() if name not in ("promised", "stored") and count}
 
 
@@ -219,9 +219,9 @@ def test_the_checker_finds_nothing_where_nothing_is_wrong(tmp_path, sent):
     path, measurements = sent
     stored(tmp_path / "a", measurements)
     assert judged(path, tmp_path / "a") == {}
-    told = read_diaries([path])
-    assert len(told.acked()) == 4
-    assert told.ack_times_ms() == pytest.approx([4e-6] * 4)
+    reported = read_diaries([path])
+    assert len(reported.acked()) == 4
+    assert reported.ack_times_ms() == pytest.approx([4e-6] * 4)
 
 
 def test_the_checker_finds_what_is_lost(tmp_path, sent):
@@ -236,11 +236,11 @@ def test_the_checker_finds_what_is_lost(tmp_path, sent):
 
 def test_the_checker_finds_what_is_changed(tmp_path, sent):
     path, measurements = sent
-    words = measurements[2].words.copy()
+    words = measurements[2].data.copy()
     words[30_000] ^= 1 << 31
     for number, changed in enumerate(
         (
-            replace(measurements[2], words=words),
+            replace(measurements[2], data=words),
             replace(measurements[2], stamp=replace(measurements[2].stamp, timestamp_ns=5)),
             replace(measurements[2], stamp=replace(measurements[2].stamp, sync_count=1)),
         )
@@ -255,7 +255,7 @@ def test_the_checker_finds_what_is_there_twice_or_never_was(tmp_path, sent):
     stored(tmp_path / "a", measurements)
     stored(tmp_path / "a", measurements[2:3], name="again.h5")
     assert judged(path, tmp_path / "a") == {"twice": 1}
-    stranger = replace(measurements[0], stamp=replace(measurements[0].stamp, epoch=8))
+    stranger = replace(measurements[0], stamp=replace(measurements[0].stamp, session_id=8))
     stored(tmp_path / "a", [stranger], name="other.h5")
     assert judged(path, tmp_path / "a") == {"twice": 1, "unexpected": 1}
 
@@ -274,8 +274,8 @@ def test_the_checker_finds_files_that_are_broken_or_ought_to_be_gone(tmp_path, s
 def test_half_a_line_of_a_diary_is_none(tmp_path, sent):
     path = tmp_path / "cut.ndjson"
     path.write_bytes(sent[0].read_bytes()[:-3])
-    told = read_diaries([path])
-    assert (len(told.kept), told.settled) == (6, {})
+    reported = read_diaries([path])
+    assert (len(reported.kept), reported.acked_through) == (6, {})
 
 
 def test_images_are_counted(tmp_path):
@@ -284,17 +284,21 @@ def test_images_are_counted(tmp_path):
         '["a", 1, 0, 0, 0, 2000000, false]\n["a", 1, 3, 2, 1, 4000000, true]\n["a", 1, 3, 4, 1, 4000000, false]\n["a",'
     )
     found = read_received(path)
-    assert (found.twice, found.disordered, found.wrong, found.dropped, found.untold) == (1, 0, 1, 1, 1)
-    assert found.times_ms == {Key("a", 1, 0): 2.0, Key("a", 1, 3): 4.0}
+    assert (found.twice, found.disordered, found.wrong, found.dropped, found.unrecorded) == (1, 0, 1, 1, 1)
+    assert found.times_ms == {DiaryKey("a", 1, 0): 2.0, DiaryKey("a", 1, 3): 4.0}
 
 
 def test_accounts_that_do_not_add_up_are_told():
     sensors = {"a": SensorStatus(received=9, published=5, dropped={"superseded": 3}, in_flight=0)}
     status = Status(version="", pid=1, host="", address="", state="processing", sensors=sensors)
     serve = serving.Serve(None, "", "", "", None, latest=status)
-    told = Sent(kept={Key("a", 1, number) for number in range(10)}, offered={Key("a", 1, 0): Row(0, 0, 0)})
-    received = Received(times_ms={Key("a", 1, 0): 1.0, Key("b", 1, 0): 1.0}, numbers=[0, 1, 4], dropped=1, wrong=1)
-    found = serving.accounts(serve, told, received)
+    reported = Sent(
+        kept={DiaryKey("a", 1, number) for number in range(10)}, offered={DiaryKey("a", 1, 0): Row(0, 0, 0)}
+    )
+    received = Received(
+        times_ms={DiaryKey("a", 1, 0): 1.0, DiaryKey("b", 1, 0): 1.0}, numbers=[0, 1, 4], dropped=1, wrong=1
+    )
+    found = serving.accounts(serve, reported, received)
     assert (found["unbalanced"], found["uncounted"], found["foreign"], found["wrong"]) == (1, 1, 1, 1)
     assert found["untold"] == 1 + 1  # five were published, three came, one was told; numbers 2 and 3 are not there
 
@@ -325,10 +329,10 @@ def test_a_part_that_could_not_be_tried_is_told():
 
 
 def test_frames_survive_any_cut():
-    frames = [zmtp.Frame(1, bytes(300)), zmtp.Frame(0, b"x"), zmtp.Frame(4, b"\x04PING")]
+    frames = [zmtp.ZmtpFrame(1, bytes(300)), zmtp.ZmtpFrame(0, b"x"), zmtp.ZmtpFrame(4, b"\x04PING")]
     data = b"".join(frame.encode() for frame in frames)
     for size in (1, 2, 7, 300, len(data)):
-        reader = zmtp.Frames()
+        reader = zmtp.ZmtpFrameParser()
         came = [frame for start in range(0, len(data), size) for frame in reader.feed(data[start : start + size])]
         assert [frame.body for frame in came] == [frame.body for frame in frames]
         assert [(frame.more, frame.is_command) for frame in came] == [(True, False), (False, False), (False, True)]

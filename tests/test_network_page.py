@@ -94,11 +94,11 @@ class Shell:
         as_json = [] if name == "emulate" else ["--json"]
         process = subprocess.Popen([*command, *as_json], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         self.running.append(process)
-        while READY[name] not in (told := process.stdout.readline()):
-            assert told, line
+        while READY[name] not in (reported := process.stdout.readline()):
+            assert reported, line
         self.readers.append(threading.Thread(target=process.stdout.read, daemon=True))
         self.readers[-1].start()  # what nobody reads would stop it
-        return told
+        return reported
 
 
 def lines_of(page, prompt):
@@ -129,8 +129,8 @@ def test_several_machines(place, ports, platform):
         shell.run("emulate examples/platform.toml &")
         for line in lines:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
-            told = shell.run(re.sub(r"(\w+\.public\.toml)", rf"{place}/keys/\1", local))
-    assert "0 lost" in told or not told
+            reported = shell.run(re.sub(r"(\w+\.public\.toml)", rf"{place}/keys/\1", local))
+    assert "0 lost" in reported or not reported
 
 
 def test_one_machine_stores(place, ports, platform):

@@ -57,9 +57,9 @@ COLOUR = re.compile(r"\x1b\[[\d;]*\b(?:3[0-8]|4[0-8]|9\d|10\d)[\d;]*m")
 
 def ends(terminal):
     """Let it end, with the cursor where somebody sees it."""
-    code, told = terminal.finish()
+    code, reported = terminal.finish()
     assert terminal.shown.rfind("\x1b[?25h") >= terminal.shown.rfind("\x1b[?25l")
-    return code, told
+    return code, reported
 
 
 # ---- bars -----------------------------------------------------------------------------------------
@@ -71,7 +71,7 @@ def test_a_bar_says_how_far_it_is_and_goes(tmp_path, coloured):
         for done in range(3):
             terminal.until(f"{done}/3")
             terminal.go_on()
-        code, told = ends(terminal)
+        code, reported = ends(terminal)
         assert code == 0
         assert bool(COLOUR.search(terminal.shown)) == coloured
         # Its last picture, before it goes.
@@ -79,7 +79,7 @@ def test_a_bar_says_how_far_it_is_and_goes(tmp_path, coloured):
         assert any(re.match(r"work\[ing\] ━+ 3/3 +0:00:\d\d +0:00:00 left$", line) for line in drawn)
         # Nothing is left of it but what was told meanwhile.
         assert "".join(terminal.lines) == "".join([*NOTES, "True"])
-        assert [line.rstrip() for line in told.splitlines()] == RESULTS
+        assert [line.rstrip() for line in reported.splitlines()] == RESULTS
 
 
 @pytest.mark.parametrize("columns", [20, 50, 200])
@@ -193,7 +193,7 @@ def test_a_command_says_the_same_on_a_terminal_and_in_a_pipe(tmp_path):
 
 
 def test_a_table_without_rows():
-    assert list(_tables.Table({"what": "left", "ms": "right"}, []).lines()) == ["what  ms"]
+    assert list(_tables.TextTable({"what": "left", "ms": "right"}, []).lines()) == ["what  ms"]
 
 
 def test_the_status_is_neither_wrapped_nor_cut_in_a_pipe(capsys):

@@ -11,7 +11,7 @@ from scipy.io import wavfile
 
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup, call_codes
-from ertis_numba.devices.sonar import Sonar as Driver
+from ertis_numba.devices.sonar import SonarDriver as Driver
 from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import received_settings
@@ -38,27 +38,27 @@ def image(emitted, matched):
     sensor = Sensor(processing=PROCESSING, recording=RECORDING, call=emitted)
     measurement = Simulator(Scene(sensors=(sensor,), points=(Point(range_m=0.8, azimuth_deg=30.0),))).render()
     settings = Settings(processing=PROCESSING, recording=RECORDING, call=matched)
-    return Pipeline(settings, device="cpu").process(Measurement(measurement.words, settings, measurement.stamp))
+    return Pipeline(settings, device="cpu").process(Measurement(measurement.data, settings, measurement.stamp))
 
 
 @pytest.fixture(scope="module")
 def by_sweep():
-    return image(DEFAULT, DEFAULT).energy
+    return image(DEFAULT, DEFAULT).amplitude
 
 
 @pytest.mark.parametrize("emitted", [DEFAULT, own(DEFAULT)])
 def test_own_waveform_equal_to_the_default_sweep_gives_the_same_image(emitted, by_sweep):
-    change = np.abs(image(emitted, own(DEFAULT)).energy - by_sweep).max()
+    change = np.abs(image(emitted, own(DEFAULT)).amplitude - by_sweep).max()
     assert 20 * np.log10(change / by_sweep.max()) < -60
 
 
 @pytest.mark.parametrize("call", [SHORT, Call(start_frequency_hz=25e3, stop_frequency_hz=50e3)])
 def test_other_own_waveform_images_a_point_where_it_is(call):
     shown = image(own(call), own(call))
-    direction, place = np.unravel_index(np.argmax(shown.energy), shown.energy.shape)
+    direction, place = np.unravel_index(np.argmax(shown.amplitude), shown.amplitude.shape)
     assert shown.range_m[place] == pytest.approx(0.8, abs=0.002)
     assert np.degrees(shown.azimuth_rad[direction]) == pytest.approx(30.0, abs=3.0)
-    assert shown.energy.max() == pytest.approx(image(call, call).energy.max(), rel=0.01)
+    assert shown.amplitude.max() == pytest.approx(image(call, call).amplitude.max(), rel=0.01)
 
 
 def test_matched_filter_takes_its_band_from_the_spectrum():
@@ -98,8 +98,8 @@ def test_settings_read_the_waveform_file_beside_them(tmp_path, name, write, rate
     assert call.sample_rate_hz == rate_hz
     time_s = np.linspace(0.0, 1.4e-3, 500)
     assert_allclose(call_at(call, time_s), call_at(SHORT, time_s), atol=0.01)
-    assert Settings().changed_by(tmp_path / "mine.toml").call == call
-    back = Settings(call=call).changed_by(_file(tmp_path / "sweep.toml", "[call]\nduration_s = 2e-3\n"))
+    assert Settings().updated_from_file(tmp_path / "mine.toml").call == call
+    back = Settings(call=call).updated_from_file(_file(tmp_path / "sweep.toml", "[call]\nduration_s = 2e-3\n"))
     assert back.call == Call(duration_s=2e-3)
 
 

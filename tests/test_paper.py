@@ -29,9 +29,9 @@ def test_image_is_the_plain_one(name):
     measurement = noise(settings)
     image = pipeline.process(measurement)
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    expected, range_m = reference.paper(measurement.words, settings, directions)
+    expected, range_m = reference.paper(measurement.data, settings, directions)
     assert image.range_m == pytest.approx(range_m, rel=1e-12)
-    assert reference.error_db(image.energy, expected) < FLOAT32_DB
+    assert reference.error_db(image.amplitude, expected) < FLOAT32_DB
 
 
 def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float):
@@ -50,11 +50,11 @@ def test_echo_lies_at_its_range_with_its_amplitude(call):
     settings = with_paper(SHORT.replace(call=call), directions="2d:181", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
     image = Pipeline(settings).process(Measurement(words, settings))
-    direction, distance = np.unravel_index(np.argmax(image.energy), image.energy.shape)
+    direction, distance = np.unravel_index(np.argmax(image.amplitude), image.amplitude.shape)
     assert math.degrees(image.azimuth_rad[direction]) == pytest.approx(20.0, abs=1.0)
     # Two samples of 0.38 mm: the recursive low pass delays a pulse a little more than its lowest frequency.
     assert image.range_m[distance] == pytest.approx(0.7, abs=8e-4)
-    assert image.energy.max() == pytest.approx(0.8, rel=0.03)
+    assert image.amplitude.max() == pytest.approx(0.8, rel=0.03)
 
 
 def test_image_agrees_with_the_exact_one_on_where_the_echo_is():
@@ -63,8 +63,8 @@ def test_image_agrees_with_the_exact_one_on_where_the_echo_is():
     image = Pipeline(settings).process(Measurement(words, settings))
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     exact = reference.exact(words, settings, directions, image.range_m)
-    assert np.argmax(image.energy) == np.argmax(exact)
-    assert image.energy.max() == pytest.approx(exact.max(), rel=0.12)  # both sample the range axis at 45 kHz
+    assert np.argmax(image.amplitude) == np.argmax(exact)
+    assert image.amplitude.max() == pytest.approx(exact.max(), rel=0.12)  # both sample the range axis at 45 kHz
 
 
 def test_range_axis_is_that_of_the_paper():
@@ -78,7 +78,7 @@ def test_rectified_carrier_is_gone():
     """With every sample kept, the envelope of a call is smooth: no ripple at twice the carrier."""
     settings = with_paper(SHORT, directions="2d:1", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
-    row = Pipeline(settings).process(Measurement(words, settings)).energy[0]
+    row = Pipeline(settings).process(Measurement(words, settings)).amplitude[0]
     spectrum = np.abs(np.fft.rfft(row * np.hanning(len(row))))
     frequency_hz = np.fft.rfftfreq(len(row), 1 / 450e3)
     assert spectrum[frequency_hz > 45e3].max() < 2e-3 * spectrum.max()

@@ -58,14 +58,14 @@ def test_image_is_that_of_the_bits():
     of_bits, of_numbers = (Pipeline(given, max_error_db="fine").process(heard(given)) for given in (bits, numbers))
     levels = [[peak.level_db for peak in ertis.find_peaks(image, top=2)] for image in (of_bits, of_numbers)]
     assert levels[0] == pytest.approx(levels[1], abs=0.1)
-    assert of_bits.energy.max() == pytest.approx(of_numbers.energy.max(), rel=0.01)
+    assert of_bits.amplitude.max() == pytest.approx(of_numbers.amplitude.max(), rel=0.01)
 
 
 def test_noise_and_faults_of_converters():
     electronics = Electronics(noise_dbfs=-40.0, dead_channels=(2,), stuck_low=(5,), stuck_high=(6,))
     sensor = sensor_of(PCM, electronics=electronics)
     simulator = Simulator(Scene(seed=4, sensors=(sensor,)), plan=only("microphone_noise", "microphone_faults"))
-    words = simulator.render().words
+    words = simulator.render().data
     assert words.dtype == np.int16
     assert words.shape == (3_000, 8)
     assert (words[:, 5] == -32_768).all()
@@ -73,12 +73,12 @@ def test_noise_and_faults_of_converters():
     rms = np.std(words[:, [0, 1, 2, 3, 4, 7]] / 32_768, axis=0)
     assert rms == pytest.approx(0.01, rel=0.06)
     assert np.abs(np.corrcoef(words[:, [0, 1, 3, 4]].T) - np.eye(4)).max() < 0.1
-    assert (simulator.render().words == words).all()
+    assert (simulator.render().data == words).all()
 
 
 def test_what_is_too_loud_is_cut_off():
     loud = Point(azimuth_deg=0.0, elevation_deg=0.0, range_m=0.6, strength_db=20.0)
-    words = Simulator(scene_of(PCM).replace(points=(loud,))).render().words
+    words = Simulator(scene_of(PCM).replace(points=(loud,))).render().data
     assert (words.min(), words.max()) == (-32_768, 32_767)
 
 
@@ -91,11 +91,11 @@ def test_recording_keeps_every_number(tmp_path, name):
     path = write_recording(tmp_path / "rec.h5", [given])
     with open_recording(path) as recording:
         back = recording[0]
-        assert np.array_equal(back.words, given.words)
-        assert back.words.dtype == given.words.dtype
+        assert np.array_equal(back.data, given.data)
+        assert back.data.dtype == given.data.dtype
         assert recording.settings.recording == given.settings.recording
         image = Pipeline(recording.settings).process(back)
-    assert np.array_equal(image.energy, Pipeline(given.settings).process(given).energy)
+    assert np.array_equal(image.amplitude, Pipeline(given.settings).process(given).amplitude)
 
 
 def test_recording_opens_in_xarray_with_names(tmp_path, measurement):
@@ -104,7 +104,7 @@ def test_recording_opens_in_xarray_with_names(tmp_path, measurement):
         with xarray.open_dataset(path, group="/sensors/sensor", engine=engine, decode_timedelta=False) as data:
             assert data["pcm"].dims == ("time", "sample", "microphone")
             assert data["pcm"].attrs["sample_rate_hz"] == RATE_HZ
-            assert np.array_equal(data["pcm"][0], measurement.words)
+            assert np.array_equal(data["pcm"][0], measurement.data)
             assert "pdm" not in data
 
 
@@ -115,7 +115,7 @@ def test_bits_and_numbers_of_two_sensors_share_a_recording(tmp_path, measurement
         writer.write(dataclasses.replace(measurement, stamp=ertis.Stamp(sensor="numbers")))
     for name, given in (("bits", bits), ("numbers", measurement)):
         with open_recording(tmp_path / "rec.h5", sensor=name) as recording:
-            assert np.array_equal(recording[0].words, given.words)
+            assert np.array_equal(recording[0].data, given.data)
 
 
 def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measurement):
@@ -136,7 +136,7 @@ def test_journal_is_sealed_to_the_same(tmp_path, measurement):
         journal.append([ertis.Entry(measurement, 0)])
     sealed = seal(path)
     with open_recording(sealed.recording) as recording:
-        assert np.array_equal(recording[0].words, measurement.words)
+        assert np.array_equal(recording[0].data, measurement.data)
 
 
 def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
@@ -148,7 +148,7 @@ def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
         journal.add_sensor("sensor", settings)
         journal.append([ertis.Entry(ertis.Measurement(words, settings), 0)])
     with open_recording(seal(path).recording) as recording:
-        assert np.array_equal(recording[0].words, words, equal_nan=True)
+        assert np.array_equal(recording[0].data, words, equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_sensor_of_bits_cannot_be_set_up_for_numbers():
 
 def test_faults_are_found_in_numbers():
     settings = PCM.replace(recording=PCM.recording.replace(n_samples=30_000))
-    words = heard(settings).words.astype(np.float64)
+    words = heard(settings).data.astype(np.float64)
     time_s = np.arange(len(words)) / RATE_HZ
     words[:, 1] = 0
     words[:, 2] = -321
@@ -213,22 +213,22 @@ def test_image_is_linear_in_samples_of_any_magnitude(beamformer, exponent):
         accuracy=Accuracy(max_error_db=-20.0),
     )
     given = heard(settings)
-    scaled = dataclasses.replace(given, words=np.ldexp(given.words, exponent))
+    scaled = dataclasses.replace(given, data=np.ldexp(given.data, exponent))
     with Pipeline(settings, device="numpy") as pipeline:
-        wanted, found = (pipeline.process(each).energy.astype(np.float64) for each in (given, scaled))
+        wanted, found = (pipeline.process(each).amplitude.astype(np.float64) for each in (given, scaled))
         (again,) = pipeline.process_batch([scaled])
     np.testing.assert_allclose(np.ldexp(found, -exponent), wanted, rtol=1e-3, atol=1e-6 * wanted.max())
-    np.testing.assert_array_equal(again.energy, found)
+    np.testing.assert_array_equal(again.amplitude, found)
     assert len(ertis.find_peaks(again, top=2)) == 2
 
 
 def test_image_that_float32_cannot_hold_is_refused():
     given = heard(PCM.replace(recording=PCM.recording.replace(encoding="float32")))
-    loudest = np.where(given.words >= 0, np.float32(3.4e38), np.float32(-3.4e38))  # square waves exceed their own peak
+    loudest = np.where(given.data >= 0, np.float32(3.4e38), np.float32(-3.4e38))  # square waves exceed their own peak
     with (
         Pipeline(given.settings, device="numpy") as pipeline,
         pytest.raises(
             DataError, match=r"reach 2\^128, so its image exceeds the largest float32, .* divide the samples"
         ),
     ):
-        pipeline.process(dataclasses.replace(given, words=loudest))
+        pipeline.process(dataclasses.replace(given, data=loudest))

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.stages.cfar import cfar_peaks
+from ertis_numba.analysis.cfar import cfar_peaks
 from ertis_numba.storage import open_energyscapes, write_energyscapes
 from tests.files import image
 
@@ -21,9 +21,9 @@ def run(*arguments, code=0):
 @pytest.fixture
 def images(tmp_path):
     given = image()
-    energy = given.energy.copy()
-    energy[5, 300] = 0.012  # 32 dB below the strongest, 12 dB above the noise
-    return write_energyscapes(tmp_path / "img.h5", [given.replace(energy=energy)])
+    amplitude = given.amplitude.copy()
+    amplitude[5, 300] = 0.012  # 32 dB below the strongest, 12 dB above the noise
+    return write_energyscapes(tmp_path / "img.h5", [given.replace(amplitude=amplitude)])
 
 
 def test_cfar_finds_what_is_weak(images):

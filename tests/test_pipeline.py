@@ -31,7 +31,7 @@ DEVICES = ("cpu", "numpy")
 
 def exact(pipeline: Pipeline, measurement: Measurement):
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    return reference.exact(measurement.words, pipeline.settings, directions, pipeline.range_m)
+    return reference.exact(measurement.data, pipeline.settings, directions, pipeline.range_m)
 
 
 def has_int16(device: str) -> bool:
@@ -49,9 +49,9 @@ def test_image_is_the_exact_one(name, device, precision):
     pipeline = Pipeline(settings, device=device)
     measurement = noise(settings)
     image = pipeline.process(measurement)
-    assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
-    assert np.isfinite(image.energy).all()
-    assert reference.error_db(image.energy, exact(pipeline, measurement)) < settings.accuracy.max_error_db
+    assert image.amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
+    assert np.isfinite(image.amplitude).all()
+    assert reference.error_db(image.amplitude, exact(pipeline, measurement)) < settings.accuracy.max_error_db
 
 
 def test_error_falls_by_6_db_when_the_phases_double():
@@ -59,9 +59,9 @@ def test_error_falls_by_6_db_when_the_phases_double():
     measurement = noise(settings)
     errors_db = []
     for oversampling in (8, 16, 32):
-        plan = {"oversampling": oversampling, "delay_taps": 1, "beam_taps": 0, "stop_band_db": 80.0}
+        plan = {"oversampling": oversampling, "delay_taps": 1, "beam_taps": 0, "stopband_attenuation_db": 80.0}
         pipeline = Pipeline(tuned(settings, precision="float32", max_error_db=0.0, **plan))
-        errors_db.append(reference.error_db(pipeline.process(measurement).energy, exact(pipeline, measurement)))
+        errors_db.append(reference.error_db(pipeline.process(measurement).amplitude, exact(pipeline, measurement)))
     assert np.diff(errors_db) == pytest.approx([-6, -6], abs=1)
 
 
@@ -71,7 +71,7 @@ def test_window_leaves_out_what_the_image_does_not_need():
     measurement = noise(SHORT)
     expected = exact(part, measurement)
     assert len(part.range_m) < len(whole.range_m) / 2
-    assert reference.error_db(part.process(measurement).energy, expected) < SHORT.accuracy.max_error_db
+    assert reference.error_db(part.process(measurement).amplitude, expected) < SHORT.accuracy.max_error_db
 
 
 @pytest.mark.parametrize("method", ["fast", "paper"])
@@ -95,15 +95,15 @@ def test_default_image_has_the_range_axis_of_the_paper():
 def test_one_pipeline_serves_several_threads_at_a_time():
     pipeline = Pipeline(SHORT)
     measurements = [noise(SHORT, seed) for seed in range(16)]
-    alone = [pipeline.process(measurement).energy.copy() for measurement in measurements]
+    alone = [pipeline.process(measurement).amplitude.copy() for measurement in measurements]
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         together = list(pool.map(pipeline.process, measurements))
     for one, other in zip(alone, together, strict=True):
-        assert one.tobytes() == other.energy.tobytes()
+        assert one.tobytes() == other.amplitude.tobytes()
 
 
 def process_noise(seed: int) -> bytes:
-    return Pipeline(SHORT).process(noise(SHORT, seed)).energy.tobytes()
+    return Pipeline(SHORT).process(noise(SHORT, seed)).amplitude.tobytes()
 
 
 def test_spawned_processes_give_the_same_bits():
@@ -121,8 +121,8 @@ def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
     image = pipeline.process(measurement, out=out)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert image.energy is out
-    assert image.energy.tobytes() == first.energy.tobytes()
+    assert image.amplitude is out
+    assert image.amplitude.tobytes() == first.amplitude.tobytes()
     assert peak < out.nbytes / 4  # the spectra, which SciPy returns in a new array
 
 
@@ -169,9 +169,9 @@ def test_batch_is_bit_by_bit_what_one_at_a_time_gives():
     pipeline, measurements = Pipeline(SHORT), [noise(SHORT, seed) for seed in range(5)]
     single = [pipeline.process(measurement) for measurement in measurements]
     batch = pipeline.process_batch(iter(measurements))
-    assert [image.energy.tobytes() for image in batch] == [image.energy.tobytes() for image in single]
+    assert [image.amplitude.tobytes() for image in batch] == [image.amplitude.tobytes() for image in single]
     assert [image.stamp for image in batch] == [measurement.stamp for measurement in measurements]
-    assert len({image.energy.tobytes() for image in batch}) == len(batch)
+    assert len({image.amplitude.tobytes() for image in batch}) == len(batch)
 
 
 def test_batch_with_a_wrong_measurement_processes_none():
@@ -196,7 +196,7 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
     with Pipeline(settings) as pipeline:
         image = pipeline.process(noise(settings))
     pipeline.close()
-    assert (len(pipeline.grid), len(pipeline.range_m)) == image.energy.shape
+    assert (len(pipeline.grid), len(pipeline.range_m)) == image.amplitude.shape
     for refused in (lambda: pipeline.process(noise(settings)), lambda: pipeline.process_batch([noise(settings)])):
         with pytest.raises(ArgumentError, match="the pipeline is closed; make another one"):
             refused()
@@ -240,7 +240,7 @@ def test_refuses_measurements_it_was_not_made_for(settings, match):
 def test_a_named_layout_and_the_same_written_out_are_one():
     written_out = SHORT.replace(array=microphones(SHORT.array).to_array())
     named, other = Pipeline(SHORT), Pipeline(written_out)
-    assert named.process(noise(written_out)).energy.tobytes() == other.process(noise(SHORT)).energy.tobytes()
+    assert named.process(noise(written_out)).amplitude.tobytes() == other.process(noise(SHORT)).amplitude.tobytes()
 
 
 def test_paper_method_runs_on_numpy_and_says_so():
@@ -254,7 +254,7 @@ def test_read_only_words_do_not_compile_anything_anew():
     pipeline = Pipeline(SHORT)
     compiled = kernels.load("cpu").demodulate_words.signatures
     before = len(compiled)
-    words = np.frombuffer(noise(SHORT).words.tobytes(), dtype=np.uint32)
+    words = np.frombuffer(noise(SHORT).data.tobytes(), dtype=np.uint32)
     image = pipeline.process(Measurement(words, SHORT))
-    assert image.energy.tobytes() == pipeline.process(noise(SHORT)).energy.tobytes()
+    assert image.amplitude.tobytes() == pipeline.process(noise(SHORT)).amplitude.tobytes()
     assert len(kernels.load("cpu").demodulate_words.signatures) == before

@@ -12,7 +12,7 @@ from ertis_numba.stages.planner import Planner
 CPU = kernels.load("cpu")
 SETTINGS = Settings(
     processing=Processing(directions="2d:9", range_m=(0.5, 1.0)),
-    accuracy=Accuracy(precision="float32", oversampling=4, delay_taps=4, beam_taps=0, stop_band_db=60.0),
+    accuracy=Accuracy(precision="float32", oversampling=4, delay_taps=4, beam_taps=0, stopband_attenuation_db=60.0),
 )
 
 

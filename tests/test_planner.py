@@ -24,8 +24,8 @@ def is_complete(accuracy):
         accuracy.delay_taps,
         accuracy.beam_taps,
         accuracy.beam_density,
-        accuracy.stop_band_db,
-        accuracy.zones,
+        accuracy.stopband_attenuation_db,
+        accuracy.focal_zones,
     )
 
 
@@ -76,7 +76,7 @@ def test_pipelines_of_all_presets_keep_them(device, budget_db):
     assert is_complete(pipeline.settings.accuracy)
     assert pipeline.settings.accuracy.max_error_db == budget_db
     exact = error_cases.image_of(measurement, SHORT.replace(accuracy=error_cases.BEST))
-    assert reference.error_db(pipeline.process(measurement).energy.astype(float), exact.astype(float)) < budget_db
+    assert reference.error_db(pipeline.process(measurement).amplitude.astype(float), exact.astype(float)) < budget_db
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_pipelines_of_all_presets_keep_them(device, budget_db):
         {"beam_taps": 6},
         {"beam_density": 2.2},
         {"beam_taps": 4, "beam_density": 3.5, "oversampling": 3, "delay_taps": 3},
-        {"stop_band_db": 77.0},
-        {"zones": 3},
+        {"stopband_attenuation_db": 77.0},
+        {"focal_zones": 3},
         {"interpolation": "cubic"},
         {"interpolation": "linear", "oversampling": 12},
     ],
@@ -116,7 +116,7 @@ def test_16_bits_are_kept_or_refused():
         ({}, "single precision"),
         ({"interpolation": "nearest", "oversampling": 12}, "interpolation of delayed samples"),
         ({"beam_taps": 2, "beam_density": 1.5}, "interpolation of beams between nodes"),
-        ({"stop_band_db": 40.0}, "noise that the decimation lets through"),
+        ({"stopband_attenuation_db": 40.0}, "noise that the decimation lets through"),
     ],
 )
 def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part):
@@ -124,10 +124,10 @@ def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part
         ArgumentError, match=rf"max_error_db is -160, and the best that .*by {part}\); give -\d+ or"
     ) as no:
         chosen_for(SMALL, max_error_db=-160.0, **pinned)
-    least_db = float(str(no.value).partition("; give ")[2].split()[0])
-    assert chosen_for(SMALL, max_error_db=least_db, **pinned).error_db <= least_db
+    min_db = float(str(no.value).partition("; give ")[2].split()[0])
+    assert chosen_for(SMALL, max_error_db=min_db, **pinned).error_db <= min_db
     with pytest.raises(ArgumentError, match="and the best that"):
-        chosen_for(SMALL, max_error_db=least_db - 1.01, **pinned)
+        chosen_for(SMALL, max_error_db=min_db - 1.01, **pinned)
 
 
 @pytest.mark.parametrize("name", ["default", "wide band", "solid angle", "line of 8", "64 bits, two words"])

@@ -84,10 +84,10 @@ def test_explains_in_words(recording, tmp_path):
 def test_explains_simple_interpolation(recording, tmp_path):
     wishes = tmp_path / "wishes.toml"
     wishes.write_text('[accuracy]\ninterpolation = "linear"\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
-    told = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
-    assert "single precision" in told
-    assert "made of two of them along a straight line" in told
-    assert "every direction's own beam is summed" in told
+    reported = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
+    assert "single precision" in reported
+    assert "made of two of them along a straight line" in reported
+    assert "every direction's own beam is summed" in reported
 
 
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
@@ -99,8 +99,8 @@ def test_verifies(recording, tmp_path, wavefront):
     with open_energyscapes(output) as images:
         image = images[0]
     vectors = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    wanted = reference.exact(measurement.words, SMALL, vectors, image.range_m, spherical=wavefront == "spherical")
-    assert found["error_db"] == pytest.approx(reference.error_db(image.energy, wanted), abs=0.2)
+    wanted = reference.exact(measurement.data, SMALL, vectors, image.range_m, spherical=wavefront == "spherical")
+    assert found["error_db"] == pytest.approx(reference.error_db(image.amplitude, wanted), abs=0.2)
     assert found["error_db"] <= found["safe_db"] <= -50
     assert -1 <= found["predicted_db"] - found["error_db"] <= 3
     assert found["peaks"]["wanted"] == 10
@@ -109,18 +109,18 @@ def test_verifies(recording, tmp_path, wavefront):
 
 
 def test_verifies_in_words(recording, tmp_path):
-    told = run(recording, "-o", tmp_path / "a.h5", "--verify").stderr.splitlines()
-    told = [line for line in told if not line.startswith("eRTIS-7: the error of plane wavefronts")]
-    assert told[0].startswith("measurement 10 of eRTIS-7: error -")
-    assert told[0].endswith("allowed -35 dB")
-    assert told[1].startswith("  10 of the strongest 10 reflectors found, within ")
+    reported = run(recording, "-o", tmp_path / "a.h5", "--verify").stderr.splitlines()
+    reported = [line for line in reported if not line.startswith("eRTIS-7: the error of plane wavefronts")]
+    assert reported[0].startswith("measurement 10 of eRTIS-7: error -")
+    assert reported[0].endswith("allowed -35 dB")
+    assert reported[1].startswith("  10 of the strongest 10 reflectors found, within ")
 
 
 def test_refuses_a_plan_that_does_not_keep_its_budget(recording, tmp_path):
     output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
     wishes.write_text(
         '[accuracy]\nprecision = "float32"\noversampling = 2\ninterpolation = "nearest"\ndelay_taps = 1\n'
-        "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nzones = 1\n",
+        "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nfocal_zones 1\n",
         "utf-8",
     )
     done = run(recording, "-o", output, "--settings", wishes, code=1)
@@ -155,8 +155,8 @@ def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
         (["--method", "paper", "--max-error", "fine"], "--max-error is for --method fast"),
     ],
 )
-def test_refuses_what_has_no_plan(recording, arguments, told):
-    assert told in run(recording, *arguments, code=2).stderr
+def test_refuses_what_has_no_plan(recording, arguments, reported):
+    assert reported in run(recording, *arguments, code=2).stderr
 
 
 def test_silence_has_no_error():
@@ -190,6 +190,12 @@ def test_words_of_a_plan():
     without_16_bits = dataclasses.replace(kernels.load("cpu"), tile_ranges=0)
     assert len(plans(without_16_bits)) == sum(row[0] == "float32" for row in PLANS)
     plan = Accuracy(
-        precision="int16", oversampling=2, delay_taps=2, beam_taps=4, beam_density=1.75, stop_band_db=60.0, zones=8
+        precision="int16",
+        oversampling=2,
+        delay_taps=2,
+        beam_taps=4,
+        beam_density=1.75,
+        stopband_attenuation_db=60.0,
+        focal_zones=8,
     )
     assert in_words(plan) == "int16, 2 samples of 2 per range, nodes 4 × 1.75, 60 dB, 8 zones"

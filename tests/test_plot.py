@@ -73,8 +73,8 @@ def test_each_kind_is_drawn(files, tmp_path, source, kind, options):
 
 def test_name_of_a_layout(tmp_path):
     with contextlib.chdir(tmp_path):
-        said = run("plot", "uRTIS_v1", "--kind", "array").stderr
-    assert said == "uRTIS_v1.png: array of uRTIS_v1\n"
+        stated = run("plot", "uRTIS_v1", "--kind", "array").stderr
+    assert stated == "uRTIS_v1.png: array of uRTIS_v1\n"
     assert (tmp_path / "uRTIS_v1.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -104,8 +104,8 @@ def test_name_of_a_layout(tmp_path):
 def test_what_is_refused(files, tmp_path, command, code, match):
     name, source, *rest = command.split()
     source = files / source if (files / source).exists() else source
-    said = run(name, source, *rest, "-o", tmp_path / "a.png", code=code).stderr
-    assert match in said
+    stated = run(name, source, *rest, "-o", tmp_path / "a.png", code=code).stderr
+    assert match in stated
     assert not (tmp_path / "a.png").exists()
 
 
@@ -113,8 +113,8 @@ def test_every_option_belongs_to_kinds():
     """Those of the table are there, and help names each kind."""
     names = {option.opts[0].removeprefix("--") for option in plot.params}
     assert set(_ONLY) <= names
-    said = " ".join(run("plot", "--help").stdout.split())
-    assert all(about in said for about in _KINDS.values())
+    stated = " ".join(run("plot", "--help").stdout.split())
+    assert all(about in stated for about in _KINDS.values())
 
 
 def test_commands_of_the_page(tmp_path):

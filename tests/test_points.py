@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
+from ertis_numba.analysis import finder
+from ertis_numba.analysis.cfar import clean
+from ertis_numba.analysis.detect import find_peaks, neighbours_of
+from ertis_numba.analysis.finder import PointFinder
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Point, Scene, Sensor
-from ertis_numba.stages import finder, planner
-from ertis_numba.stages.cfar import clean
-from ertis_numba.stages.detect import find_peaks, neighbours_of
+from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
-from ertis_numba.stages.finder import PointFinder
-from ertis_numba.stages.points import PointExtractor
 from tests.cases import noise as words_of_noise
 from tests.parabolas import interpolated
 from tests.scenes import heard

@@ -17,7 +17,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from ertis_numba.devices import ports
 from ertis_numba.devices.emulator import Emulator, Quirks
 from ertis_numba.devices.ports import Port, find_again, find_ports, resolve
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.devices.survey import survey
 from ertis_numba.errors import SonarError
 
@@ -140,7 +140,7 @@ def four(folder):
         registers = emulators["call"].registers
         registers.n_codes, registers.codes[:3] = 3, (0x120, 0x003, 0x400)
         emulators["mute"].quirks = Quirks(silent=True)
-        stack.enter_context(Sonar.open("used"))
+        stack.enter_context(SonarDriver.open("used"))
         yield emulators
 
 

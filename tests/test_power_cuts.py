@@ -10,7 +10,7 @@ from ertis_bench import powercuts, reliability_tables
 from ertis_bench.network import tables
 from ertis_bench.powercuts import log as logs
 from ertis_bench.powercuts.disk import Disk
-from ertis_bench.powercuts.log import Kind, Record
+from ertis_bench.powercuts.log import DiskOperation, DiskRecord
 
 SEED = 1
 N_STATES = {"capture": 24, "record": 40, "spool": 36}
@@ -24,11 +24,11 @@ def test_power_cuts_lose_and_repeat_nothing(tmp_path, name):
     reason = powercuts.reason_not_to_try(tmp_path)
     if reason:
         pytest.skip(reason)
-    told = []
+    reported = []
     found = powercuts.try_cuts(
-        tmp_path, seed=SEED, count=N_STATES[name], only=(name,), n_measurements=N_MEASUREMENTS, say=told.append
+        tmp_path, seed=SEED, count=N_STATES[name], only=(name,), n_measurements=N_MEASUREMENTS, say=reported.append
     )
-    assert {what: found[what] for what in NOTHING_WRONG} == NOTHING_WRONG, told
+    assert {what: found[what] for what in NOTHING_WRONG} == NOTHING_WRONG, reported
     assert found["states"] == N_STATES[name]
     assert found["acknowledged"] > N_STATES[name]
     assert found["failed_syncs"] > 0
@@ -38,11 +38,11 @@ def test_power_cuts_without_a_compiler_are_reported_as_not_tried(tmp_path, monke
     monkeypatch.setattr(shutil, "which", lambda _: None)
     found = powercuts.try_cuts(tmp_path, seed=SEED, count=1)
     assert found == {"reason": "power cuts need Linux and a C compiler; install gcc"}
-    told = f"not tried: {found['reason']}"
-    assert tables.row("power_cuts", found)[2] == told
+    reported = f"not tried: {found['reason']}"
+    assert tables.row("power_cuts", found)[2] == reported
     report = {"power_cuts": found, "machine": {}, "seed": SEED, "long": False, "only": []}
     monkeypatch.setattr(reliability_tables, "sentence", lambda _: "")
-    assert told in reliability_tables.reliability(report)
+    assert reported in reliability_tables.reliability(report)
 
 
 class Happening:
@@ -53,11 +53,11 @@ class Happening:
 
     def __call__(self, kind, name="", data=b"", *, inode=1, offset=0):
         path = str(self.folder / name) if name else str(self.folder)
-        self.disk.take(Record(kind, 1, inode, offset, path, data))
+        self.disk.take(DiskRecord(kind, 1, inode, offset, path, data))
 
-    def sync(self, name, *, inode=1, ends=Kind.SYNC_END):
+    def sync(self, name, *, inode=1, ends=DiskOperation.SYNC_END):
         is_folder = int(not name)
-        self(Kind.SYNC_BEGIN, name, inode=inode, offset=is_folder)
+        self(DiskOperation.SYNC_BEGIN, name, inode=inode, offset=is_folder)
         self(ends, name, inode=inode, offset=is_folder)
 
     def states(self, target, count=60):
@@ -86,39 +86,39 @@ def after(tmp_path):
 
 
 def test_disk_keeps_what_was_synced(happens, after):
-    happens(Kind.CREATE, "a")
-    happens(Kind.WRITE, "a", b"x" * 5000)
+    happens(DiskOperation.CREATE, "a")
+    happens(DiskOperation.WRITE, "a", b"x" * 5000)
     happens.sync("a")
     happens.sync("")
     assert happens.states(after, 9) == 9 * [{"a": b"x" * 5000}]
 
 
 def test_disk_loses_and_tears_what_was_not_synced(happens, after):
-    happens(Kind.CREATE, "a")
+    happens(DiskOperation.CREATE, "a")
     happens.sync("")
-    happens(Kind.WRITE, "a", b"x" * 4096)
+    happens(DiskOperation.WRITE, "a", b"x" * 4096)
     contents = [state["a"] for state in happens.states(after)]
     assert {b"", b"x" * 4096} < set(contents)
     assert any(content[:512] == bytes(512) and b"x" in content for content in contents)
 
 
 def test_disk_never_has_what_a_failed_sync_was_to_write(happens, after):
-    happens(Kind.CREATE, "a")
-    happens(Kind.WRITE, "a", b"x" * 512)
-    happens.sync("a", ends=Kind.SYNC_FAIL)
+    happens(DiskOperation.CREATE, "a")
+    happens(DiskOperation.WRITE, "a", b"x" * 512)
+    happens.sync("a", ends=DiskOperation.SYNC_FAIL)
     happens.sync("a")
     happens.sync("")
     assert happens.states(after, 9) == 9 * [{"a": b""}]
-    happens(Kind.WRITE, "a", b"y" * 512)
+    happens(DiskOperation.WRITE, "a", b"y" * 512)
     happens.sync("a")
     assert {state["a"] for state in happens.states(after / "0")} == {b"y" * 512}
 
 
 def test_disk_may_lose_names_until_their_folder_is_synced(happens, after):
-    happens(Kind.CREATE, "a")
-    happens(Kind.WRITE, "a", b"x")
+    happens(DiskOperation.CREATE, "a")
+    happens(DiskOperation.WRITE, "a", b"x")
     happens.sync("a")
-    happens(Kind.RENAME, "a", str(happens.folder / "b").encode())
+    happens(DiskOperation.RENAME, "a", str(happens.folder / "b").encode())
     names = [set(state) for state in happens.states(after)]
     assert set() in names
     assert {"a"} in names
@@ -158,5 +158,5 @@ os.unlink(f"{folder}/b")
             "CREATE", "WRITE", "SYNC_BEGIN", "SYNC_END", "TRUNCATE", "SYNC_BEGIN",
         ]  # fmt: skip
         seen.add((sync.kind.name, ack.data))
-        assert (renamed.kind, unlinked.kind) == (Kind.RENAME, Kind.UNLINK)
+        assert (renamed.kind, unlinked.kind) == (DiskOperation.RENAME, DiskOperation.UNLINK)
     assert seen == {("SYNC_FAIL", b"5"), ("SYNC_END", b"synced")}

@@ -61,7 +61,7 @@ def test_file_is_the_same_whatever_the_batch(recording, tmp_path, monkeypatch):
     assert len(set(files)) == 1
     with open_energyscapes(target) as images:
         assert [image.stamp.sequence for image in images] == [10 + index for index in range(COUNT)]
-        assert len({image.energy.tobytes() for image in images}) == COUNT
+        assert len({image.amplitude.tobytes() for image in images}) == COUNT
 
 
 @pytest.mark.parametrize(
@@ -76,10 +76,10 @@ def test_batches_have_the_size_asked_for(recording, tmp_path, sizes, arguments, 
 def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatch):
     run(recording, "-o", tmp_path / "img.h5", *FAST)
     with open_energyscapes(tmp_path / "img.h5") as images:
-        image_bytes = images[0].energy.nbytes
+        image_bytes = images[0].amplitude.nbytes
     for room, wanted in ((2.5, [2, 2, 2, 1]), (0.5, [1] * 7)):
         sizes["sizes"].clear()
-        monkeypatch.setattr(sensor_run, "MOST_BYTES", room * image_bytes)
+        monkeypatch.setattr(sensor_run, "MAX_BYTES", room * image_bytes)
         run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
         assert sizes["sizes"] == [1, *wanted]  # the first image is made once more, to predict its error
 

@@ -13,7 +13,7 @@ from ertis_cli import _process_many
 from ertis_cli.main import cli
 
 from ertis_numba import verification
-from ertis_numba.campaign import Advanced, Begun, Campaign, Ended, Options
+from ertis_numba.campaign import Advanced, Begun, Campaign, CampaignOptions, RecordingEnded
 from tests.campaigns import Here, names_in, write_recordings
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
@@ -115,9 +115,9 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain is for --method fast"),
     ],
 )
-def test_wrong_usage(runs, arguments, code, said):
+def test_wrong_usage(runs, arguments, code, stated):
     done = run(*arguments, code=code)
-    assert said in done.stderr
+    assert stated in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (runs.parent / "out").exists() or names_in(runs.parent / "out") == []
 
@@ -140,7 +140,9 @@ def test_bars_on_a_terminal(runs, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", terminal)
     (runs / "broken.h5").unlink()
     with click.Context(click.Command("process")):
-        _process_many.process_many(["runs"], "out", Options(), workers=None, scheduler=None, quiet=False, as_json=True)
+        _process_many.process_many(
+            ["runs"], "out", CampaignOptions(), workers=None, scheduler=None, quiet=False, as_json=True
+        )
     shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # less colours
     assert re.search(r"recordings ━+ \d/2", shown)
     assert "out/a.energy.h5: 3 measurements" in shown
@@ -160,19 +162,19 @@ def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
         bars.follow(Begun(path, 7))
     bars.follow(Advanced(paths[1], 4))
     assert drawn() == [("recordings", 0, 3), ("a.h5", 0, 7), ("b.h5", 4, 7)]
-    bars.follow(Ended(paths[1], Path("out/b.energy.h5"), "failed"))
+    bars.follow(RecordingEnded(paths[1], Path("out/b.energy.h5"), "failed"))
     assert drawn() == [("recordings", 1, 3), ("a.h5", 0, 7)]
 
 
 def test_a_table_of_very_many_has_those_that_failed(monkeypatch, capsys):
-    monkeypatch.setattr(_process_many, "_MOST_ROWS", 2)
-    monkeypatch.setattr(_process_many, "_MOST_FAILED", 2)
+    monkeypatch.setattr(_process_many, "_MAX_ROWS", 2)
+    monkeypatch.setattr(_process_many, "_MAX_FAILED", 2)
     paths = [Path(f"runs/{number}.h5") for number in range(5)]
     report = vars(_process_many)["_Report"](paths, quiet=False, as_json=False)
     shown = vars(_process_many)["_Hidden"]()
     for path in paths:
         outcome = "there" if path == paths[1] else "failed"
-        report.follow(Ended(path, Path("out"), outcome, error="torn" if outcome == "failed" else ""), shown)
+        report.follow(RecordingEnded(path, Path("out"), outcome, error="torn" if outcome == "failed" else ""), shown)
     with pytest.raises(click.ClickException, match="4 of 5 recordings failed"):
         report.close()
     table = capsys.readouterr().err.partition("outcome")[2]

@@ -7,15 +7,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.messages import Image, Points
-from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.status import Status
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
-from ertis_numba.stages.points import PointExtractor
 from tests.cases import SHORT
 from tests.driven import ANY, MEASUREMENT, Application, driven, hello
 
@@ -33,14 +33,14 @@ def test_images_points_and_raw_words_are_those_of_the_pipeline():
     assert application.kinds() == ["Image", "Points", "Raw"]
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
-    (image, energy), (points, cloud), (raw, words) = application.got
-    assert np.array_equal(np.frombuffer(energy, "<f4").reshape(image.shape), wanted.energy)
-    assert words == MEASUREMENT.words.tobytes()
+    (image, amplitude), (points, cloud), (raw, words) = application.got
+    assert np.array_equal(np.frombuffer(amplitude, "<f4").reshape(image.shape), wanted.amplitude)
+    assert words == MEASUREMENT.data.tobytes()
     extracted = PointExtractor(wanted.settings)(wanted)
     rows = np.frombuffer(cloud, "<f4").reshape(points.n_points, 4)
     assert len(rows) > 0
     assert np.array_equal(rows[:, :3], extracted.position_m)
-    assert np.array_equal(rows[:, 3], extracted.energy)
+    assert np.array_equal(rows[:, 3], extracted.amplitude)
     description, settings, (azimuth, elevation, range_m) = application.descriptions[image.description]
     assert settings == self_contained(wanted.settings)
     assert np.array_equal(np.frombuffer(azimuth), wanted.azimuth_rad)
@@ -63,14 +63,14 @@ def test_options_change_what_a_sensor_says():
         loop.processing.know(hello(), SHORT)
         loop.offer()
         loop.until(lambda: application.read() or application.got)
-    ((image, energy),) = application.got
+    ((image, amplitude),) = application.got
     assert image.shape[0] == 5
     applied = application.descriptions[image.description][1]
     assert (applied.processing.directions, applied.accuracy.max_error_db) == ("2d:5", -30.0)
     with Pipeline(applied, device="cpu") as pipeline:
-        wanted = pipeline.process(MEASUREMENT).energy.astype(np.float16)
+        wanted = pipeline.process(MEASUREMENT).amplitude.astype(np.float16)
     assert image.dtype == "float16"
-    assert np.array_equal(np.frombuffer(energy, "<f2").reshape(image.shape), wanted)
+    assert np.array_equal(np.frombuffer(amplitude, "<f2").reshape(image.shape), wanted)
 
 
 def test_overload_drops_the_oldest_and_counts_each():
@@ -170,13 +170,13 @@ def test_the_end_waits_for_what_is_under_way():
 
 def test_an_address_that_is_taken_is_told_in_a_line():
     with driven() as loop:
-        other = Processing(Options(publish=loop.processing.address, device="numpy"))
+        other = ImageProcessing(ProcessingOptions(publish=loop.processing.address, device="numpy"))
         with pytest.raises(NetworkError, match="cannot be listened at"):
             other.start()
 
 
 def test_start_returns_before_the_publisher_listens_once_it_is_to_stop():
-    processing = Processing(Options(publish=ANY, device="numpy"))
+    processing = ImageProcessing(ProcessingOptions(publish=ANY, device="numpy"))
     try:
         processing.start(lambda: True)
         assert processing.address == ANY
@@ -213,14 +213,14 @@ def test_points_are_made_only_where_somebody_wants_them():
 def test_threads_of_one_measurement_change_its_image_by_nothing():
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
-        assert np.array_equal(pipeline.process(MEASUREMENT, threads=1).energy, wanted.energy)
+        assert np.array_equal(pipeline.process(MEASUREMENT, threads=1).amplitude, wanted.amplitude)
         with pytest.raises(ArgumentError, match="threads is 0"):
             pipeline.process(MEASUREMENT, threads=0)
-        assert np.array_equal(pipeline.process(MEASUREMENT).energy, wanted.energy)
+        assert np.array_equal(pipeline.process(MEASUREMENT).amplitude, wanted.amplitude)
 
 
 def test_missed_error_budget_is_logged_once_per_sensor():
-    silence = np.zeros_like(MEASUREMENT.words)
+    silence = np.zeros_like(MEASUREMENT.data)
     silence[::2] = ~silence[::2]
     with driven(device="cpu") as loop:
         for sensor in ("loud", "quiet"):
@@ -238,11 +238,11 @@ def test_missed_error_budget_is_logged_once_per_sensor():
 @pytest.mark.parametrize("is_paper", [True, False])
 def test_images_of_no_plan_and_silence_are_not_predicted(is_paper):
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper")) if is_paper else SHORT
-    measurement = MEASUREMENT if is_paper else dataclasses.replace(MEASUREMENT, words=np.zeros_like(MEASUREMENT.words))
+    measurement = MEASUREMENT if is_paper else dataclasses.replace(MEASUREMENT, data=np.zeros_like(MEASUREMENT.data))
     with Pipeline(settings, predict=False) as pipeline:
         image = pipeline.process(dataclasses.replace(measurement, settings=settings))
     if not is_paper:
-        image = image.replace(energy=np.zeros_like(image.energy))
+        image = image.replace(amplitude=np.zeros_like(image.amplitude))
     predictions = Predictions("cpu")
     predictions.add("sensor", image, measurement)
     found = predictions.drain()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from ertis_numba.devices.blocks import FOOTER, HEADER
 from ertis_numba.devices.emulator.faults import KINDS
-from ertis_numba.devices.protocol import BlockParser, Receiver
-from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters, told
+from ertis_numba.devices.protocol import BlockParser, BlockReceiver
+from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters, reported
 
 WORD = struct.Struct("<I")
 TRICKY = st.sampled_from([HEADER, FOOTER, 0, HEADER >> 8, HEADER << 8 & 0xFFFF_FFFF, HEADER >> 16])
@@ -38,7 +38,7 @@ def fed(data, cuts=()):
 def test_it_does_not_matter_how_a_stream_is_cut(data, cuts):
     whole, found = fed(data)
     pieces, found_again = fed(data, cuts)
-    assert told(found_again) == told(found)
+    assert reported(found_again) == reported(found)
     for name in ("rejected", "rejected_blocks", "pending"):
         assert getattr(pieces, name) == getattr(whole, name)
 
@@ -48,7 +48,7 @@ def test_what_was_sent_without_faults_is_received(sent, first):
     """False headers and footers in the words cost nothing as long as each block directly follows another."""
     data = [block_of(first + 1000 * index, words) for index, words in enumerate(sent)]
     parser, found = fed(b"".join(data))
-    assert told(found) == data
+    assert reported(found) == data
     assert not parser.rejected
 
 
@@ -58,7 +58,7 @@ def test_no_damage_costs_a_block_but_its_own(place, n_lost, added, seed):
     before, victim, after, last = (block_of(10 * seed + index) for index in range(4))
     damaged = victim[:place] + added + victim[place + n_lost :]
     _, found = fed(before + damaged + after + last)
-    alone = told(found)
+    alone = reported(found)
     assert alone[:1] == [before]
     assert alone[-2:] == [after, last]
     assert all(other in damaged for other in alone[1:-2])
@@ -70,7 +70,7 @@ def test_one_after_another_is_found_behind_any_junk(data):
     junk = data.draw(st.lists(JUNK | st.just(WORD.pack(HEADER)), max_size=4).map(b"".join))
     sent = [block_of(index) for index in range(3)]
     _, found = fed(junk + b"".join(sent))
-    assert told(found)[-3:] == sent
+    assert reported(found)[-3:] == sent
 
 
 def test_the_header_of_a_junk_block_within_words_costs_nothing():
@@ -78,7 +78,7 @@ def test_the_header_of_a_junk_block_within_words_costs_nothing():
     damaged = block_of(1)[:-1]
     sent = [block_of(index, [HEADER, 7, HEADER, FOOTER, HEADER]) for index in (2, 3)]
     parser, found = fed(damaged + b"".join(sent))
-    assert told(found) == sent
+    assert reported(found) == sent
     assert parser.rejected == {"footer": N_BYTES - 1}
     assert parser.rejected_blocks == {"footer": 1}
 
@@ -109,7 +109,7 @@ def test_after_a_deadline_the_rest_is_searched_for_the_block_that_has_begun_sinc
     parser.feed(block_of(1)[:14] + block_of(2)[:10], at(0))
     parser.expire()
     assert parser.missing == N_BYTES - 10
-    assert told(parser.feed(block_of(2)[10:], at(1))) == [block_of(2)]
+    assert reported(parser.feed(block_of(2)[10:], at(1))) == [block_of(2)]
     assert parser.rejected == {"cut short": 14}
 
 
@@ -145,16 +145,16 @@ def test_a_block_that_was_searched_for_arrives_with_its_first_byte_too():
 def test_words_have_memory_of_their_own():
     parser = BlockParser(N_SAMPLES)
     [block] = parser.feed(block_of(1), at(0))
-    assert block.words.flags.owndata
-    assert not block.words.flags.writeable
-    assert block.words.dtype == np.uint32
+    assert block.data.flags.owndata
+    assert not block.data.flags.writeable
+    assert block.data.dtype == np.uint32
     parser.feed(block_of(2), at(0))
-    assert told([block]) == [block_of(1)]
+    assert reported([block]) == [block_of(1)]
 
 
 @pytest.mark.alone
 def test_a_block_takes_two_milliseconds_at_most():
-    receiver = Receiver(163_840, expected=0, shortest_s=0.04)
+    receiver = BlockReceiver(163_840, expected=0, shortest_s=0.04)
     times_s = []
     for counter in range(20):
         data = block_of(counter, n_samples=163_840)

@@ -9,7 +9,7 @@ import pytest
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
-from ertis_numba.network.processing.subscribers import Item, Subscriber, Subscribers
+from ertis_numba.network.processing.subscribers import ConnectedSubscriber, QueuedProduct, Subscribers
 from ertis_numba.network.status import Status
 from tests.cases import SHORT
 from tests.driven import Application, driven, hello
@@ -43,9 +43,9 @@ def test_without_credit_the_latest_waits_and_what_it_replaces_is_counted():
         application.consumed = 1
         application.subscribe("energyscape", credit=2)
         loop.until(lambda: application.read() or len(application.got) == 3)
-        told = loop.processing.status
-        loop.until(lambda: told().subscribers and told().subscribers[0].sent == 3)
-        (status,) = told().subscribers
+        reported = loop.processing.status
+        loop.until(lambda: reported().subscribers and reported().subscribers[0].sent == 3)
+        (status,) = reported().subscribers
     images = [image for image, _ in application.got]
     assert [(image.sequence, image.number, image.dropped) for image in images] == [(0, 0, 0), (1, 1, 0), (6, 6, 4)]
     assert (status.sent, status.dropped, status.products) == (3, 4, ("energyscape",))
@@ -216,8 +216,8 @@ class TestKeys:
             loop.processing.publish_status(status)
             application.send(AskStatus())
             loop.until(lambda: application.read() or len(application.got) == 3)
-            (told,) = loop.processing.status().subscribers
-            assert told.name == "viewer"
+            (reported,) = loop.processing.status().subscribers
+            assert reported.name == "viewer"
             AllowList.load(tmp_path / "allow.toml").remove("viewer").save(tmp_path / "allow.toml")
             loop.until(lambda: not loop.processing.status().subscribers)
             publish(loop, 1)
@@ -277,11 +277,11 @@ class TestSubscribers:
 
 class TestSubscriber:
     def item(self, n_bytes=100):
-        return Item("raw", "front", None, (bytes(n_bytes),))
+        return QueuedProduct("raw", "front", None, (bytes(n_bytes),))
 
     def made(self, **values):
         wants = Subscribe(products=("raw",), **values)
-        return Subscriber((), "app", wants, before=wants.consumed)
+        return ConnectedSubscriber((), "app", wants, before=wants.consumed)
 
     def test_credit_is_what_it_says_less_what_is_under_way(self):
         one = self.made(credit=1)

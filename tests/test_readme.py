@@ -49,9 +49,11 @@ def test_python_lines(place):
 
 
 def test_every_folder_is_told_of():
-    _, _, told = README.partition("## Where things are")
+    _, _, reported = README.partition("## Where things are")
     folders = {path.parent.name for path in (ROOT / "ertis_numba").glob("*/__init__.py")}
-    assert {name for name in folders if f"`{name}/`" not in told and f"`ertis_numba/{name}/`" not in told} == set()
+    assert {
+        name for name in folders if f"`{name}/`" not in reported and f"`ertis_numba/{name}/`" not in reported
+    } == set()
 
 
 def test_commands(place):
@@ -91,18 +93,20 @@ def test_page_on_devices(place):
 def test_example(place):
     """The nearest of the strong reflectors of the recording that is emulated."""
     with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
-        told = run(place, sys.executable, "-W", "error", str(ROOT / "examples" / "1_nearest_reflector.py"), "sensor")
-    assert told.stdout.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
+        reported = run(
+            place, sys.executable, "-W", "error", str(ROOT / "examples" / "1_nearest_reflector.py"), "sensor"
+        )
+    assert reported.stdout.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
 
 def test_page_on_simulation(place):
     (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
-    told = run(place, sys.executable, "-W", "error", "-c", code).stdout
-    assert "absorption True" in told
-    assert told.endswith("() ()\n")  # nothing missed, nothing false
+    reported = run(place, sys.executable, "-W", "error", "-c", code).stdout
+    assert "absorption True" in reported
+    assert reported.endswith("() ()\n")  # nothing missed, nothing false
     for command in commands_in(SIMULATION):
-        told = run_here(place, command)
-    assert "points[0]" in told
+        reported = run_here(place, command)
+    assert "points[0]" in reported
 
 
 def test_gallery_begins_as_the_readme():

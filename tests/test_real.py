@@ -51,9 +51,11 @@ def exact_energy(azimuth_rad, elevation_rad, range_m):
 def exact_image(processed):
     """The exact image of the right layout, on the axes of the processed one."""
     image = processed[2]
-    energy = exact_energy(*(tuple(axis.tolist()) for axis in (image.azimuth_rad, image.elevation_rad, image.range_m)))
+    amplitude = exact_energy(
+        *(tuple(axis.tolist()) for axis in (image.azimuth_rad, image.elevation_rad, image.range_m))
+    )
     settings = ertis.Settings.from_preset("default_25_50")
-    return image.replace(energy=energy.astype(np.float32), settings=settings)
+    return image.replace(amplitude=amplitude.astype(np.float32), settings=settings)
 
 
 def agreeing(found, wanted):
@@ -83,8 +85,8 @@ def test_ten_strongest_reflectors_are_where_the_exact_image_has_them(processed, 
 
 def test_image_is_the_exact_one(processed, exact_image):
     layout, _, image = processed
-    error_db = reference.error_db(image.energy, exact_image.energy.astype(float))
-    brightest_db = 20 * np.log10(image.energy.max() / exact_image.energy.max())
+    error_db = reference.error_db(image.amplitude, exact_image.amplitude.astype(float))
+    brightest_db = 20 * np.log10(image.amplitude.max() / exact_image.amplitude.max())
     if layout == "eRTIS_v3D1":
         assert error_db < -60
         assert abs(brightest_db) < 0.1

@@ -12,7 +12,7 @@ import time
 
 import pytest
 from click.testing import CliRunner
-from ertis_cli._lines import Lines
+from ertis_cli._lines import JsonLines
 from ertis_cli.main import cli
 
 from ertis_numba.journal import SUFFIX
@@ -64,24 +64,24 @@ def test_it_listens_soon(tmp_path):
 
 def test_nothing_that_was_acked_is_lost_or_there_twice_when_it_is_killed(tmp_path):
     given = entries(60, first=0)
-    settled = -1
+    acked_through = -1
     for kill in range(5):
         with Recording(tmp_path, "--rotate-size", "1") as central, Node(central.address) as node:
-            known = node.hello(first=settled + 1).settled
-            assert known >= settled
-            settled = known
-            node.measure(*given[settled + 1 : 12 * (kill + 1)])
-            settled = node.hear_settled(12 * kill + 5).settled
+            known = node.hello(first=acked_through + 1).acked_through
+            assert known >= acked_through
+            acked_through = known
+            node.measure(*given[acked_through + 1 : 12 * (kill + 1)])
+            acked_through = node.hear_settled(12 * kill + 5).acked_through
             central.process.send_signal(signal.SIGKILL)
     with Recording(tmp_path) as central, Node(central.address) as node:
-        assert node.hello(first=settled + 1).settled >= settled
-        node.measure(*given[settled + 1 :])
+        assert node.hello(first=acked_through + 1).acked_through >= acked_through
+        node.measure(*given[acked_through + 1 :])
         node.send(Ping())
         node.hear_settled(59)
         central.process.send_signal(signal.SIGINT)
-        told = central.event("recorded")
+        reported = central.event("recorded")
         assert central.process.wait() == 0
-    assert told["unsealed"] == 0
+    assert reported["unsealed"] == 0
     assert not list(tmp_path.glob(f"*{SUFFIX}"))
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
@@ -92,12 +92,14 @@ def test_a_signal_ends_it_well(number, tmp_path):
     with Recording(tmp_path, "--every", "--name", "tour") as central, Node(central.address) as node:
         node.hello(first=0)
         node.measure(*given)
-        told = [central.event("stored") for _ in given]
+        reported = [central.event("stored") for _ in given]
         central.process.send_signal(number)
         sealed = central.event("sealed")
         counts = central.event("recorded")
         assert central.process.wait() == 0
-    assert [(each["sensor"], each["epoch"], each["sequence"]) for each in told] == [each[0] for each in wanted(given)]
+    assert [(each["sensor"], each["session_id"], each["sequence"]) for each in reported] == [
+        each[0] for each in wanted(given)
+    ]
     assert sealed["measurements"] == counts["stored"] == 3
     assert counts["recordings"] == [str(path) for path in tmp_path.glob("tour_*.h5")]
     assert stored(tmp_path)[0] == wanted(given)
@@ -158,11 +160,11 @@ def test_where_it_listens_is_told_as_it_is(tmp_path):
 def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):
     settings = TINY.replace(recording=TINY.recording.replace(n_samples=8192))
     given = entries(1, first=0, settings=settings)
-    n_bytes = given[0].measurement.words.nbytes
-    for most_bytes in (n_bytes - 1, n_bytes):
-        with Recording(tmp_path, "--most-bytes", str(most_bytes)) as central, Node(central.address) as node:
+    n_bytes = given[0].measurement.data.nbytes
+    for max_bytes in (n_bytes - 1, n_bytes):
+        with Recording(tmp_path, "--most-bytes", str(max_bytes)) as central, Node(central.address) as node:
             answer = node.hello(first=0, settings=settings)
-            if most_bytes < n_bytes:
+            if max_bytes < n_bytes:
                 assert "let it take more (--most-bytes)" in answer.reason
                 continue
             node.measure(*given)
@@ -175,10 +177,14 @@ def test_it_reports_what_serve_does(tmp_path):
         node.measure(*entries(3, first=2))
         node.hear_settled(4)
         central.process.send_signal(signal.SIGINT)
-        told = central.event("recorded")
-    assert set(told) == REPORTED
-    assert (told["received"], told["stored"], told["missing"]) == (3, 3, {"never reached the central node": 2})
-    assert told["missing"] == told["sensors"]["left"]["missing"]
+        reported = central.event("recorded")
+    assert set(reported) == REPORTED
+    assert (reported["received"], reported["stored"], reported["missing"]) == (
+        3,
+        3,
+        {"never reached the central node": 2},
+    )
+    assert reported["missing"] == reported["sensors"]["left"]["missing"]
 
 
 def test_metrics_are_served_while_it_runs(tmp_path):
@@ -191,7 +197,7 @@ def test_metrics_are_served_while_it_runs(tmp_path):
 def test_who_does_not_read_its_events_holds_nothing_up():
     reader, writer = os.pipe()
     with os.fdopen(writer, "w", encoding="utf-8") as stream:
-        lines = Lines(stream, most=1000)
+        lines = JsonLines(stream, largest=1000)
         begun_s = time.monotonic()
         for number in range(100_000):
             lines.write(f"line {number}\n")

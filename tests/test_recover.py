@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError, InUseError, SonarError
+from ertis_numba.errors import DataError, JournalInUseError, SonarError
 from ertis_numba.journal import seal_apart, sealer
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
@@ -27,9 +27,9 @@ def test_apart(tmp_path):
     with create(tmp_path, [*entries(4), *entries(1, sensor="right")]) as journal:
         path = journal.path
     shutil.copy(path, tmp_path / "kept")
-    told = []
-    sealed = seal_apart(path, progress=lambda *numbers: told.append(numbers))
-    assert told == [(number + 1, 5) for number in range(5)]
+    reported = []
+    sealed = seal_apart(path, progress=lambda *numbers: reported.append(numbers))
+    assert reported == [(number + 1, 5) for number in range(5)]
     assert not path.exists()
     shutil.copy(tmp_path / "kept", path)
     assert sealed == seal(path)
@@ -43,7 +43,10 @@ def test_apart_nothing_was_measured(tmp_path):
 
 
 def test_apart_refused(tmp_path):
-    with create(tmp_path) as journal, pytest.raises(InUseError, match=r"rec.h5.journal is in use by another process"):
+    with (
+        create(tmp_path) as journal,
+        pytest.raises(JournalInUseError, match=r"rec.h5.journal is in use by another process"),
+    ):
         seal_apart(journal.path)
     (tmp_path / "rec.h5").write_text("mine")
     with pytest.raises(DataError, match="exists and holds something else"):
@@ -87,9 +90,9 @@ def test_apart_and_lost(tmp_path, instead, line, reason):
 def test_apart_and_interrupted(tmp_path, instead, late):
     path = crashed(tmp_path)
     steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
-    told, late_told = (json.dumps(json.dumps(step)) for step in steps)
+    reported, late_told = (json.dumps(json.dumps(step)) for step in steps)
     slow = tmp_path / "slow.py"
-    slow.write_text(f"import time; print({told}, flush=True); time.sleep(5); print({late_told})")
+    slow.write_text(f"import time; print({reported}, flush=True); time.sleep(5); print({late_told})")
     instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
 
     def interrupt(*_):
@@ -132,8 +135,8 @@ def test_recover_what_cannot_be_sealed(tmp_path):
     assert done.stderr == (
         f"ertis: error: {tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force\n"
     )
-    told = json.loads(done.stdout)["journals"]
-    assert [(report.get("measurements"), "error" in report) for report in told] == [(3, False), (None, True)]
+    reported = json.loads(done.stdout)["journals"]
+    assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
     assert run("recover", path, "--force", "--quiet").stderr == ""
     assert verify(tmp_path / "rec.h5")[0].whole
 
@@ -142,8 +145,8 @@ def test_recover_damaged_measurements(tmp_path):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
-    told = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
-    assert told in run("recover", path, code=3).stderr
+    reported = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
+    assert reported in run("recover", path, code=3).stderr
 
 
 def test_recover_nothing(tmp_path):
@@ -191,16 +194,16 @@ def test_a_capture_tells_of_damage(tmp_path, capsys):
 def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
-    told = (
+    reported = (
         f"{tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force; "
         f"the measurements are safe in {path}, seal them by 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)
-    assert capsys.readouterr().err == f"ertis: error: {told}\n"
+    assert capsys.readouterr().err == f"ertis: error: {reported}\n"
     with pytest.raises(DataError) as error:
         _seal(path, None, overwrite=False)
-    assert str(error.value) == told
+    assert str(error.value) == reported
     assert capsys.readouterr().err == ""
     _seal(path, None, overwrite=True)
     assert verify(tmp_path / "rec.h5")[0].whole

@@ -57,7 +57,7 @@ def test_near_point_needs_spherical_delays():
 def test_spherical_delays_become_plane_ones_when_the_array_is_small():
     tiny = SHORT.replace(array=Array(layout="pair", positions_m=((0.0, 1e-4, 0.0), (0.0, -1e-4, 0.0)), word_bits=8))
     plane, spherical = (
-        reference.exact(noise(tiny).words, tiny, directions_of([-40.0, 40.0]), [1.5], spherical=spherical)
+        reference.exact(noise(tiny).data, tiny, directions_of([-40.0, 40.0]), [1.5], spherical=spherical)
         for spherical in (False, True)
     )
     assert reference.error_db(plane, spherical) < -80
@@ -66,10 +66,10 @@ def test_spherical_delays_become_plane_ones_when_the_array_is_small():
 def test_32_microphones_gain_15_db_on_white_noise():
     settings = Settings(recording=Recording(n_samples=163_840))
     range_m = np.linspace(0.2, 5.5, 1500)
-    power = np.mean(reference.exact(noise(settings).words, settings, directions_of(0.0), range_m) ** 2)
+    power = np.mean(reference.exact(noise(settings).data, settings, directions_of(0.0), range_m) ** 2)
     single = Settings(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8))
     power_1 = np.mean(
-        [reference.exact(noise(single, seed).words, single, directions_of(0.0), range_m) ** 2 for seed in range(4)]
+        [reference.exact(noise(single, seed).data, single, directions_of(0.0), range_m) ** 2 for seed in range(4)]
     )
     assert 10 * np.log10(power_1 / power) == pytest.approx(15.05, abs=0.3)
 
@@ -97,8 +97,8 @@ def test_beam_of_the_image_has_the_width_of_the_array():
     words = received(SHORT, 2 * 0.7 - positions_m @ directions_of(0.0)[0])
     azimuth_deg = np.linspace(-6, 6, 121)
     image = reference.exact(words, SHORT, directions_of(azimuth_deg), 0.7 + np.arange(-60, 61) * 5e-4)
-    energy = np.sum(image**2, axis=1)  # over ranges, so over the band
-    wide = azimuth_deg[energy > energy.max() / 2]
+    amplitude = np.sum(image**2, axis=1)  # over ranges, so over the band
+    wide = azimuth_deg[amplitude > amplitude.max() / 2]
     # A hyperbolic sweep spends 1 / f² of its time at f, and the matched filter weighs by that once more.
     frequency_hz = np.linspace(25e3, 50e3, 101)
     expected_deg = beam_width_deg(frequency_hz, weights=frequency_hz**-4.0)

@@ -21,30 +21,30 @@ PLACES = [
 LOW_RATE_HZ = 450_000
 
 
-def rooms_of(mouth_m, ear_m, most):
+def rooms_of(mouth_m, receiver_m, largest):
     """The same room twice, with its corner at the origin; the ear is silent, the mouth emits."""
     room = pyroomacoustics.ShoeBox(
-        SIZE_M, fs=LOW_RATE_HZ, max_order=most, materials=pyroomacoustics.Material(1 - AMPLITUDE**2)
+        SIZE_M, fs=LOW_RATE_HZ, max_order=largest, materials=pyroomacoustics.Material(1 - AMPLITUDE**2)
     )
     room.set_sound_speed(SPEED_M_S)
     room.add_source(mouth_m)
-    room.add_microphone(ear_m)
+    room.add_microphone(receiver_m)
     room.image_source_model()
     box = Box(position_m=tuple(side_m / 2 for side_m in SIZE_M), size_m=SIZE_M, reflection_db=20 * np.log10(AMPLITUDE))
     sensors = (
-        EAR.replace(position_m=ear_m, emitter=Emitter(silent=True)),
+        EAR.replace(position_m=receiver_m, emitter=Emitter(silent=True)),
         EAR.replace(name="mouth", position_m=mouth_m),
     )
-    return room, Scene(sensors=sensors, boxes=(box,), max_reflections=most)
+    return room, Scene(sensors=sensors, boxes=(box,), max_reflections=largest)
 
 
 @pytest.mark.parametrize(("mouth_m", "ear_m"), PLACES)
 @pytest.mark.parametrize(("most", "count"), [(0, 1), (1, 7), (2, 25), (3, 63)])
-def test_image_sources_agree(mouth_m, ear_m, most, count):
-    room, scene = rooms_of(mouth_m, ear_m, most)
+def test_image_sources_agree(mouth_m, receiver_m, largest, count):
+    room, scene = rooms_of(mouth_m, receiver_m, largest)
     delay_s, amplitude = sorted_ways(scene, "walls", "occlusion", "spreading", "cross_emission")
     [source] = room.sources
-    way_m = np.linalg.norm(source.images - np.array(ear_m)[:, None], axis=0)
+    way_m = np.linalg.norm(source.images - np.array(receiver_m)[:, None], axis=0)
     level = source.damping[0] / way_m
     order = np.argsort(way_m)
     assert len(delay_s) == count == len(way_m)
@@ -54,9 +54,9 @@ def test_image_sources_agree(mouth_m, ear_m, most, count):
 
 
 @pytest.mark.parametrize(("mouth_m", "ear_m"), PLACES[:2])
-def test_rendered_signals_agree(mouth_m, ear_m):
+def test_rendered_signals_agree(mouth_m, receiver_m):
     """The call through the other simulator's impulse response, sampled at 450 kHz."""
-    room, scene = rooms_of(mouth_m, ear_m, 2)
+    room, scene = rooms_of(mouth_m, receiver_m, 2)
     sensors = tuple(sensor.replace(recording=Recording(n_samples=140_000)) for sensor in scene.sensors)
     [signal] = heard(scene.replace(sensors=sensors), "walls", "occlusion", "spreading", "cross_emission")
     room.compute_rir()

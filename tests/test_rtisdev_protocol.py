@@ -143,17 +143,17 @@ class TestBothWays:
         assert driven[way].report["firmware"] == "v1.0.0"
 
     def test_what_it_configures_arrives(self, driven, way):
-        told = driven[way].registers
-        assert (told.n_bytes, told.clock, told.emissions) == (4 * N_SAMPLES, 0, 3)
-        assert (told.dac_rate_hz, told.n_codes) == (480_000, 601)
-        assert (told.armed, told.pin, told.active, told.amplifier) == (1, 2, 1, 0)
+        reported = driven[way].registers
+        assert (reported.n_bytes, reported.clock, reported.emissions) == (4 * N_SAMPLES, 0, 3)
+        assert (reported.dac_rate_hz, reported.n_codes) == (480_000, 601)
+        assert (reported.armed, reported.pin, reported.active, reported.amplifier) == (1, 2, 1, 0)
         assert driven[way].refused == 0
 
     def test_its_call_is_the_one_that_settings_describe(self, driven, way):
-        told = driven[way].registers
+        reported = driven[way].registers
         call = Call(start_frequency_hz=80e3, stop_frequency_hz=20e3, duration_s=1.25e-3, sample_rate_hz=480e3)
-        assert told.hash == driven[way].report["hash"] == call_hash(told.codes[:601])
-        error = np.abs(told.codes[:601].astype(int) - call_codes(call))
+        assert reported.hash == driven[way].report["hash"] == call_hash(reported.codes[:601])
+        error = np.abs(reported.codes[:601].astype(int) - call_codes(call))
         assert error[62:-62].max() <= 1
         assert error.max() <= 0.02 * 2047  # its ramps are those of a Hann window of another length
 

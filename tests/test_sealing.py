@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from ertis_bench import kills
 
-from ertis_numba import atomic
-from ertis_numba.errors import ArgumentError, DataError, InUseError
+from ertis_numba import atomic_files
+from ertis_numba.errors import ArgumentError, DataError, JournalInUseError
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, Numbers
-from ertis_numba.storage._sealing_process import IN_USE, NOTHING, main
 from ertis_numba.storage.sealing import seal
+from ertis_numba.storage.sealing_process import IN_USE, NOTHING, main
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python
 from tests.test_journal_damage import spoil
 
@@ -38,10 +38,10 @@ def two_sensors(folder):
         journal.add_sensor("right", TINY)
         for entry in given[1:]:
             journal.append([entry])
-        journal.note_gap("left", 12, 12, "footer", epoch=EPOCH)
-        journal.note_gap("left", 7, 9, "the sensor was unplugged", epoch=EPOCH)
-        journal.note_gap("right", 2, 5, "it never arrived", epoch=EPOCH)
-        journal.note_gap("absent", 0, 5, "it never arrived", epoch=EPOCH)
+        journal.note_gap("left", 12, 12, "footer", session_id=EPOCH)
+        journal.note_gap("left", 7, 9, "the sensor was unplugged", session_id=EPOCH)
+        journal.note_gap("right", 2, 5, "it never arrived", session_id=EPOCH)
+        journal.note_gap("absent", 0, 5, "it never arrived", session_id=EPOCH)
     return journal.path, [entry.measurement for entry in given]
 
 
@@ -69,7 +69,7 @@ def test_a_journal_becomes_a_recording(tmp_path):
         back += list(right)
     for came, wanted in zip(back, [given[i] for i in (0, 2, 4, 1, 3)], strict=True):
         assert (came.stamp, came.settings.air) == (wanted.stamp, wanted.settings.air)
-        assert np.array_equal(came.words, wanted.words)
+        assert np.array_equal(came.data, wanted.data)
 
 
 def test_it_is_the_recording_that_would_have_been_written_at_once(tmp_path):
@@ -119,7 +119,7 @@ OTHERS = {
     "one more": lambda path, given: write_recording(path, [*given, entries(9)[8].measurement]),
     "another sensor": lambda path, given: write_recording(path, [*given, entries(1, sensor="right")[0].measurement]),
     "other words": lambda path, given: write_recording(
-        path, [*given[:-1], replace(given[-1], words=given[-1].words ^ 1)]
+        path, [*given[:-1], replace(given[-1], data=given[-1].data ^ 1)]
     ),
     "another time": lambda path, given: write_recording(
         path, [*given[:-1], replace(given[-1], stamp=replace(given[-1].stamp, timestamp_ns=7))]
@@ -162,9 +162,9 @@ def test_a_damaged_measurement_is_a_gap_and_the_journal_is_kept(tmp_path, capsys
     spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE id = 2")
     shutil.copy(path, tmp_path / "kept")
     assert main([str(path)]) == 0
-    told = capsys.readouterr()
-    assert told.out == f"{tmp_path / 'rec.h5'}\n"
-    assert told.err == f"1 measurement is damaged; the journal is kept as {path}.damaged\n"
+    reported = capsys.readouterr()
+    assert reported.out == f"{tmp_path / 'rec.h5'}\n"
+    assert reported.err == f"1 measurement is damaged; the journal is kept as {path}.damaged\n"
     with open_recording(tmp_path / "rec.h5") as recording:
         assert [stamp.sequence for stamp in recording.stamps()] == [10, 12]
         assert [(gap.first, gap.last, gap.reason) for gap in recording.gaps] == [(11, 11, "damaged in the journal")]
@@ -192,7 +192,7 @@ def test_all_measurements_are_damaged(tmp_path):
 
 def test_a_journal_in_use(tmp_path, capsys):
     with create(tmp_path) as journal:
-        with pytest.raises(InUseError, match="is in use by another process"):
+        with pytest.raises(JournalInUseError, match="is in use by another process"):
             seal(journal.path)
         assert main([str(journal.path), "--json"]) == IN_USE
         assert json.loads(capsys.readouterr().out)["in_use"] is True
@@ -202,7 +202,7 @@ def test_a_journal_in_use(tmp_path, capsys):
 def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
     path = crashed(tmp_path)
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
+    monkeypatch.setattr(atomic_files.shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
     assert main([str(path)]) == 1
     wanted = "has 5.0 MB free, wanted 8.0 MB for what is next, 8 MB of it to spare; free some space"
     assert wanted in capsys.readouterr().err
@@ -260,7 +260,7 @@ def test_a_process_of_its_own(tmp_path):
 
 def test_it_goes_on_when_nobody_listens_any_more(tmp_path):
     path = crashed(tmp_path)
-    command = [sys.executable, "-m", "ertis_numba.storage._sealing_process", "--json", str(path)]
+    command = [sys.executable, "-m", "ertis_numba.storage.sealing_process", "--json", str(path)]
     with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         process.stderr.close()
@@ -311,9 +311,9 @@ def test_gaps_are_those_of_a_naive_count():
         for number in present:
             numbers.add(number)
         missing = numbers.missing(noted)
-        told = {number: reason for first, last, reason in missing for number in range(first, last + 1)}
-        assert told == naive_gaps(set(present), noted)
-        assert sum(last - first + 1 for first, last, _ in missing) == len(told)
+        reported = {number: reason for first, last, reason in missing for number in range(first, last + 1)}
+        assert reported == naive_gaps(set(present), noted)
+        assert sum(last - first + 1 for first, last, _ in missing) == len(reported)
         for before, after in itertools.pairwise(missing):
             assert before[1] < after[0]
             assert before[1] + 1 < after[0] or before[2] != after[2]  # joined where they can be

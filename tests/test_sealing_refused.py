@@ -8,11 +8,11 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.journal import Journal, seal_apart
-from ertis_numba.network.central_node._items import Failed, SealedOne
+from ertis_numba.network.central_node._received_items import SealedOne, SealingFailed
 from ertis_numba.settings import Call, call
 from ertis_numba.storage import open_recording, sealing, sensor_names
-from ertis_numba.storage._sealing_process import FAILED, main
 from ertis_numba.storage.sealing import seal
+from ertis_numba.storage.sealing_process import FAILED, main
 from ertis_numba.storage.verify import verify
 from tests.journals import TINY, create, entries
 from tests.test_archive import Opened
@@ -29,7 +29,7 @@ def left(tmp_path, monkeypatch):
         with create(tmp_path, entries(3)) as journal:
             journal.add_sensor("bad", long)
             journal.append(entries(2, sensor="bad", settings=long))
-            journal.note_gap("bad", 20, 21, "lost", epoch=5)
+            journal.note_gap("bad", 20, 21, "lost", session_id=5)
     return journal.path
 
 
@@ -111,4 +111,4 @@ def test_an_archive_seals_the_other_sensors_and_counts_what_is_set_aside(tmp_pat
         status = opened.archive.status()
     assert "no recording can hold sensor bad" in event.sealed.remark
     assert (status.sealed, status.set_aside, status.sealing_failed) == (1, 1, 0)
-    assert not [event for event in opened.events if isinstance(event, Failed)]
+    assert not [event for event in opened.events if isinstance(event, SealingFailed)]

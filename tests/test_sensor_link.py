@@ -52,7 +52,7 @@ def test_an_ack_of_what_was_not_sent_is_none():
     given = entries(3)
     with StandIn() as central, Node(central.address) as node:
         central.refusal = lambda message: (
-            messages.Ack(sensor="left", epoch=EPOCH, settled=10**9, status="stored")
+            messages.Ack(sensor="left", session_id=EPOCH, acked_through=10**9, status="stored")
             if isinstance(message, messages.Data) and not lied.is_set()
             else None
         )
@@ -96,7 +96,7 @@ def test_who_is_refused_is_told_once_and_tries_again_while_others_pass():
         def refuse(message):
             if isinstance(message, messages.Hello) and message.sensor == "left" and asked.qsize() < 3:
                 asked.put(message)
-                return messages.Refused(code="serial", reason="left is not yours", sensor="left", epoch=EPOCH)
+                return messages.Refused(code="serial", reason="left is not yours", sensor="left", session_id=EPOCH)
             return None
 
         central.refusal = refuse
@@ -116,7 +116,7 @@ def test_a_reason_that_holds_another_number_each_time_is_told_once():
         if isinstance(message, messages.Hello) and asked.qsize() < 5:
             asked.put(message)
             reason = f"no room for {asked.qsize()} more"
-            return messages.Refused(code="size", reason=reason, sensor=message.sensor, epoch=message.epoch)
+            return messages.Refused(code="size", reason=reason, sensor=message.sensor, session_id=message.session_id)
         return None
 
     with StandIn() as central, Node(central.address, ("left", "right")) as node:
@@ -209,7 +209,7 @@ def test_a_failing_listener_stops_nothing(caplog):
     def fail(_):
         raise OSError("the pipe is closed")
 
-    with StandIn() as central, SensorNode(central.address, on_note=fail, on_settled=fail) as node:
+    with StandIn() as central, SensorNode(central.address, on_note=fail, on_acked=fail) as node:
         node.add_sensor("left", TINY)
         node.append(given[:3])
         assert node.flush(SOON_S)
@@ -220,8 +220,8 @@ def test_a_failing_listener_stops_nothing(caplog):
         assert node.flush(SOON_S)
         assert node.counts["left"].stored == 6
     assert has_all(central, given)
-    told = [record.ertis_fields["text"] for record in caplog.records if record.name == "ertis.network.sensor_node"]
-    assert sorted(told) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_note", "on_settled")]
+    reported = [record.ertis_fields["text"] for record in caplog.records if record.name == "ertis.network.sensor_node"]
+    assert sorted(reported) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_note", "on_acked")]
 
 
 def test_a_link_that_fails_is_made_again(monkeypatch):

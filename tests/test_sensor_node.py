@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Sensor
+from ertis_numba.journal import Entry, JournalSensor
 from ertis_numba.network import messages
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.sensor_node import _runs as runs
@@ -33,28 +33,33 @@ def test_measurements_arrive_with_all_that_belongs_to_them():
     assert has_all(central, given)
     assert (hello.next_sequence, hello.firmware, hello.translation_m) == (0, "1.2.3", (1.0, 2.0, 3.0))
     assert settings.decode() == TINY.to_toml()
-    assert (counts.accepted, counts.stored, counts.unsettled, counts.unsettled_bytes) == (50, 50, 0, 0)
+    assert (counts.accepted, counts.stored, counts.unacked, counts.unacked_bytes) == (50, 50, 0, 0)
     assert (central.wrong, central.resent, central.connections, node.reconnects) == ([], 0, 1, 0)
     acks = [node.acks.get_nowait() for _ in range(node.acks.qsize())]
-    assert [ack.settled for ack in acks] == sorted({ack.settled for ack in acks})
-    assert (acks[-1].sensor, acks[-1].epoch, acks[-1].settled, acks[-1].status) == ("left", EPOCH, 49, "stored")
+    assert [ack.acked_through for ack in acks] == sorted({ack.acked_through for ack in acks})
+    assert (acks[-1].sensor, acks[-1].session_id, acks[-1].acked_through, acks[-1].status) == (
+        "left",
+        EPOCH,
+        49,
+        "stored",
+    )
 
 
 def test_gaps_arrive_in_their_turn():
     given = entries(6, first=3)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:2])
-        node.note_gap("left", 5, 5, "footer", epoch=EPOCH)
-        node.note_gap("left", 4, 6, "unplugged", epoch=EPOCH)  # of which 6 is news
+        node.note_gap("left", 5, 5, "footer", session_id=EPOCH)
+        node.note_gap("left", 4, 6, "unplugged", session_id=EPOCH)  # of which 6 is news
         node.append(given[5:])
-        node.note_gap("left", 0, 8, "late", epoch=EPOCH)  # which is none
+        node.note_gap("left", 0, 8, "late", session_id=EPOCH)  # which is none
         assert node.flush(SOON_S)
     assert [*central.held[KEY]] == [3, 4, 8]
     assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
 
 
 def test_several_sensors_and_runs():
-    left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, epoch=9, seed=3)
+    left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, session_id=9, seed=3)
     with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
         for pair in zip(left, right, strict=True):
             node.append(pair)
@@ -63,7 +68,7 @@ def test_several_sensors_and_runs():
     assert has_all(central, left)
     assert has_all(central, right, ("right", EPOCH))
     assert has_all(central, later, ("left", 9))
-    assert [hello.epoch for hello, _ in central.hellos.queue if hello.sensor == "left"] == [EPOCH, 9]
+    assert [hello.session_id for hello, _ in central.hellos.queue if hello.sensor == "left"] == [EPOCH, 9]
 
 
 def test_no_more_is_under_way_than_the_window_has_room_for():
@@ -78,15 +83,15 @@ def test_no_more_is_under_way_than_the_window_has_room_for():
 
 
 def test_runs_that_are_over_are_taken_leave_of():
-    given = [entries(2, epoch=epoch) for epoch in range(20)]
+    given = [entries(2, session_id=session_id) for session_id in range(20)]
     with StandIn() as central, Node(central.address) as node:
-        central.most_runs = 3
+        central.max_runs = 3
         for several in given:
             node.append(several)
         assert node.flush(SOON_S)
         assert not node.notes.qsize()
-    for epoch, several in enumerate(given):
-        assert has_all(central, several, ("left", epoch))
+    for session_id, several in enumerate(given):
+        assert has_all(central, several, ("left", session_id))
 
 
 def test_a_full_memory_forgets_the_oldest():
@@ -97,9 +102,9 @@ def test_a_full_memory_forgets_the_oldest():
     with Node(address, ring_bytes=10 * TINY.recording.n_samples) as node:
         for entry in given:
             node.append([entry])
-            assert node.counts["left"].unsettled_bytes <= 10 * TINY.recording.n_samples
+            assert node.counts["left"].unacked_bytes <= 10 * TINY.recording.n_samples
         counts = node.counts["left"]
-        assert (counts.accepted, counts.overwritten, counts.unsettled) == (40, 30, 10)
+        assert (counts.accepted, counts.overwritten, counts.unacked) == (40, 30, 10)
         assert not node.flush(0.01)
         assert not node.flush(SOON_S, stop=lambda: True)
         with central:
@@ -119,7 +124,7 @@ def test_memory_is_flat_while_nobody_takes_anything():
         for number in range(0, 4000, 2):
             stamp = replace(blank.measurement.stamp, sequence=number)
             node.append([Entry(replace(blank.measurement, stamp=stamp), 0)])
-            node.note_gap("left", number + 1, number + 1, f"reason {number % 7}", epoch=EPOCH)
+            node.note_gap("left", number + 1, number + 1, f"reason {number % 7}", session_id=EPOCH)
         run = node._spool.runs[KEY]  # noqa: SLF001  nobody else can tell
         assert len(run.items) < 300
         assert run.items[0].first == 0
@@ -129,7 +134,7 @@ def test_memory_is_flat_while_nobody_takes_anything():
 @IMPATIENT
 def test_memory_is_flat_while_one_sensor_is_not_let_in():
     small = TINY.replace(recording=Recording(n_samples=64))
-    refused = messages.Refused(code="serial", reason="no", sensor="left", epoch=EPOCH)
+    refused = messages.Refused(code="serial", reason="no", sensor="left", session_id=EPOCH)
     with StandIn() as central, SensorNode(central.address) as node:
         central.refusal = lambda message: refused if getattr(message, "sensor", "") == "left" else None
         node.add_sensor("left", small)
@@ -137,20 +142,20 @@ def test_memory_is_flat_while_one_sensor_is_not_let_in():
         node.append(entries(1, settings=small))
         for entry in entries(3000, sensor="right", settings=small):
             node.append([entry])
-        until(lambda: central.settled.get(("right", EPOCH)) == 3009)
-        until(lambda: node.unsettled == 1)
+        until(lambda: central.acked_through.get(("right", EPOCH)) == 3009)
+        until(lambda: node.unacked == 1)
         node.append(entries(1, first=11, settings=small))
         assert len(node._spool._order) < 1010  # noqa: SLF001  nobody else can tell
 
 
 def test_a_run_of_which_the_central_node_has_more_holds_no_later_one():
     """As when the end of a spool was lost with the power."""
-    later = entries(3, first=0, epoch=EPOCH + 1)
+    later = entries(3, first=0, session_id=EPOCH + 1)
     with StandIn() as central, Node(central.address) as node:
-        central.settled[KEY] = 15
+        central.acked_through[KEY] = 15
         node.append([*entries(3), *later])  # 10 to 12
         assert node.flush(SOON_S)
-        assert node.acks.get_nowait().settled == 12
+        assert node.acks.get_nowait().acked_through == 12
     assert KEY not in central.held
     assert has_all(central, later, ("left", EPOCH + 1))
 
@@ -159,14 +164,14 @@ def test_numbers_of_any_kind_are_sent():
     given = entries(2, first=0)
     stamp = given[0].measurement.stamp
     numpy = replace(
-        stamp, sequence=np.int32(0), sync_count=np.int64(5), timestamp_ns=np.int64(9), epoch=np.uint32(EPOCH)
+        stamp, sequence=np.int32(0), sync_count=np.int64(5), timestamp_ns=np.int64(9), session_id=np.uint32(EPOCH)
     )
     given[0] = replace(
         given[0], measurement=replace(given[0].measurement, stamp=numpy), monotonic_ns=np.int64(3), crc32=None
     )
     with StandIn() as central, Node(central.address) as node:
         node.append(given)
-        node.note_gap("left", np.int64(2), np.int64(4), "footer", epoch=np.int64(EPOCH))
+        node.note_gap("left", np.int64(2), np.int64(4), "footer", session_id=np.int64(EPOCH))
         assert node.flush(SOON_S)
         assert not node.notes.qsize()
     assert has_all(central, given)
@@ -181,17 +186,17 @@ def test_what_is_thrown_away_is_counted_once():
             node.append([entry])
         assert node.flush(SOON_S)
         counts = node.counts["left"]
-        told = [ack.dropped for ack in node.acks.queue if ack.dropped]
+        reported = [ack.dropped for ack in node.acks.queue if ack.dropped]
     assert counts.dropped == {"superseded": 2, "failed twice": 1}
     assert (counts.taken, counts.stored) == (8, 0)
-    assert told == [central.dropped]
+    assert reported == [central.dropped]
 
 
 def test_numbers_hold_whatever_happens():  # noqa: C901  it is a list of what may
     """A run against an obvious model: random losses, evictions, acks late and beyond."""
     chance = random.Random(4)
     for _ in range(30):
-        run = runs.Run(Sensor.of("left", TINY), EPOCH)
+        run = runs.OutgoingSession(JournalSensor.of("left", TINY), EPOCH)
         taken, number, lost = -1, 0, set()
         for step in range(400):
             match chance.randrange(8):
@@ -214,12 +219,12 @@ def test_numbers_hold_whatever_happens():  # noqa: C901  it is a list of what ma
                         if item.first <= taken + 1 and chance.random() < 0.8:
                             taken = max(taken, item.last)
                 case 6:
-                    run.settle(chance.randint(run.settled - 2, max(taken, run.settled)), step)
+                    run.settle(chance.randint(run.acked_through - 2, max(taken, run.acked_through)), step)
                 case 7:
                     run.go_back(step)
-            assert run.settled <= taken
+            assert run.acked_through <= taken
             assert run.sent <= run.reached
-            expected = run.settled + 1
+            expected = run.acked_through + 1
             for item in run.items:
                 assert item.first == expected
                 expected = item.last + 1
@@ -247,11 +252,11 @@ BAD = {
         "sensor 'right' is not known to this sensor node; add it first",
     ),
     "gap of it": (
-        lambda node: node.note_gap("right", 0, 1, "x", epoch=1),
+        lambda node: node.note_gap("right", 0, 1, "x", session_id=1),
         "sensor 'right' is not known to this sensor node; add it first",
     ),
     "gap backwards": (
-        lambda node: node.note_gap("left", 2, 1, "x", epoch=1),
+        lambda node: node.note_gap("left", 2, 1, "x", session_id=1),
         "last missing sequence number is 1; give",
     ),
     "number": (
@@ -259,14 +264,17 @@ BAD = {
         f"sequence is {2**48 + 1}; give a whole number from 0 to {2**48}",
     ),
     "number of a gap": (
-        lambda node: node.note_gap("left", 20, 2**48 + 1, "x", epoch=EPOCH),
+        lambda node: node.note_gap("left", 20, 2**48 + 1, "x", session_id=EPOCH),
         f"last missing sequence number is {2**48 + 1}; give a whole number from 0 to {2**48}",
     ),
     "half a number": (
-        lambda node: node.note_gap("left", 20, 21.5, "x", epoch=EPOCH),
+        lambda node: node.note_gap("left", 20, 21.5, "x", session_id=EPOCH),
         "last missing sequence number is 21.5; give a whole number",
     ),
-    "epoch": (lambda node: node.note_gap("left", 1, 2, "x", epoch=-1), "epoch is -1; give a whole number from 0"),
+    "session_id": (
+        lambda node: node.note_gap("left", 1, 2, "x", session_id=-1),
+        "epoch is -1; give a whole number from 0",
+    ),
     "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; give 64 at most"),
     "longer than the memory": (
         lambda node: node.add_sensor("b", TINY.replace(recording=Recording(n_samples=200_000))),
@@ -291,13 +299,13 @@ def test_what_does_not_fit_is_refused(name):
         node.append(entries())
         with pytest.raises(ArgumentError, match=message):
             act(node)
-        assert node.counts["left"].accepted == node.unsettled == 3
+        assert node.counts["left"].accepted == node.unacked == 3
 
 
 def test_words_of_any_kind_are_sent_little_endian():
     (given,) = entries(1, first=0)
-    strided = np.repeat(given.measurement.words, 2)[::2]
-    given.measurement = replace(given.measurement, words=strided)
+    strided = np.repeat(given.measurement.data, 2)[::2]
+    given.measurement = replace(given.measurement, data=strided)
     with StandIn() as central, Node(central.address) as node:
         node.append([given])
         assert node.flush(SOON_S)

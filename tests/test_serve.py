@@ -77,9 +77,10 @@ class Sensors:
     def measure(self):
         number, now_ns = next(self.numbers), time.time_ns()
         stamps = [
-            Stamp(sensor=name, sequence=number, sync_count=number, epoch=11, timestamp_ns=now_ns) for name in self.names
+            Stamp(sensor=name, sequence=number, sync_count=number, session_id=11, timestamp_ns=now_ns)
+            for name in self.names
         ]
-        self.node.append([Entry(Measurement(MEASUREMENT.words, SHORT, stamp), time.monotonic_ns()) for stamp in stamps])
+        self.node.append([Entry(Measurement(MEASUREMENT.data, SHORT, stamp), time.monotonic_ns()) for stamp in stamps])
 
 
 def received(subscriber, kind):
@@ -132,20 +133,20 @@ def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
                 images += [product] * isinstance(product, Energyscape)
                 groups += [product] * isinstance(product, Group)
         assert node.flush(TIMEOUT_S)
-        told = served.end()
-    assert set(told) == REPORTED
+        reported = served.end()
+    assert set(reported) == REPORTED
     assert (tmp_path / "q").is_dir()
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
-    assert all(np.array_equal(image.energy, wanted.energy) for image in images)
+    assert all(np.array_equal(image.amplitude, wanted.amplitude) for image in images)
     assert {(image.stamp.sensor, image.stamp.sequence) for image in images} == set(
         itertools.product(("left", "right"), range(4))
     )
     assert [(group.sensors, group.flags) for group in groups] == [(("left", "right"), ())] * 4
     for name in ("left", "right"):
-        sensor = told["sensors"][name]
+        sensor = reported["sensors"][name]
         assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
-        (recording,) = told["recordings"]
+        (recording,) = reported["recordings"]
         assert Path(recording).name.startswith("tour_")
         with open_recording(recording, sensor=name) as stored:
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
@@ -224,13 +225,13 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
         (("--range", "5:1"), "processing.range_m runs from 5 to 1"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(options, told):
+def test_what_cannot_be_is_refused_in_a_line(options, reported):
     command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *options]
     environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert told in line
+    assert reported in line
 
 
 def test_what_is_refused_has_left_nothing(tmp_path):
@@ -257,13 +258,13 @@ def test_numbers_of_pcm_go_all_the_way(tmp_path):
         received(subscriber, Status)
         with SensorNode(served.listen) as node:
             node.add_sensor("ring", given.settings)
-            stamp = Stamp(sensor="ring", epoch=11, timestamp_ns=time.time_ns())
-            node.append([Entry(Measurement(given.words, given.settings, stamp), time.monotonic_ns())])
+            stamp = Stamp(sensor="ring", session_id=11, timestamp_ns=time.time_ns())
+            node.append([Entry(Measurement(given.data, given.settings, stamp), time.monotonic_ns())])
             assert node.flush(timeout_s=TIMEOUT_S)
             image = received(subscriber, Energyscape)
         served.end()
     with Pipeline(image.settings, max_error_db=image.settings.accuracy.max_error_db) as pipeline:
-        assert np.array_equal(image.energy, pipeline.process(given).energy)
+        assert np.array_equal(image.amplitude, pipeline.process(given).amplitude)
     (path,) = tmp_path.rglob("*.h5")
     with open_recording(path) as recording:
-        assert np.array_equal(recording[0].words, given.words)
+        assert np.array_equal(recording[0].data, given.data)

@@ -25,7 +25,7 @@ from ertis_numba.settings import (
     Processing,
     Recording,
     Settings,
-    suit_ranges,
+    fit_ranges,
 )
 
 TWO = ((0.0, 0.0, 0.0), (0.0, 0.01, 0.0))
@@ -90,8 +90,8 @@ any_settings = st.builds(
         delay_taps=st.none() | st.integers(1, 8),
         beam_taps=st.sampled_from([None, 0, 2, 4, 6]),
         beam_density=st.none() | st.floats(1.1, 8),
-        stop_band_db=st.none() | st.floats(40, 140),
-        zones=st.none() | st.integers(1, 1000),
+        stopband_attenuation_db=st.none() | st.floats(40, 140),
+        focal_zones=st.none() | st.integers(1, 1000),
     ),
 )
 
@@ -179,8 +179,8 @@ def test_nothing_can_be_changed_in_place():
         ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; give a whole number from 1 to 8"),
         ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
         ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; give a number from 1\.1 to 8"),
-        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stop_band_db is 30; give a number from 40 to 140"),
-        ("[accuracy]\nzones = 0", r"accuracy\.zones is 0; give a whole number from 1 to"),
+        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; give a number from 40 to 140"),
+        ("[accuracy]\nfocal_zones 0", r"accuracy\.focal_zones is 0; give a whole number from 1 to"),
         (
             "[accuracy]\ninterpolation = 'linear'\ndelay_taps = 4",
             r"accuracy\.delay_taps is 4, but interpolation 'linear' takes 2; leave it out",
@@ -228,7 +228,7 @@ def test_bad_settings_are_refused(text, message):
         (lambda: Array(positions_m=TWO, enabled=("yes", "no")), r"array\.enabled\[0\] is 'yes'; give true or false"),
         (lambda: Array(positions_m=5), r"array\.positions_m is 5; give a list or None"),
         (lambda: Array(layout=3), r"array\.layout is 3; give text"),
-        (lambda: Accuracy(zones=1.5), r"accuracy\.zones is 1\.5; give a whole number or None"),
+        (lambda: Accuracy(focal_zones=1.5), r"accuracy\.focal_zones is 1\.5; give a whole number or None"),
         (lambda: Processing(range_m="12"), r"processing\.range_m is '12'; give a list"),
         (lambda: Processing(range_m=(1, 2, 3)), r"processing\.range_m has shape \(3,\); give shape \(2,\)"),
         (lambda: Processing(range_m=(1, 10**400)), r"processing\.range_m\[1\] is beyond all .*; give a finite number"),
@@ -382,12 +382,12 @@ def test_a_file_changes_what_it_holds_and_names_files_beside_it(tmp_path, monkey
         processing=Processing(directions="near.csv", range_m=(1.0, 2.0)),
     )
     (folder / "s.toml").write_text("\ufeff[recording]\npdm_rate_hz = 4e6\n[processing]\nrange_m = [1, 3]\n", "utf-8")
-    changed = known.changed_by("mine/s.toml")
+    changed = known.updated_from_file("mine/s.toml")
     assert changed.recording == Recording(sample_rate_hz=4e6, n_samples=100_000)
     assert changed.processing == known.processing.replace(range_m=(1.0, 3.0))
     assert (changed.array, changed.call) == (known.array, known.call)
     (folder / "s.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "far.csv"\n')
-    changed = known.changed_by("mine/s.toml")
+    changed = known.updated_from_file("mine/s.toml")
     assert changed.array == Array(layout=str(Path("mine/line.csv")))
     assert changed.processing == known.processing.replace(directions=str(Path("mine/far.csv")))
 
@@ -396,7 +396,7 @@ def test_a_file_that_does_not_suit_the_rest_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text("[processing]\nrange_decimation = 50\n")
     known = Settings(processing=Processing(decimation=20))
     with pytest.raises(SettingsError, match=r"s\.toml: processing\.decimation is 20; give a divisor of .* \(50\)"):
-        known.changed_by(tmp_path / "s.toml")
+        known.updated_from_file(tmp_path / "s.toml")
 
 
 @pytest.mark.parametrize(
@@ -413,13 +413,13 @@ def test_a_file_that_does_not_suit_the_rest_is_refused(tmp_path):
 def test_ranges_suit_rate_and_band(rate_hz, band_hz, step):
     call = Call(start_frequency_hz=band_hz[1], stop_frequency_hz=band_hz[0])
     recording = Recording(sample_rate_hz=rate_hz, n_samples=round(rate_hz / 20))
-    assert suit_ranges(Processing(), recording, call).range_decimation == step
+    assert fit_ranges(Processing(), recording, call).range_decimation == step
 
 
 def test_a_window_is_where_the_whole_echo_fits():
     def window_m(n_samples, **processing):
         recording = Recording(sample_rate_hz=1e6, n_samples=n_samples)
-        return suit_ranges(Processing(**processing), recording, Call()).range_m
+        return fit_ranges(Processing(**processing), recording, Call()).range_m
 
     assert window_m(10**6) == (0.5, 5.0)
     assert window_m(22_500) == (0.5, 3.0)

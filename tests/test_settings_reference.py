@@ -12,11 +12,11 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.geometry import load_layout
-from ertis_numba.reference import DOCUMENTS, reference
 from ertis_numba.settings import Settings
 from ertis_numba.simulation import load_scene
+from ertis_numba.toml_reference import DOCUMENTS, reference
 
 ROOT = Path(__file__).parents[1]
 READERS = {"settings": Settings.load, "scene": load_scene, "layout": load_layout, "mounting": load_scene}
@@ -27,7 +27,7 @@ def structures(kind):
     yield kind
     for field in msgspec.structs.fields(kind):
         for part in (field.type, *getattr(field.type, "__args__", ())):
-            if isinstance(part, type) and issubclass(part, Table):
+            if isinstance(part, type) and issubclass(part, TomlTable):
                 yield from structures(part)
 
 
@@ -75,8 +75,8 @@ def test_settings_template_with_a_key_set(tmp_path):
 
 
 def test_reference_as_json():
-    told = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
-    (table,) = told["tables"]
+    reported = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
+    (table,) = reported["tables"]
     (found,) = (key for key in table["keys"] if key["name"] == "positions_mm")
     assert (found["unit"], found["default"]) == ("mm", "required")
 

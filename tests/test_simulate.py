@@ -46,7 +46,7 @@ def test_it_writes_what_is_rendered(scene_file, tmp_path):
         assert len(recording) == 3
         for index, measurement in enumerate(recording):
             wanted = simulator.render(index)
-            assert_array_equal(measurement.words, wanted.words)
+            assert_array_equal(measurement.data, wanted.data)
             assert measurement.stamp == wanted.stamp
         truth = recording.truth
     decided = Scene.from_toml(truth.scene)
@@ -71,7 +71,7 @@ def test_it_records_all_sensors_or_one(tmp_path):
     assert simulate(path, "--count", 2, "--quiet").exit_code == 0
     for name in ("left", "right"):
         with open_recording(path.with_suffix(".h5"), sensor=name) as recording:
-            assert_array_equal(recording[1].words, Simulator(PAIR.replace(count=2), sensor=name).render(1).words)
+            assert_array_equal(recording[1].data, Simulator(PAIR.replace(count=2), sensor=name).render(1).data)
     with open_recording(path.with_suffix(".h5"), sensor="right") as recording:
         assert_allclose(recording.translation_m, (0.1, -0.4, 0.0))
         assert_allclose(recording.rotation_xyzw, (0, 0, np.sin(np.radians(15)), np.cos(np.radians(15))), atol=1e-12)

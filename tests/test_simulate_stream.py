@@ -65,8 +65,8 @@ def test_truth_is_computed_measurement_by_measurement(path, monkeypatch):
         Engine, "reflectors", lambda self, index=0: done.append(("truth", index)) or reflectors(self, index)
     )
     assert simulate(path, "--count", 4, "--quiet").exit_code == 0
-    told = [each for each in done if each[1] > 0]
-    assert told == [(kind, index) for index in (1, 2, 3) for kind in ("truth", "words")]
+    reported = [each for each in done if each[1] > 0]
+    assert reported == [(kind, index) for index in (1, 2, 3) for kind in ("truth", "words")]
 
 
 def test_interrupted_simulation_leaves_nothing(path, monkeypatch):

@@ -117,8 +117,8 @@ def test_fractional_delay_conserves_energy():
     """Parseval: whatever part of a sample a call is delayed by, the energy stays."""
     step_m = SPEED_M_S / RATE_HZ / 2
     scenes = (scene_of(Point(range_m=0.5 + step_m * part), sensor=EAR) for part in (0.0, 0.1, 0.37, 0.5, 0.77, 123.4))
-    energy = [np.sum(heard(scene) ** 2) for scene in scenes]
-    assert np.ptp(energy) / energy[0] < 1e-9
+    amplitude = [np.sum(heard(scene) ** 2) for scene in scenes]
+    assert np.ptp(amplitude) / amplitude[0] < 1e-9
 
 
 @pytest.mark.parametrize("block", [4099, 16_384, 65_536])
@@ -166,29 +166,29 @@ def test_call_is_far_below_half_the_pdm_rate():
 
 def test_seed_and_index_decide_every_bit():
     first = render(NOISY)
-    assert_array_equal(first.words, render(NOISY).words)
+    assert_array_equal(first.data, render(NOISY).data)
     others = [render(NOISY, 1), render(NOISY.replace(seed=8)), render(SCENE)]
     for other in others:
-        assert np.mean(other.words != first.words) > 0.1
+        assert np.mean(other.data != first.data) > 0.1
     stamp = others[0].stamp
     assert (stamp.sensor, stamp.sequence, stamp.sync_count, stamp.timestamp_ns) == ("sensor", 1, 1, 50_000_000)
 
 
 def test_words_are_those_of_an_earlier_version():
     """A change of these bits changes every shipped recording: then rebuild data/synthetic, and say so."""
-    words = render(NOISY).words
+    words = render(NOISY).data
     assert hashlib.sha256(words.tobytes()).hexdigest()[:16] == "6ef2f5669f9743ea"
 
 
 def test_sensors_of_a_scene_differ_in_their_noise():
     twins = NOISY.replace(sensors=(NOISY.sensors[0], NOISY.sensors[0].replace(name="other")), points=())
-    words = [render(twins, sensor=name).words for name in ("sensor", "other")]
+    words = [render(twins, sensor=name).data for name in ("sensor", "other")]
     assert np.mean(words[0] != words[1]) > 0.1
 
 
 def test_threads_do_not_decide_bits():
     words = [
-        Simulator(NOISY, threads=threads).render().words for threads in range(1, kernels.load("cpu").max_threads + 1)
+        Simulator(NOISY, threads=threads).render().data for threads in range(1, kernels.load("cpu").max_threads + 1)
     ]
     for other in words[1:]:
         assert_array_equal(other, words[0])
@@ -196,9 +196,9 @@ def test_threads_do_not_decide_bits():
 
 def test_the_order_of_measurements_does_not_matter():
     forth, back = Simulator(NOISY), Simulator(NOISY)
-    words = [forth.render(index).words for index in (0, 1, 2)]
+    words = [forth.render(index).data for index in (0, 1, 2)]
     for index in (2, 1, 0):
-        assert_array_equal(back.render(index).words, words[index])
+        assert_array_equal(back.render(index).data, words[index])
 
 
 @pytest.mark.parametrize(("word_bits", "n_channels"), [(8, 1), (8, 8), (16, 17), (32, 33), (64, 64), (64, 1024)])
@@ -207,8 +207,8 @@ def test_channels_lie_in_their_bits(word_bits, n_channels):
     sensor = SENSOR.replace(array=array, recording=Recording(n_samples=601))
     measurement = Simulator(scene_of(sensor=sensor), plan=only()).render()
     n_words = -(-n_channels // word_bits)
-    assert measurement.words.shape == ((601, n_words) if n_words > 1 else (601,))
-    assert measurement.words.dtype == f"u{word_bits // 8}"
+    assert measurement.data.shape == ((601, n_words) if n_words > 1 else (601,))
+    assert measurement.data.dtype == f"u{word_bits // 8}"
     bits = bits_of(measurement)
     assert np.all(bits[n_channels:] == -1)
     assert np.all(np.abs(bits[:n_channels].mean(axis=1)) < 0.2)
@@ -234,7 +234,7 @@ def test_disabled_channels_hold_zeros():
 @pytest.mark.parametrize("n_samples", [1, 7, 4099, 32_769])
 def test_odd_records_render(n_samples):
     scene = scene_of(Point(range_m=0.05), sensor=EAR.replace(recording=Recording(n_samples=n_samples)))
-    assert Simulator(scene, plan=only("spreading")).render().words.shape == (n_samples,)
+    assert Simulator(scene, plan=only("spreading")).render().data.shape == (n_samples,)
 
 
 def test_memory_does_not_grow_with_the_record():

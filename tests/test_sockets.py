@@ -92,7 +92,7 @@ def test_garbage_on_the_port_harms_nobody(door):
 
 
 def test_a_frame_that_is_too_long_ends_its_connection_alone(tmp_path):
-    with Door(tmp_path, with_keys=False, most_bytes=1000) as door:
+    with Door(tmp_path, with_keys=False, max_bytes=1000) as door:
         good, bad = door.knock(None), door.knock(None, text=bytes(2000))
         assert door.until(lambda: door.came)
         door.say(bad, b"after")
@@ -102,21 +102,21 @@ def test_a_frame_that_is_too_long_ends_its_connection_alone(tmp_path):
 
 
 def test_two_hundred_slow_connections_keep_nobody_out_and_are_hung_up_on(door):
-    strangers = [raw.create_connection(("127.0.0.1", door.port)) for _ in range(200)]
+    handshakes = [raw.create_connection(("127.0.0.1", door.port)) for _ in range(200)]
     try:
-        for number, stranger in enumerate(strangers):
+        for number, stranger in enumerate(handshakes):
             stranger.sendall(GREETING.replace(b"NULL", b"CURVE")[: number % 64])
         began_s = time.monotonic()
         door.knock(ROBOT)
         assert door.until(lambda: door.came)
         assert time.monotonic() - began_s < 2.0
-        waiting = dict.fromkeys(strangers)
-        for stranger in strangers:
+        waiting = dict.fromkeys(handshakes)
+        for stranger in handshakes:
             stranger.settimeout(0)
         assert door.until(lambda: not _still_open(waiting), 6.0)
         assert door.until(lambda: door.gate.refused["no key"] >= 190)
     finally:
-        for stranger in strangers:
+        for stranger in handshakes:
             stranger.close()
 
 

@@ -23,8 +23,8 @@ from ertis_numba.devices.commands import encode_answer
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.setup import Setup, call_hash
-from ertis_numba.devices.sonar import Sonar
-from ertis_numba.errors import ArgumentError, SonarError, SonarGoneError
+from ertis_numba.devices.sonar import SonarDriver
+from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call, Recording, Settings
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log
 
@@ -47,7 +47,7 @@ def device(folder):
 
 @pytest.fixture
 def sonar(device):
-    with Sonar.open("left") as sonar:
+    with SonarDriver.open("left") as sonar:
         sonar.configure(Setup.of(SETTINGS))
         yield sonar
     assert device.refused == 0
@@ -55,7 +55,7 @@ def sonar(device):
 
 @pytest.fixture
 def armed(device):
-    with Sonar.open(device.port) as sonar:
+    with SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
         sonar.arm()
         yield sonar
@@ -106,7 +106,7 @@ def wait_for_bytes(device):
 
 
 def is_block(block, counter, words):
-    return block.counter == counter and np.array_equal(block.words, words)
+    return block.counter == counter and np.array_equal(block.data, words)
 
 
 def taken(sonar, count):
@@ -116,7 +116,7 @@ def taken(sonar, count):
 def refusal(device, *, timeout_s=0.2):
     """Return the error of opening a fake device."""
     with device, pytest.raises(SonarError) as caught:
-        Sonar.open(device.port, timeout_s=timeout_s)
+        SonarDriver.open(device.port, timeout_s=timeout_s)
     return caught.value
 
 
@@ -124,7 +124,7 @@ def refusal(device, *, timeout_s=0.2):
 
 
 def test_open(device):
-    with Sonar.open(device.port) as sonar:
+    with SonarDriver.open(device.port) as sonar:
         assert (sonar.port, sonar.serial_number, sonar.firmware) == (device.port, "left", "1.0.0")
         assert sonar.call_hash() == 0
         assert sonar.dropped == 0
@@ -132,25 +132,25 @@ def test_open(device):
 
 def test_a_port_that_another_program_has_open(device):
     with serial.Serial(device.port, exclusive=True), pytest.raises(SonarError, match="is in use by another") as caught:
-        Sonar.open("left")
+        SonarDriver.open("left")
     assert caught.value.errno == errno.EBUSY
-    Sonar.open("left").close()
-    Sonar.open("left").close()
+    SonarDriver.open("left").close()
+    SonarDriver.open("left").close()
 
 
 def test_what_is_no_serial_port(tmp_path):
     (tmp_path / "file.txt").touch()
     with pytest.raises(SonarError, match=r"file\.txt is no serial port that can be used \(.*; give another"):
-        Sonar.open(str(tmp_path / "file.txt"))
+        SonarDriver.open(str(tmp_path / "file.txt"))
 
 
 def test_a_program_is_told_what_is_wrong_with_a_port(tmp_path, monkeypatch):
     (tmp_path / "file.txt").touch()
     with pytest.raises(SonarError) as caught:
-        Sonar.open(str(tmp_path / "file.txt"))
+        SonarDriver.open(str(tmp_path / "file.txt"))
     assert caught.value.errno == errno.EINVAL
     with pytest.raises(SonarError, match="there is no serial port") as caught:
-        Sonar.open(str(tmp_path / "nothing"))
+        SonarDriver.open(str(tmp_path / "nothing"))
     assert caught.value.errno == errno.ENOENT
 
     same = [ListPortInfo("/dev/ttyACM0"), ListPortInfo("/dev/ttyACM1")]
@@ -158,7 +158,7 @@ def test_a_program_is_told_what_is_wrong_with_a_port(tmp_path, monkeypatch):
         port.vid, port.serial_number = 0x0483, "SN7"
     monkeypatch.setattr(list_ports, "comports", lambda: same)
     with pytest.raises(SonarError, match="'SN7' are 2 ports") as caught:
-        Sonar.open("SN7")
+        SonarDriver.open("SN7")
     assert caught.value.errno == errno.EINVAL
 
 
@@ -171,7 +171,7 @@ def test_a_port_in_a_program_with_more_than_a_thousand_open_files(device):
         stack.callback(os.close, null)
         for _ in range(1100):
             stack.callback(os.close, os.dup(null))
-        with Sonar.open(device.port) as sonar:
+        with SonarDriver.open(device.port) as sonar:
             sonar.configure(Setup.of(SETTINGS))
             assert is_block(sonar.measure(), 0, WORDS[0])
 
@@ -185,7 +185,7 @@ def test_a_port_that_the_system_refuses(device, monkeypatch, code, text):
 
     monkeypatch.setattr(serial, "Serial", refuse)
     with pytest.raises(SonarError, match=text) as caught:
-        Sonar.open(device.port)
+        SonarDriver.open(device.port)
     assert caught.value.errno == (errno.ENOENT if code == errno.EIO else code)
 
 
@@ -193,7 +193,7 @@ def test_a_silent_device(device):
     device.quirks = Quirks(silent=True)
     wanted = r"does not answer 'firmware version\?' within 0.2 s; is it an eRTIS"
     with pytest.raises(SonarError, match=wanted) as caught:
-        Sonar.open("left", timeout_s=0.2)
+        SonarDriver.open("left", timeout_s=0.2)
     assert caught.value.errno == errno.ETIMEDOUT
 
 
@@ -219,7 +219,7 @@ def test_a_device_that_never_stops_sending():
         talker.start()
         try:
             with pytest.raises(SonarError, match="keeps sending whatever it is told; is it an eRTIS"):
-                Sonar.open(device.port, timeout_s=0.2)
+                SonarDriver.open(device.port, timeout_s=0.2)
         finally:
             ended.set()
             talker.join()
@@ -230,7 +230,7 @@ def test_a_stream_that_a_crashed_program_left(device):
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SyncChain([device], 50.0):
         wait_for_bytes(device)
-        with Sonar.open("left") as sonar:
+        with SonarDriver.open("left") as sonar:
             assert registers.armed == 0
             assert 0 < sonar.dropped < 20 * BLOCK_BYTES
             sonar.configure(Setup.of(SETTINGS), counter=7)
@@ -241,7 +241,7 @@ def test_a_stream_that_a_crashed_program_left(device):
 def test_half_a_command_that_a_crashed_program_left(device):
     with serial.Serial(device.port) as port:
         port.write(b"!C,12")
-    Sonar.open("left").close()
+    SonarDriver.open("left").close()
 
 
 # Setting up
@@ -249,25 +249,30 @@ def test_half_a_command_that_a_crashed_program_left(device):
 
 def test_everything_is_told(device, caplog):
     setup = Setup.of(SETTINGS.replace(recording=Recording(n_samples=65_536, sample_rate_hz=1_125_000.0)), emissions=3)
-    with Sonar.open("left") as sonar:
+    with SonarDriver.open("left") as sonar:
         assert device.registers.armed == 0
         caplog.set_level("INFO", "ertis_numba")
         sonar.configure(setup, counter=11)
-        told = device.registers
-        assert (told.n_bytes, told.clock, told.dac_rate_hz, told.n_codes) == (262_144, 1, 450_000, len(setup.codes))
-        assert (told.emissions, told.active, told.amplifier, told.counter) == (3, 1, 1, 11)
-        assert np.array_equal(told.codes[: told.n_codes], setup.codes)
+        reported = device.registers
+        assert (reported.n_bytes, reported.clock, reported.dac_rate_hz, reported.n_codes) == (
+            262_144,
+            1,
+            450_000,
+            len(setup.codes),
+        )
+        assert (reported.emissions, reported.active, reported.amplifier, reported.counter) == (3, 1, 1, 11)
+        assert np.array_equal(reported.codes[: reported.n_codes], setup.codes)
         assert sonar.call_hash() == call_hash(setup.codes)
         assert "a call of 1126 samples was sent" in caplog.text
         caplog.clear()
         sonar.configure(setup, counter=12)
-        assert (told.counter, caplog.text) == (12, "")
+        assert (reported.counter, caplog.text) == (12, "")
 
 
 def test_a_slow_device_gets_its_call(device):
     device.quirks = Quirks(answer_delay_s=2e-3)
     setup = Setup.of(SETTINGS.replace(call=Call(duration_s=2e-4)))
-    with Sonar.open("left", timeout_s=0.2) as sonar:
+    with SonarDriver.open("left", timeout_s=0.2) as sonar:
         sonar.configure(setup)
         assert np.array_equal(device.registers.codes[: len(setup.codes)], setup.codes)
 
@@ -277,14 +282,14 @@ def test_a_call_that_did_not_arrive(device):
     setup = Setup.of(SETTINGS)
     wanted, held = f"{call_hash(setup.codes):#06x}", f"{call_hash(setup.codes) ^ 1:#06x}"
     with (
-        Sonar.open("left") as sonar,
+        SonarDriver.open("left") as sonar,
         pytest.raises(SonarError, match=f"sent a call with hash {wanted} and holds one with {held}; plug"),
     ):
         sonar.configure(setup)
 
 
 def test_a_device_that_falls_silent(device):
-    with Sonar.open("left", timeout_s=0.1) as sonar:
+    with SonarDriver.open("left", timeout_s=0.1) as sonar:
         device.quirks = Quirks(silent=True)
         with pytest.raises(SonarError, match=r"does not answer 'SYNC input 1: off' within 0\.1 s"):
             sonar.configure(Setup.of(SETTINGS))
@@ -299,7 +304,7 @@ def test_answers_that_are_missing_name_their_command():
 
     with (
         Fake(forgetful) as device,
-        Sonar.open(device.port, timeout_s=0.1) as sonar,
+        SonarDriver.open(device.port, timeout_s=0.1) as sonar,
         pytest.raises(SonarError, match=r"does not answer 'sample 31 of the call: \d+' within 0\.1 s"),
     ):
         sonar.configure(Setup.of(SETTINGS))  # nobody can tell which of sixteen is missing: the last
@@ -322,7 +327,7 @@ def test_measurements_on_command(sonar):
 
 def test_what_cannot_be_emitted_is_refused(device):
     setup = Setup.of(SETTINGS, active=False)
-    with Sonar.open("left") as sonar:
+    with SonarDriver.open("left") as sonar:
         sonar.configure(setup)
         with pytest.raises(ArgumentError, match="and would emit nothing; configure a setup with amplifier=True"):
             sonar.measure(active=True)
@@ -366,7 +371,7 @@ def test_a_measurement_that_comes_in_the_next_one_s_place(pause_s):
             time.sleep(pause_s)  # it measures
             write(encode_block(1, WORDS[1]))
 
-    with Fake(slow) as device, Sonar.open(device.port) as sonar:
+    with Fake(slow) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
         with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
             sonar.measure()
@@ -384,7 +389,7 @@ def test_a_byte_that_is_lost_costs_one_measurement():
             data = encode_block(counter, WORDS[counter])
             write(data[:5_000] + data[5_001:] if counter == 0 else data)
 
-    with Fake(lossy) as device, Sonar.open(device.port) as sonar:
+    with Fake(lossy) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
         with pytest.raises(SonarError, match="; 131083 of 131084 bytes came"):
             sonar.measure()
@@ -403,7 +408,7 @@ def test_a_command_that_is_lost_does_not_shift_the_numbers():
         elif line.startswith(b"!A") and len(counters) > 1:
             write(encode_block(counters[-1], WORDS[1]))
 
-    with Fake(deaf_once) as device, Sonar.open(device.port) as sonar:
+    with Fake(deaf_once) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
         with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
             sonar.measure()
@@ -412,7 +417,7 @@ def test_a_command_that_is_lost_does_not_shift_the_numbers():
 
 @pytest.mark.usefixtures("device")
 def test_bits_that_cannot_be_true():
-    with Sonar.open("left") as sonar:
+    with SonarDriver.open("left") as sonar:
         sonar.configure(Setup.of(SETTINGS), bits=lambda words: "odd" if np.array_equal(words, WORDS[0]) else None)
         with pytest.raises(SonarError, match="no whole measurement"):
             sonar.measure()
@@ -426,16 +431,16 @@ def test_bits_that_cannot_be_true():
 def test_twenty_pulses_a_second(folder):
     """All that the device sent is here; on a busy machine it drops what nobody reads in time, and says so."""
     log = Log()
-    with Emulator(WORDS, link=folder / "right", log=log) as device, Sonar.open("right") as sonar:
+    with Emulator(WORDS, link=folder / "right", log=log) as device, SonarDriver.open("right") as sonar:
         sonar.configure(Setup.of(SETTINGS))
         sonar.arm()
         with SyncChain([device], 20.0):
             blocks = taken(sonar, 20)
-        told = log.lines(blocks[-1].counter + 1)
-        sent = [(line["counter"], line["crc32"]) for line in told if line["fault"] != "dropped"]
-        assert [(block.counter, zlib.crc32(block.words)) for block in blocks] == sent
+        reported = log.lines(blocks[-1].counter + 1)
+        sent = [(line["counter"], line["crc32"]) for line in reported if line["fault"] != "dropped"]
+        assert [(block.counter, zlib.crc32(block.data)) for block in blocks] == sent
         receiver = sonar.receiver
-        assert (sonar.dropped, receiver.lost, receiver.rejected.total()) == (0, len(told) - len(sent), 0)
+        assert (sonar.dropped, receiver.lost, receiver.rejected.total()) == (0, len(reported) - len(sent), 0)
         sonar.disarm()
         assert device.registers.armed == 0
 
@@ -457,15 +462,15 @@ def test_listening_stops_at_once(armed):
 def test_a_stopped_dialogue_fails_and_can_be_repeated(device):
     setup = Setup.of(SETTINGS)
     with pytest.raises(SonarError):
-        Sonar.open(device.port, stop=lambda: True)
+        SonarDriver.open(device.port, stop=lambda: True)
     polls = itertools.count()
-    with Sonar.open(device.port) as sonar:
+    with SonarDriver.open(device.port) as sonar:
         with pytest.raises(SonarError):
             sonar.configure(setup, stop=lambda: next(polls) > 20)
         assert sonar.call_hash() != call_hash(setup.codes)
         sonar.configure(setup)
         assert sonar.call_hash() == call_hash(setup.codes)
-        assert sonar.measure().words.shape == WORDS[0].shape
+        assert sonar.measure().data.shape == WORDS[0].shape
 
 
 def test_closing_ends_listening_and_disarms(armed, device):
@@ -492,7 +497,7 @@ def test_listening_without_a_byte_sent(device):
     """Somebody else has set the device up; the counter may stand anywhere."""
     registers = device.registers
     registers.n_bytes, registers.armed, registers.counter = 4 * N_SAMPLES, 1, 40
-    with Sonar.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+    with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         assert sonar.firmware == ""
         sonar.configure(Setup.of(SETTINGS))
         counters = [block.counter for block in taken(sonar, 3)]
@@ -506,7 +511,7 @@ def test_listening_without_a_byte_sent(device):
 def test_listening_for_another_length(device):
     registers = device.registers
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
-    with Sonar.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+    with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
         with pytest.raises(SonarError, match=r"\d+ bytes came within .* no whole measurement of 65536 samples; give"):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))
@@ -521,7 +526,7 @@ def test_a_pause_within_a_measurement(monkeypatch):
         if line.startswith(b"!J,1"):
             write(encode_block(0, WORDS[0])[:1_000])
 
-    with Fake(stalling) as device, Sonar.open(device.port) as sonar:
+    with Fake(stalling) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
         sonar.arm()
         writer = threading.Thread(target=device.write, args=[encode_block(1, WORDS[1])])
@@ -539,7 +544,7 @@ def test_a_pause_within_a_measurement(monkeypatch):
 
 @pytest.mark.usefixtures("device")
 def test_what_needs_something_else_first():
-    with Sonar.open("left") as sonar:
+    with SonarDriver.open("left") as sonar:
         with pytest.raises(SonarError, match=r"is not configured; call configure\(\) first"):
             sonar.measure()
         sonar.configure(Setup.of(SETTINGS))
@@ -559,10 +564,10 @@ def test_unplugged_within_a_measurement(sonar, device):
     device.quirks = Quirks(bytes_per_s=400_000)
     timer = threading.Timer(0.15, device.unplug)
     timer.start()
-    with pytest.raises(SonarGoneError, match=f"{first} was unplugged; plug it in again"):
+    with pytest.raises(SonarDisconnectedError, match=f"{first} was unplugged; plug it in again"):
         sonar.measure()
     timer.join()
-    with pytest.raises(SonarGoneError, match="was unplugged"):
+    with pytest.raises(SonarDisconnectedError, match="was unplugged"):
         sonar.measure()
     device.quirks = Quirks()
     device.replug()
@@ -575,7 +580,7 @@ def test_unplugged_while_listening(armed, device):
     with SyncChain([device], 50.0):
         blocks = taken(armed, 3)
         device.unplug()
-        with pytest.raises(SonarGoneError):
+        with pytest.raises(SonarDisconnectedError):
             blocks += taken(armed, 100)
         device.replug()
         before = time.monotonic()
@@ -590,7 +595,7 @@ def test_unplugged_while_listening(armed, device):
 
 def test_a_device_that_does_not_come_back(sonar, device):
     device.unplug()
-    with pytest.raises(SonarGoneError, match=r"did not come back within 0\.1 s: there is no serial port"):
+    with pytest.raises(SonarDisconnectedError, match=r"did not come back within 0\.1 s: there is no serial port"):
         sonar.reconnect(within_s=0.1)
     assert not sonar.reconnect(within_s=TIMEOUT_S, stop=lambda: True)
     timer = threading.Timer(0.1, sonar.close)

@@ -46,7 +46,7 @@ def test_measurements_are_durable_before_they_are_sent(tmp_path):
     with Node(NOBODY, spool=tmp_path / "spool") as node:
         assert node.is_durable
         assert node.append(given) == given
-        node.note_gap("left", 15, 16, "footer", epoch=EPOCH)
+        node.note_gap("left", 15, 16, "footer", session_id=EPOCH)
         for path in (tmp_path / "spool").iterdir():  # as if the process were killed here
             shutil.copy(path, tmp_path)
     (path,) = journals(tmp_path)
@@ -75,7 +75,7 @@ def test_what_the_central_node_has_leaves_the_disk(tmp_path):
 
 
 def test_earlier_runs_are_sent_first(tmp_path):
-    old, older, new = entries(5, epoch=2), entries(5, epoch=1), entries(5, epoch=3)
+    old, older, new = entries(5, session_id=2), entries(5, session_id=1), entries(5, session_id=3)
     kept(tmp_path, older)
     journals(tmp_path)[0].rename(tmp_path / "20200101T000000Z-1.h5.journal")
     kept(tmp_path, old)
@@ -84,9 +84,9 @@ def test_earlier_runs_are_sent_first(tmp_path):
         assert node.flush(SOON_S)
         assert node.counts["left"].stored == 15
         notes = list(node.notes.queue)
-    for epoch, given in enumerate((older, old, new), 1):
-        assert has_all(central, given, ("left", epoch))
-    assert [hello.epoch for hello, _ in central.hellos.queue] == [1, 2, 3]
+    for session_id, given in enumerate((older, old, new), 1):
+        assert has_all(central, given, ("left", session_id))
+    assert [hello.session_id for hello, _ in central.hellos.queue] == [1, 2, 3]
     assert not journals(tmp_path)
     assert notes == []
 
@@ -99,7 +99,7 @@ def test_a_run_goes_on_after_a_restart(tmp_path):
             node.append(given[4:])
         node.append(given[5:])
         assert len(journals(tmp_path)) == 1
-        assert node.unsettled == 10
+        assert node.unacked == 10
     with StandIn() as central, Node(central.address, spool=tmp_path) as node:
         assert node.flush(SOON_S)
     assert has_all(central, given)
@@ -168,14 +168,14 @@ def test_a_disk_that_takes_nothing_for_a_while(tmp_path, monkeypatch, text):
             patch.setattr(Journal, "note_gap", fail)
             for entry in given[3:6]:
                 assert node.append([entry]) == []
-            node.note_gap("left", 16, 16, "footer", epoch=EPOCH)
+            node.note_gap("left", 16, 16, "footer", session_id=EPOCH)
         assert (Journal.append, Journal.note_gap) == (append, note_gap)
         assert node.append(given[7:]) == given[7:]
         assert node.flush(SOON_S)
         assert list(node.notes.queue) == [text]
     assert [*central.held[KEY]] == [10, 11, 12, 17, 18]
-    told = {number: reason for first, last, reason in central.gaps[KEY] for number in range(first, last + 1)}
-    assert told == dict.fromkeys((13, 14, 15), disk.SPOOL_FULL) | {16: "footer"}
+    reported = {number: reason for first, last, reason in central.gaps[KEY] for number in range(first, last + 1)}
+    assert reported == dict.fromkeys((13, 14, 15), disk.SPOOL_FULL) | {16: "footer"}
     assert not journals(tmp_path)
 
 
@@ -192,7 +192,7 @@ def test_what_is_damaged_in_the_spool_is_a_gap(tmp_path):
         assert "measurement 3 of sensor left has CRC-32" in node.notes.get(timeout=SOON_S)
     assert [*central.held[KEY]] == [0, 1, 2, *range(5, 20)]
     assert [gap for gap in central.gaps[KEY] if gap[1] >= 0] == [(3, 3, disk.DAMAGED), (4, 4, disk.DAMAGED)]
-    assert (counts.accepted, counts.stored, counts.damaged, counts.unsettled) == (20, 18, 2, 0)
+    assert (counts.accepted, counts.stored, counts.damaged, counts.unacked) == (20, 18, 2, 0)
 
 
 def test_journals_that_cannot_be_sent_stay(tmp_path):
@@ -200,7 +200,7 @@ def test_journals_that_cannot_be_sent_stay(tmp_path):
 
     And an empty one, which goes.
     """
-    given = entries(4, epoch=7)
+    given = entries(4, session_id=7)
     kept(tmp_path, given)
     (path,) = journals(tmp_path)
     shutil.copy(path, tmp_path / "z_copy.h5.journal")
@@ -243,7 +243,7 @@ import sys
 from pathlib import Path
 from ertis_numba.network.sensor_node import SensorNode
 from tests.journals import TINY, entries
-address, folder, epoch = sys.argv[1], sys.argv[2], int(sys.argv[3])
+address, folder, session_id = sys.argv[1], sys.argv[2], int(sys.argv[3])
 with SensorNode(address, spool=folder) as node:
     for sensor in ("left", "right"):
         node.add_sensor(sensor, TINY)
@@ -259,14 +259,14 @@ def test_killed_nodes_and_a_central_node_that_dies_lose_nothing(tmp_path):
     """Everything that a node said it had kept arrives once."""
     accepted = {}
     with StandIn() as central:
-        for epoch in range(5):
-            command = [sys.executable, "-c", SEND, central.address, tmp_path, str(epoch)]
+        for session_id in range(5):
+            command = [sys.executable, "-c", SEND, central.address, tmp_path, str(session_id)]
             with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True) as process:
-                for number, told in enumerate(process.stdout):
-                    if told.endswith("\n"):
-                        sensor, sequence, crc32 = told.split()
-                        accepted[sensor, epoch, int(sequence)] = int(crc32)
-                    if number == 30 + 17 * epoch:
+                for number, reported in enumerate(process.stdout):
+                    if reported.endswith("\n"):
+                        sensor, sequence, crc32 = reported.split()
+                        accepted[sensor, session_id, int(sequence)] = int(crc32)
+                    if number == 30 + 17 * session_id:
                         process.send_signal(signal.SIGKILL)
                     elif number in (10, 20):
                         central.stop()

@@ -16,7 +16,6 @@ from ertis_cli.status import _drawn
 
 from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.asking import Asking
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.status import (
@@ -28,6 +27,7 @@ from ertis_numba.network.status import (
     SubscriberStatus,
     WorkerStatus,
 )
+from ertis_numba.network.status_client import Asking
 
 CENTRAL, ROBOT, VIEWER = (KeyPair.new(name) for name in ("central", "robot", "viewer"))
 PATIENCE_S = 10.0
@@ -177,8 +177,8 @@ def test_the_command_prints_one_json_object(keys, tmp_path):
     assert result.exit_code == 0
     report = json.loads(result.stdout)
     assert report["event"] == "status"
-    told = msgspec.convert(report, Status)
-    assert (told.address, told.state, told.keys) == (address, "storage", True)
+    reported = msgspec.convert(report, Status)
+    assert (reported.address, reported.state, reported.keys) == (address, "storage", True)
 
 
 def test_a_command_that_gets_no_answer_fails_in_a_line():
@@ -214,7 +214,7 @@ class _Asked:
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_central_node_that_goes_away_is_waited_for(monkeypatch, as_json):
-    monkeypatch.setattr("ertis_numba.network.asking.Asking", lambda *_, **__: _Asked())
+    monkeypatch.setattr("ertis_numba.network.status_client.Asking", lambda *_, **__: _Asked())
     monkeypatch.setattr("ertis_cli.status._REFRESH_S", 0.0)
     result = CliRunner().invoke(cli, ["status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
     if as_json:
@@ -222,8 +222,8 @@ def test_a_central_node_that_goes_away_is_waited_for(monkeypatch, as_json):
         assert [each["event"] for each in events] == ["status", "away", "away", "status"]
         assert events[1] == {"event": "away", "address": BUSY.address, "text": "it has not answered"}
     else:
-        told = [line for line in result.stdout.splitlines() if line.startswith("away: ")]
-        assert told == [f"away: {why}; it said before:" for why in ("it has not answered", "it hung up")]
+        reported = [line for line in result.stdout.splitlines() if line.startswith("away: ")]
+        assert reported == [f"away: {why}; it said before:" for why in ("it has not answered", "it hung up")]
 
 
 def _printed(status):
@@ -265,7 +265,7 @@ def test_a_table_says_all_that_somebody_should_look_at():
         ("a.h5", "", "a.h5 is written, 0 MB in its journal"),
     ],
 )
-def test_what_is_written_is_told_as_it_is(recording, fault, told):
+def test_what_is_written_is_told_as_it_is(recording, fault, reported):
     archive = msgspec.structs.replace(BUSY.archive, recording=recording)
     text = _printed(msgspec.structs.replace(BUSY, archive=archive, fault=fault))
-    assert f"archive /data: {told}, 0 sealed, 0 to seal" in text
+    assert f"archive /data: {reported}, 0 sealed, 0 to seal" in text

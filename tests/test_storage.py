@@ -11,10 +11,11 @@ import xarray
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import (
     EnergyscapeWriter,
-    Gap,
+    RecordingGap,
     RecordingWriter,
     file_kind,
     open_energyscapes,
@@ -23,7 +24,6 @@ from ertis_numba.storage import (
     write_recording,
 )
 from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, lay_out
-from ertis_numba.words import word_format
 from tests.files import SMALL, image, line, noise
 
 
@@ -38,8 +38,8 @@ def test_recording_comes_back(tmp_path, settings):
     with open_recording(path) as recording:
         assert len(recording) == len(given)
         for back, measurement in zip(recording, given, strict=True):
-            assert back.words.dtype == measurement.words.dtype
-            assert np.array_equal(back.words, measurement.words)
+            assert back.data.dtype == measurement.data.dtype
+            assert np.array_equal(back.data, measurement.data)
             assert back.stamp == measurement.stamp
         assert recording[-1].stamp == given[-1].stamp
         assert recording.attributes["source"] == "noise"
@@ -58,14 +58,14 @@ def test_readers_are_sequences(tmp_path):
         assert [item.stamp for item in reversed(recording)] == [item.stamp for item in given[::-1]]
     with open_energyscapes(write_energyscapes(tmp_path / "img.h5", [image()] * 3)) as images:
         assert isinstance(images, Sequence)
-        assert [np.array_equal(each.energy, image().energy) for each in images[1:]] == [True, True]
+        assert [np.array_equal(each.amplitude, image().amplitude) for each in images[1:]] == [True, True]
 
 
 def test_recording_depends_on_no_other_file(tmp_path):
     layout = tmp_path / "mine.csv"
     layout.write_text("0, 0\n4, 0\n8, 1\n")
     settings = SMALL.replace(array=Array(layout=str(layout)))
-    words = noise(count=1)[0].words
+    words = noise(count=1)[0].data
     write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
     layout.unlink()
     with open_recording(tmp_path / "rec.h5") as recording:
@@ -73,26 +73,26 @@ def test_recording_depends_on_no_other_file(tmp_path):
         again = write_recording(tmp_path / "again.h5", recording)
     assert len(image.settings.array.positions_m) == 3
     with open_recording(tmp_path / "again.h5") as recording:  # a copy of a copy drifts by no bit
-        assert np.array_equal(Pipeline(recording.settings).process(recording[0]).energy, image.energy)
+        assert np.array_equal(Pipeline(recording.settings).process(recording[0]).amplitude, image.amplitude)
     assert again.name == "again.h5"
 
 
 def test_gaps_epochs_and_air(tmp_path):
     warm = SMALL.replace(air=Air(temperature_c=31.25, humidity_percent=80.0))
-    words = noise(count=1)[0].words
+    words = noise(count=1)[0].data
     runs = [(3, 7), (4, 7), (9, 7), (1, 2**40), (3, 2**40), (4, 0)]
-    stamps = [Stamp(sequence=sequence, epoch=epoch) for sequence, epoch in runs]
+    stamps = [Stamp(sequence=sequence, session_id=session_id) for sequence, session_id in runs]
     write_recording(
         tmp_path / "rec.h5", (Measurement(words, warm if s.sequence == 9 else SMALL, s) for s in stamps), settings=SMALL
     )
     with open_recording(tmp_path / "rec.h5") as recording:
-        assert [(gap.first, gap.last, gap.epoch) for gap in recording.gaps] == [(5, 8, 7), (2, 2, 2**40)]
+        assert [(gap.first, gap.last, gap.session_id) for gap in recording.gaps] == [(5, 8, 7), (2, 2, 2**40)]
         assert recording.stamps() == stamps
-        assert isinstance(recording.gaps[0], Gap)
+        assert isinstance(recording.gaps[0], RecordingGap)
         assert [m.settings.air for m in recording] == [SMALL.air] * 2 + [warm.air] + [SMALL.air] * 3
         assert recording.settings.air == SMALL.air
     with h5py.File(tmp_path / "rec.h5") as file:
-        assert file["sensors/sensor/epoch"][:].tolist() == [epoch for _, epoch in runs]
+        assert file["sensors/sensor/epoch"][:].tolist() == [session_id for _, session_id in runs]
         assert file["sensors/sensor/gap_epoch"][:].tolist() == [7, 2**40]
 
 
@@ -127,7 +127,7 @@ def test_xarray_shows_named_axes(tmp_path):
         assert data["time"].values[0] == np.datetime64(1_700_000_000_123_456_789, "ns")
         assert set(data.variables) == {variable.name for variable in RECORDING}
     with xarray.open_dataset(tmp_path / "img.h5", group="/sensors/sensor", engine="netcdf4") as data:
-        assert data["energy"].dims == ("time", "direction", "range")
+        assert data["amplitude"].dims == ("time", "direction", "range")
         assert {"azimuth", "elevation", "range", "time"} == set(data.coords)
         assert data["range"].attrs["units"] == "m"
         assert set(data.variables) == {variable.name for variable in ENERGYSCAPE}
@@ -141,10 +141,10 @@ def test_several_words_have_an_axis_of_their_own(tmp_path):
 
 def test_energyscapes_come_back(tmp_path):
     given = image()
-    write_energyscapes(tmp_path / "img.h5", [given, given.replace(energy=given.energy * 2)])
+    write_energyscapes(tmp_path / "img.h5", [given, given.replace(amplitude=given.amplitude * 2)])
     with open_energyscapes(tmp_path / "img.h5") as images:
         assert len(images) == 2
-        assert np.array_equal(images[1].energy, given.energy * 2)
+        assert np.array_equal(images[1].amplitude, given.amplitude * 2)
         for field in ("azimuth_rad", "elevation_rad", "range_m"):
             assert np.array_equal(getattr(images[0], field), getattr(given, field))
         assert images[0].settings.processing == given.settings.processing
@@ -155,8 +155,8 @@ def test_half_precision_keeps_three_digits(tmp_path):
     given = image()
     write_energyscapes(tmp_path / "img.h5", [given], dtype="float16")
     with open_energyscapes(tmp_path / "img.h5") as images:
-        assert images[0].energy.dtype == np.float32
-        np.testing.assert_allclose(images[0].energy, given.energy, rtol=2**-11, atol=2**-25)
+        assert images[0].amplitude.dtype == np.float32
+        np.testing.assert_allclose(images[0].amplitude, given.amplitude, rtol=2**-11, atol=2**-25)
 
 
 def test_result_names_its_recording(tmp_path):
@@ -173,7 +173,7 @@ def test_result_names_its_recording(tmp_path):
 @pytest.mark.parametrize("directions", ["2d:181", "3d:500"])
 def test_replay_gives_the_same_bits_for_any_number_of_threads(tmp_path, directions):
     write_recording(tmp_path / "rec.h5", noise())
-    energies = []
+    amplitudes = []
     with open_recording(tmp_path / "rec.h5") as recording:
         settings = recording.settings.replace(
             processing=Processing(directions=directions, range_m=(0.3, 0.9), elevation_limits_deg=(-30.0, 30.0))
@@ -182,8 +182,8 @@ def test_replay_gives_the_same_bits_for_any_number_of_threads(tmp_path, directio
             pipeline = Pipeline(settings, threads=threads)
             write_energyscapes(tmp_path / "img.h5", map(pipeline.process, recording), overwrite=True)
             with h5py.File(tmp_path / "img.h5") as file:
-                energies.append(file["sensors/eRTIS-7/energy"][:].tobytes())
-    assert energies[0] == energies[1] == energies[2]
+                amplitudes.append(file["sensors/eRTIS-7/energy"][:].tobytes())
+    assert amplitudes[0] == amplitudes[1] == amplitudes[2]
 
 
 def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
@@ -199,7 +199,7 @@ def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
 
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     long = Settings()  # 640 KiB a measurement
-    words = noise(long, 1)[0].words
+    words = noise(long, 1)[0].data
 
     def copy():
         with open_recording(tmp_path / "rec.h5") as recording:
@@ -271,10 +271,10 @@ def spoilt(**settings):
         (spoilt(array=Array(layout="eRTIS_v2")), "other array settings"),
         (spoilt(call=Call(duration_s=2e-3)), "other call settings"),
         (spoilt(recording=Recording(n_samples=50_000)), "other recording settings"),
-        ([Measurement(noise()[0].words, SMALL, Stamp(sensor="a/b"))], "sensor name 'a/b' cannot stand in a file"),
-        ([Measurement(noise()[0].words[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
+        ([Measurement(noise()[0].data, SMALL, Stamp(sensor="a/b"))], "sensor name 'a/b' cannot stand in a file"),
+        ([Measurement(noise()[0].data[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
         (
-            [Measurement(noise()[0].words, SMALL, Stamp(timestamp_uncertainty_ns=2**32))],
+            [Measurement(noise()[0].data, SMALL, Stamp(timestamp_uncertainty_ns=2**32))],
             "timestamp_uncertainty_ns is 4294967296",
         ),
         (noise(SMALL.replace(processing=Processing(directions="grid.csv"))), "is the file grid.csv"),
@@ -297,21 +297,21 @@ def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
             "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808",
         ),
         (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; give"),
-        (Stamp(epoch=2**63), "epoch is 9223372036854775808; give"),
+        (Stamp(session_id=2**63), "epoch is 9223372036854775808; give"),
     ],
-    ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "epoch"],
+    ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "session_id"],
 )
 def test_stamps_that_no_file_can_hold(tmp_path, stamp, message):
     with pytest.raises(ArgumentError, match=message):
-        write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].words, SMALL, stamp)])
+        write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].data, SMALL, stamp)])
     with pytest.raises(ArgumentError, match=message):
         write_energyscapes(tmp_path / "img.h5", [image().replace(stamp=stamp)])
     assert not list(tmp_path.iterdir())
 
 
-def numbered(*numbers, epoch=0):
-    words = noise(count=1)[0].words
-    return [Measurement(words, SMALL, Stamp(sequence=number, epoch=epoch)) for number in numbers]
+def numbered(*numbers, session_id=0):
+    words = noise(count=1)[0].data
+    return [Measurement(words, SMALL, Stamp(sequence=number, session_id=session_id)) for number in numbers]
 
 
 @pytest.mark.parametrize(
@@ -323,8 +323,8 @@ def test_a_number_comes_once_in_a_run(tmp_path, numbers, place):
     message = rf"measurement {place} has sequence {numbers[place]} of epoch 0, which one before it has; give each"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", numbered(*numbers))
-    given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], epoch=1)]
-    given += [Measurement(m.words, SMALL, Stamp(sensor="other", sequence=m.stamp.sequence)) for m in given[:place]]
+    given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], session_id=1)]
+    given += [Measurement(m.data, SMALL, Stamp(sensor="other", sequence=m.stamp.sequence)) for m in given[:place]]
     write_recording(tmp_path / "rec.h5", given)
 
 
@@ -356,7 +356,7 @@ PCM_OF = {
     ids=lambda given: given if isinstance(given, str) else given.recording.encoding,
 )
 def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, dtype):
-    words = word_format(settings)
+    words = sample_format(settings)
     message = rf"measurement 0 holds {dtype} words, its settings want {words.dtype.name}; convert them, or give"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", [Measurement(np.zeros(words.shape, dtype), settings)])
@@ -364,16 +364,16 @@ def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, 
 
 @pytest.mark.parametrize("settings", [SMALL, *PCM_OF.values()], ids=["pdm", *PCM_OF])
 def test_words_of_another_byte_order_are_the_same_words(tmp_path, settings):
-    given = np.ones(word_format(settings).shape, word_format(settings).dtype.newbyteorder(">"))
+    given = np.ones(sample_format(settings).shape, sample_format(settings).dtype.newbyteorder(">"))
     write_recording(tmp_path / "rec.h5", [Measurement(given, settings)])
     with open_recording(tmp_path / "rec.h5") as recording:
-        assert np.array_equal(recording[0].words, given)
+        assert np.array_equal(recording[0].data, given)
 
 
 @pytest.mark.parametrize("number", [np.nan, -np.inf], ids=str)
 def test_what_is_no_number_is_not_recorded(tmp_path, number):
     settings = PCM_OF["float32"]
-    words = np.zeros(word_format(settings).shape, np.float32)
+    words = np.zeros(sample_format(settings).shape, np.float32)
     words[7, 2] = number
     with pytest.raises(ArgumentError, match=rf"measurement 0 holds {number} at \[7, 2\]; give finite numbers"):
         write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
@@ -429,4 +429,4 @@ def test_image_too_large_for_one_piece_is_refused(tmp_path):
     with h5py.File(tmp_path / "large.h5", "w") as file:
         sizes = {"direction": 1_000_000, "range": 1_178}
         with pytest.raises(ArgumentError, match="energy of 1000000 directions × 1178 ranges exceeds the 4 GiB"):
-            lay_out(file, ENERGYSCAPE, sizes=sizes, dtypes={"energy": "<f4"})
+            lay_out(file, ENERGYSCAPE, sizes=sizes, dtypes={"amplitude": "<f4"})

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba import atomic
+from ertis_numba import atomic_files
 from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
 from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
@@ -229,10 +229,10 @@ def test_one_damaged_bit_never_passes(tmp_path):
     """Wherever it is, reading gives what was written or a `DataError` of one line."""
     given = noise(line(8, 8).replace(recording=Recording(n_samples=512)), 2)
     wall = Reflector(name="wall", azimuth_deg=10.0, elevation_deg=20.0, range_m=1.5, level_db=0.0)
-    told = Truth(scene="", seed=1, reflectors=((), (wall,)))
-    path = write_recording(tmp_path / "rec.h5", given, truth={"eRTIS-7": told})
+    reported = Truth(scene="", seed=1, reflectors=((), (wall,)))
+    path = write_recording(tmp_path / "rec.h5", given, truth={"eRTIS-7": reported})
     with open_recording(path) as recording:
-        told = recording.truth
+        reported = recording.truth
     whole = path.read_bytes()
     rng = np.random.default_rng(5)
     refusals = []
@@ -242,9 +242,9 @@ def test_one_damaged_bit_never_passes(tmp_path):
         path.write_bytes(spoilt)
         try:
             with open_recording(path) as recording:
-                assert recording.truth == told
+                assert recording.truth == reported
                 for back, measurement in zip(recording, given, strict=True):
-                    assert np.array_equal(back.words, measurement.words)
+                    assert np.array_equal(back.data, measurement.data)
                     assert back.stamp == measurement.stamp
         except DataError as error:
             refusals.append(str(error))
@@ -262,7 +262,7 @@ def test_settings_that_were_changed(path):
 
 def test_no_room(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr(atomic, "SPARE_BYTES", 2 * free)
+    monkeypatch.setattr(atomic_files, "SPARE_BYTES", 2 * free)
     with pytest.raises(
         DataError, match=r"MB free, wanted [\d.]+ MB for what is next, \d+ MB of it to spare; free some"
     ):

@@ -68,13 +68,13 @@ def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monke
     ],
     ids=["unallocated", "attributes"],
 )
-def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, told):
+def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, reported):
     path = write_good(tmp_path / "good.h5")
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         spoil(file.create_group("extra"))
     (report,) = verify(path)
     assert not report.whole
-    assert told in report.remark
+    assert reported in report.remark
 
 
 def test_verify_refuses_other_objects_in_other_files(tmp_path):

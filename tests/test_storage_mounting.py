@@ -98,8 +98,8 @@ def test_what_is_given_counts_more_than_the_recording(recorded, tmp_path):
         ({"back": PLACES["left"]}, "mounting is given for sensor 'back', of which no measurement came"),
     ],
 )
-def test_mountings_that_cannot_be(tmp_path, given, told):
-    with pytest.raises(ArgumentError, match=told):
+def test_mountings_that_cannot_be(tmp_path, given, reported):
+    with pytest.raises(ArgumentError, match=reported):
         write_energyscapes(tmp_path / "img.h5", images("left"), mounting=given)
     assert not [*tmp_path.iterdir()]
 
@@ -111,11 +111,11 @@ def test_mountings_that_cannot_be(tmp_path, given, told):
         (lambda attributes: attributes.modify("rotation_xyzw", np.full(4, np.nan)), "rotation_xyzw of sensor left"),
     ],
 )
-def test_half_a_mounting_is_damage(tmp_path, spoil, told):
+def test_half_a_mounting_is_damage(tmp_path, spoil, reported):
     path = write_energyscapes(tmp_path / "img.h5", images("left"), mounting={"left": PLACES["left"]})
     with h5py.File(path, "r+") as file:
         spoil(file["sensors/left"].attrs)
-    with pytest.raises(DamagedError, match=f"img.h5.*{told}"):
+    with pytest.raises(DamagedError, match=f"img.h5.*{reported}"):
         open_energyscapes(path)
 
 
@@ -220,9 +220,11 @@ def test_point_clouds_of_an_unknown_mounting_have_no_place_on_a_platform():
 @pytest.mark.parametrize("place", [None, (1.0, 2.0, 3.0)])
 def test_mountings_travel_over_the_wire(place):
     rotation = None if place is None else (0.0, 0.0, 0.0, 1.0)
-    hello = Hello(sensor="a", epoch=1, next_sequence=0, settings_crc32=0, translation_m=place, rotation_xyzw=rotation)
+    hello = Hello(
+        sensor="a", session_id=1, next_sequence=0, settings_crc32=0, translation_m=place, rotation_xyzw=rotation
+    )
     assert decode(encode(hello)) == hello
-    assert Hello(sensor="a", epoch=1, next_sequence=0, settings_crc32=0).translation_m is None
+    assert Hello(sensor="a", session_id=1, next_sequence=0, settings_crc32=0).translation_m is None
 
 
 def test_processing_refuses_to_write_a_picture(tmp_path):

@@ -42,7 +42,7 @@ def test_sensors_come_back(tmp_path):
             assert (recording.sensor, recording.sensors) == (name, ("right", "left"))
             assert recording.stamps() == [m.stamp for m in given]
             for back, measurement in zip(recording, given, strict=True):
-                assert np.array_equal(back.words, measurement.words)
+                assert np.array_equal(back.data, measurement.data)
                 assert back.stamp == measurement.stamp
             assert recording.settings.replace(array=wanted.array) == wanted
     with xarray.open_dataset(path, group="/sensors/left", engine="netcdf4") as data:
@@ -61,18 +61,18 @@ def test_energyscapes_of_several_sensors_come_back(tmp_path):
         with open_energyscapes(tmp_path / "img.h5", sensor=name) as back:
             given = [image for image in images if image.stamp.sensor == name]
             assert back.attributes["recording_sha256"] == digest
-            assert [np.array_equal(one.energy, other.energy) for one, other in zip(back, given, strict=True)] == [
+            assert [np.array_equal(one.amplitude, other.amplitude) for one, other in zip(back, given, strict=True)] == [
                 True
             ] * len(given)
 
 
 def test_each_sensor_has_gaps_and_epochs_of_its_own(tmp_path):
     given = two()
-    given[2] = replace(given[2], stamp=replace(given[2].stamp, sequence=20, epoch=3))
+    given[2] = replace(given[2], stamp=replace(given[2].stamp, sequence=20, session_id=3))
     given.append(replace(given[2], stamp=replace(given[2].stamp, sequence=22)))
     write_recording(tmp_path / "rec.h5", given)
     with open_recording(tmp_path / "rec.h5", sensor="left") as left:
-        assert [(gap.first, gap.last, gap.epoch) for gap in left.gaps] == [(21, 21, 3)]
+        assert [(gap.first, gap.last, gap.session_id) for gap in left.gaps] == [(21, 21, 3)]
     with open_recording(tmp_path / "rec.h5", sensor="right") as right:
         assert right.gaps == ()
     with h5py.File(tmp_path / "rec.h5") as file:

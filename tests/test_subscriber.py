@@ -49,12 +49,12 @@ def test_each_product_comes_as_it_was_sent(publisher):
             came.append(got(publisher, subscriber))
             consumed(publisher, len(came))
         assert [kind_of(item) for item in came] == list(ALL)
-        np.testing.assert_array_equal(came[0].energy, sent[0].energy)
+        np.testing.assert_array_equal(came[0].amplitude, sent[0].amplitude)
         for name in ("azimuth_rad", "elevation_rad", "range_m"):
             np.testing.assert_array_equal(getattr(came[0], name), getattr(sent[0], name))
         np.testing.assert_array_equal(came[1].position_m, sent[1].position_m)
-        np.testing.assert_array_equal(came[1].energy, sent[1].energy)
-        np.testing.assert_array_equal(came[2].words, sent[2].words)
+        np.testing.assert_array_equal(came[1].amplitude, sent[1].amplitude)
+        np.testing.assert_array_equal(came[2].data, sent[2].data)
         assert [item.stamp for item in came[:3]] == [item.stamp for item in sent[:3]]
         assert [item.settings for item in came[:3]] == [SETTINGS] * 3
         assert came[1].translation_m == publisher.translation_m
@@ -85,13 +85,13 @@ def test_what_came_with_a_product(publisher):
 
 def test_images_of_half_precision_come_as_float32(publisher):
     half = image(reflectors=[(0, 1, 1.0)])
-    half = half.replace(energy=half.energy.astype(np.float16))
+    half = half.replace(amplitude=half.amplitude.astype(np.float16))
     with Subscriber(publisher.address) as subscriber:
         subscribed(publisher)
         publisher.publish(half)
         came = got(publisher, subscriber)
-    assert came.energy.dtype == np.float32
-    np.testing.assert_array_equal(came.energy, half.energy.astype(np.float32))
+    assert came.amplitude.dtype == np.float32
+    np.testing.assert_array_equal(came.amplitude, half.amplitude.astype(np.float32))
 
 
 def test_the_air_of_a_raw_measurement_is_its_own(publisher):

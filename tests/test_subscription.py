@@ -15,7 +15,7 @@ from ertis_numba.errors import RefusedError
 from ertis_numba.network import _subscription, messages
 from ertis_numba.network.allow_list import AllowList
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
-from ertis_numba.network.processing import Options, Processing
+from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from tests.publishing import (
@@ -203,16 +203,16 @@ def offered(processing, subscriber, sequences):
         given = measurement(sequence)
         data = messages.Data(
             sensor="front",
-            epoch=7,
+            session_id=7,
             sequence=sequence,
             sync_count=sequence,
             timestamp_ns=given.stamp.timestamp_ns,
             uncertainty_ns=900,
             monotonic_ns=time.monotonic_ns(),
             **{name: getattr(SETTINGS.air, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")},
-            crc32=zlib.crc32(given.words.data),
+            crc32=zlib.crc32(given.data.data),
         )
-        processing.offer(data, given.words, time.monotonic_ns())
+        processing.offer(data, given.data, time.monotonic_ns())
         turned(processing, lambda: [came.append(subscriber.receive(0)), came[-1]][-1] is not None)
     return [item for item in came if item is not None]
 
@@ -230,10 +230,12 @@ def turned(processing, until):
 
 
 def test_images_of_a_real_publisher_which_dies_and_comes_back(keys):
-    processing = Processing(Options(publish="tcp://127.0.0.1:0", keys=keys["server"], device="cpu", workers=1))
+    processing = ImageProcessing(
+        ProcessingOptions(publish="tcp://127.0.0.1:0", keys=keys["server"], device="cpu", workers=1)
+    )
     processing.start()
     with contextlib.closing(processing), Subscriber(processing.address, keys=keys["known"]) as subscriber:
-        processing.know(messages.Hello(sensor="front", epoch=7, next_sequence=0, settings_crc32=0), SETTINGS)
+        processing.know(messages.Hello(sensor="front", session_id=7, next_sequence=0, settings_crc32=0), SETTINGS)
         turned(processing, lambda: processing.status().subscribers)
         images = offered(processing, subscriber, range(3))
         # Whoever kills it must know it: it is nobody's business otherwise.
@@ -245,6 +247,6 @@ def test_images_of_a_real_publisher_which_dies_and_comes_back(keys):
         assert (subscriber.counts.received, subscriber.counts.missed, subscriber.counts.reconnects) == (6, 0, 1)
     with Pipeline(SETTINGS, device="cpu") as pipeline:
         expected = pipeline.process(measurement(5))
-    np.testing.assert_array_equal(images[5].energy, expected.energy)
+    np.testing.assert_array_equal(images[5].amplitude, expected.amplitude)
     np.testing.assert_array_equal(images[5].range_m, expected.range_m)
     assert images[5].stamp == measurement(5).stamp

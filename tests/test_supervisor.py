@@ -40,19 +40,19 @@ def test_record_restarts_at_its_address_without_losing_acknowledged_measurements
     with Recording(tmp_path) as central, Node(central.address) as node:
         node.hello(first=0)
         node.measure(*given[:10])
-        assert node.hear_settled(9).settled == 9
+        assert node.hear_settled(9).acked_through == 9
         os.kill(central.started["pid"], number)
         restarted = central.event("restarted")
         assert central.event("listening")["address"] == central.address
         with Node(central.address) as again:
-            assert again.hello(first=10).settled == 9
+            assert again.hello(first=10).acked_through == 9
             again.measure(*given[10:])
             again.hear_settled(19)
             central.process.send_signal(signal.SIGTERM)
-            told = central.event("recorded")
+            reported = central.event("recorded")
             assert central.process.wait() == 0
     assert restarted == {"event": "restarted", "restarts": 1, "reason": signal.Signals(number).name}
-    assert told["restarts"] == 1
+    assert reported["restarts"] == 1
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
@@ -107,10 +107,10 @@ def test_supervisor_fails_after_ten_restarts_in_vain_and_keeps_measurements(end,
             broken.touch()
             os.kill(central.started["pid"], signal.SIGKILL)
             assert central.process.wait(TIMEOUT_S) == 1
-        told = stderr.read()
+        reported = stderr.read()
         assert "restarted" not in central.process.stdout.read()
     failed = f"ertis: error: the central node's process failed to start 10 times in a row ({reason}); all acknowledged"
-    assert told.startswith(failed)
+    assert reported.startswith(failed)
     assert stored(tmp_path / "a")[0] == wanted(given)
 
 

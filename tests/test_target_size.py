@@ -12,11 +12,11 @@ WAVE = 2 * np.pi * BAND_HZ / SPEED_M_S
 CENTRE_M = np.array([0.4, 0.0, 0.0])
 
 
-def pair(ear_m, mouth_m, **more):
+def pair(receiver_m, mouth_m, **more):
     """A sensor that hears what an emitter elsewhere sends."""
-    ear = EAR.replace(position_m=vector(ear_m), emitter=Emitter(silent=True))
-    mouth = EAR.replace(name="mouth", position_m=vector(mouth_m))
-    return scene_of(sensor=ear, **more).replace(sensors=(ear, mouth))
+    receiver = EAR.replace(position_m=vector(receiver_m), emitter=Emitter(silent=True))
+    transmitter = EAR.replace(name="mouth", position_m=vector(mouth_m))
+    return scene_of(sensor=receiver, **more).replace(sensors=(receiver, transmitter))
 
 
 def of_the_call(signal):
@@ -51,13 +51,13 @@ def test_sphere_echo_matches_the_partial_wave_series(radius_m):
 
 @pytest.mark.parametrize("radius_m", [0.001, 0.003, 0.008])
 def test_sphere_bistatic_echo_matches_the_partial_wave_series(radius_m):
-    ear_m, mouth_m = np.array([0.0, 0.0, 0.0]), np.array([0.1, 0.4, 0.0])
-    scene = pair(ear_m, mouth_m, spheres=(Sphere(position_m=vector(CENTRE_M), radius_m=radius_m),))
-    silent = pair(ear_m, mouth_m)
+    receiver_m, mouth_m = np.array([0.0, 0.0, 0.0]), np.array([0.1, 0.4, 0.0])
+    scene = pair(receiver_m, mouth_m, spheres=(Sphere(position_m=vector(CENTRE_M), radius_m=radius_m),))
+    silent = pair(receiver_m, mouth_m)
     names = ("spreading", "target_size", "cross_emission")
     echo = heard(scene, *names)[0] - heard(silent, *names)[0]
-    first_m, second_m = np.linalg.norm(mouth_m - CENTRE_M), np.linalg.norm(ear_m - CENTRE_M)
-    cos_between = (mouth_m - CENTRE_M) @ (ear_m - CENTRE_M) / first_m / second_m
+    first_m, second_m = np.linalg.norm(mouth_m - CENTRE_M), np.linalg.norm(receiver_m - CENTRE_M)
+    cos_between = (mouth_m - CENTRE_M) @ (receiver_m - CENTRE_M) / first_m / second_m
     wanted = np.array([series_of_a_sphere(radius_m, first_m, second_m, cos_between, wave) for wave in WAVE])
     assert_allclose(of_the_call(echo) / wanted, 1.0, atol=0.06)
 
@@ -71,7 +71,7 @@ def test_small_sphere_follows_rayleigh_scattering():
         assert abs(amplitude[0]) == pytest.approx(5 / 6 * 0.001 * size**2, rel=0.5 * size**2 + 0.002)
 
 
-def kirchhoff(radius_m, mouth_m, ear_m, normal, wave, count=200):
+def kirchhoff(radius_m, mouth_m, receiver_m, normal, wave, count=200):
     """Kirchhoff's integral over a disc at the origin, relative to its echo straight back from afar."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     places_m = radius_m * (nodes + 1) / 2
@@ -80,8 +80,8 @@ def kirchhoff(radius_m, mouth_m, ear_m, normal, wave, count=200):
     across /= np.linalg.norm(across)
     up = np.cross(normal, across)
     points_m = places_m[:, None, None] * (np.cos(around)[:, None] * across + np.sin(around)[:, None] * up)
-    legs_m = [np.linalg.norm(points_m - end_m, axis=-1) for end_m in (mouth_m, ear_m)]
-    ends_m = [np.linalg.norm(end_m) for end_m in (mouth_m, ear_m)]
+    legs_m = [np.linalg.norm(points_m - end_m, axis=-1) for end_m in (mouth_m, receiver_m)]
+    ends_m = [np.linalg.norm(end_m) for end_m in (mouth_m, receiver_m)]
     falls = ends_m[0] * ends_m[1] / (legs_m[0] * legs_m[1])
     phases = np.exp(-1j * wave * (legs_m[0] + legs_m[1] - sum(ends_m)))
     return np.sum((weights * places_m)[:, None] * falls * phases) / count / radius_m
@@ -102,9 +102,9 @@ def test_disc_echo_matches_kirchhoffs_integral(diameter_m, turned_deg):
 
 def test_near_disc_echo_differs_between_microphones():
     """A disc of 10 cm at 40 cm: a microphone 5 cm aside is almost in its shadow."""
-    ear = EAR.replace(array=line_array(3, 0.05))
+    receiver = EAR.replace(array=line_array(3, 0.05))
     disc = Point(position_m=vector(CENTRE_M), diameter_m=0.1, facing_deg=(180, 0), strength_db=0.0)
-    [echo] = ways(scene_of(disc, sensor=ear), "target_size", frequency_hz=BAND_HZ)
+    [echo] = ways(scene_of(disc, sensor=receiver), "target_size", frequency_hz=BAND_HZ)
     for mic, y_m in enumerate((-0.05, 0.0, 0.05)):
         ends_m = (-CENTRE_M, np.array([-0.4, y_m, 0.0]))
         wanted = [kirchhoff(0.05, *ends_m, np.array([-1.0, 0.0, 0.0]), wave) for wave in WAVE]

@@ -49,7 +49,7 @@ def measurement_of(settings, seed=1):
 
 def wanted_of(image, measurement):
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    return referee.exact(measurement.words, image.settings, directions, image.range_m)
+    return referee.exact(measurement.data, image.settings, directions, image.range_m)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def wanted_of(image, measurement):
         pytest.param(small(processing=FIVE.replace(band_edges_hz=(5e3, 90e3))), id="wide band"),
         pytest.param(small(processing=FIVE.replace(beamformer="coherence_factor")), id="coherence factor"),
         pytest.param(small(processing=FIVE.replace(beamformer="dmas", dmas_order=3), array=CALIBRATED), id="dmas"),
-        pytest.param(small(processing=FIVE.replace(beamformer="capon", loading=1e-3)), id="capon"),
+        pytest.param(small(processing=FIVE.replace(beamformer="capon", diagonal_loading=1e-3)), id="capon"),
     ],
 )
 def test_exact_image_agrees_with_referee(settings):
@@ -77,7 +77,7 @@ def test_exact_image_agrees_with_referee(settings):
 def test_default_band_edges_are_5_khz_outside_the_call():
     measurement = measurement_of(small())
     images = [
-        Pipeline(small(processing=FIVE.replace(band_edges_hz=edges_hz)), "cpu", 1).process(measurement).energy
+        Pipeline(small(processing=FIVE.replace(band_edges_hz=edges_hz)), "cpu", 1).process(measurement).amplitude
         for edges_hz in (None, (20e3, 55e3))
     ]
     np.testing.assert_array_equal(*images)
@@ -108,7 +108,7 @@ def test_images_of_short_and_rampless_calls_keep_their_budgets(settings, budget_
     """The matched filter once had the spectrum of a call that aliased at the decimated rate: up to 75 dB worse."""
     measurement = measurement_of(settings)
     image = Pipeline(settings, "cpu", 1, max_error_db=budget_db, predict=False).process(measurement)
-    true_db = reference.error_db(image.energy, wanted_of(image, measurement))
+    true_db = reference.error_db(image.amplitude, wanted_of(image, measurement))
     assert true_db <= budget_db
     assert verification.measure(image, measurement).error_db == pytest.approx(true_db, abs=0.1)
 
@@ -134,7 +134,7 @@ def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer):
     (measurement,) = noise(count=1)
     settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
     image = Pipeline(settings, max_error_db=0).process(measurement)
-    true_db = reference.error_db(image.energy, wanted_of(image, measurement))
+    true_db = reference.error_db(image.amplitude, wanted_of(image, measurement))
     assert sensor["verified"]["error_db"] == pytest.approx(true_db, abs=0.05)
 
 
@@ -155,7 +155,7 @@ def test_sampled_places_stand_for_all(monkeypatch, wavefront, n_sampled):
     processing = measurement.settings.processing.replace(directions=directions, range_m=range_m, wavefront=wavefront)
     image = Pipeline(measurement.settings.replace(processing=processing)).process(measurement)
     whole = verification.measure(image, measurement)
-    assert whole.n_directions == len(image.energy)
+    assert whole.n_directions == len(image.amplitude)
     assert whole.peaks.lost == 0
     operations = ExactImage(image, measurement).operations_per_direction
     monkeypatch.setattr(_measured, "_MAX_OPERATIONS", n_sampled * operations)
@@ -194,10 +194,10 @@ def test_bench_verification_reports_every_kind_of_setting(tmp_path):
 
 def test_bench_verification_names_what_is_wrong(monkeypatch):
     monkeypatch.setattr(verification, "measure", lambda *_: verification.Measured(-90.0, 1, None))
-    said = []
-    (row,) = campaign.run(count=1, seed=1, say=said.append)["rows"]
+    stated = []
+    (row,) = campaign.run(count=1, seed=1, say=stated.append)["rows"]
     assert row["wrong"]
-    assert said == [f"seed 1: verified -90.00 dB, true {row['true_db']:.2f} dB"]
+    assert stated == [f"seed 1: verified -90.00 dB, true {row['true_db']:.2f} dB"]
 
 
 def test_random_settings_are_of_every_kind():
@@ -211,7 +211,7 @@ def test_random_settings_are_of_every_kind():
     assert {settings.processing.wavefront for settings in drawn} == {"plane", "spherical"}
     assert {settings.recording.encoding for settings in drawn} == {"pdm", "int16", "float32"}
     assert sum(settings.call.ramp_fraction == 0 for settings in drawn) > 10
-    assert random_measurement(7).words.tobytes() == random_measurement(7).words.tobytes()
+    assert random_measurement(7).data.tobytes() == random_measurement(7).data.tobytes()
 
 
 def test_random_settings_refuse_limits_that_nothing_meets():

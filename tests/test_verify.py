@@ -75,8 +75,12 @@ def test_gaps_and_all_damaged_measurements_are_told(recording):
         f"{recording}  left: 6 measurements, 6 missing (13: footer; 16 to 17: not among the measurements given; "
         "19 to 21: the sensor was unplugged), 4 damaged (at 0, 2 to 4)\n"
     )
-    told = json.loads(run("verify", recording, "--json", code=3).stdout)["files"][0]
-    assert (told["whole"], told["sensors"][0]["missing"], len(told["sensors"][0]["damaged"])) == (False, 6, 4)
+    reported = json.loads(run("verify", recording, "--json", code=3).stdout)["files"][0]
+    assert (reported["whole"], reported["sensors"][0]["missing"], len(reported["sensors"][0]["damaged"])) == (
+        False,
+        6,
+        4,
+    )
 
 
 @pytest.fixture
@@ -101,21 +105,21 @@ def test_a_number_that_comes_twice_is_told(tmp_path):
 
 
 def test_numbers_that_start_again(tmp_path):
-    with create(tmp_path, entries(2, first=8, epoch=1)) as journal:
-        journal.append(entries(2, first=0, epoch=2))
+    with create(tmp_path, entries(2, first=8, session_id=1)) as journal:
+        journal.append(entries(2, first=0, session_id=2))
     assert verify(journal.path)[0].whole
     given = measurements(8, 9, 0, 1)
-    given[2:] = [replace(m, stamp=replace(m.stamp, epoch=2**62)) for m in given[2:]]
+    given[2:] = [replace(m, stamp=replace(m.stamp, session_id=2**62)) for m in given[2:]]
     assert verify(write_recording(tmp_path / "rec.h5", given))[0].whole
 
 
 def test_gaps_of_two_runs(tmp_path):
     """Each run has its own numbers, also where both have given the same ones."""
-    with create(tmp_path, [*entries(1, first=0, epoch=9), *entries(1, first=3, epoch=9)]) as journal:
-        journal.append([*entries(2, first=0, epoch=4), *entries(1, first=3, epoch=4)])
-        journal.note_gap("left", 2, 2, "footer", epoch=4)
-        journal.note_gap("left", 2, 2, "it never arrived", epoch=9)
-        journal.note_gap("left", 0, 1, "it was silent", epoch=3)
+    with create(tmp_path, [*entries(1, first=0, session_id=9), *entries(1, first=3, session_id=9)]) as journal:
+        journal.append([*entries(2, first=0, session_id=4), *entries(1, first=3, session_id=4)])
+        journal.note_gap("left", 2, 2, "footer", session_id=4)
+        journal.note_gap("left", 2, 2, "it never arrived", session_id=9)
+        journal.note_gap("left", 0, 1, "it was silent", session_id=3)
     spoil(journal.path, "UPDATE measurements SET words = x'00' WHERE id = 3")
     wanted = [
         (1, 1, UNKNOWN, 9),
@@ -125,7 +129,7 @@ def test_gaps_of_two_runs(tmp_path):
         (0, 1, "it was silent", 3),
     ]
     (report,) = verify(journal.path)
-    assert [(gap.first, gap.last, gap.reason, gap.epoch) for gap in report.gaps] == wanted
+    assert [(gap.first, gap.last, gap.reason, gap.session_id) for gap in report.gaps] == wanted
     shutil.copy(journal.path, tmp_path / "kept")
     seal(journal.path)
     shutil.move(tmp_path / "kept", journal.path)
@@ -133,12 +137,12 @@ def test_gaps_of_two_runs(tmp_path):
     seal(journal.path)  # killed in between
     assert (tmp_path / "rec.h5").stat().st_ino == before
     (report,) = verify(tmp_path / "rec.h5")
-    assert [(gap.first, gap.last, gap.reason, gap.epoch) for gap in report.gaps] == wanted
+    assert [(gap.first, gap.last, gap.reason, gap.session_id) for gap in report.gaps] == wanted
     assert (report.disordered, report.damaged) == ((), ())
 
 
 def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
-    given = [*entries(2, first=8, epoch=2**63 - 1), *entries(3, first=0, epoch=1)]
+    given = [*entries(2, first=8, session_id=2**63 - 1), *entries(3, first=0, session_id=1)]
     create(tmp_path, given).close()
     path = seal(tmp_path / "rec.h5.journal").recording
     assert verify(path)[0].whole
@@ -151,7 +155,7 @@ def test_files_from_before_epochs_were_numbers_of_runs():
     path = Path(__file__).parent / "recordings" / "before_epochs.h5"
     with h5py.File(path) as file:
         (group,) = file["sensors"].values()
-        assert (group["epoch"].dtype.str, "gap_epoch" in group) == ("<i4", False)
+        assert (group["session_id"].dtype.str, "gap_session_id" in group) == ("<i4", False)
     assert all(report.whole for report in verify(path))
 
 
@@ -184,7 +188,7 @@ def test_journals(tmp_path):
     path = crashed(tmp_path, [*entries(2), *entries(1, sensor="right")])
     assert [report.whole for report in verify(path)] == [True, True]
     with Journal.open(path) as journal:
-        journal.note_gap("left", 12, 13, "footer", epoch=EPOCH)
+        journal.note_gap("left", 12, 13, "footer", session_id=EPOCH)
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id <= 2")
     left, right = verify(path)
     assert right.whole
@@ -203,8 +207,8 @@ def test_several_files_and_such_that_cannot_be_read(tmp_path, recording):
     assert "is an energyscape file, wanted a recording" in done.stderr
     assert "used.h5.journal is in use by another process" in done.stderr
     assert done.stdout.startswith(f"{recording}  left: 6 measurements")
-    told = json.loads(run("verify", images, recording, "--json", code=1).stdout)["files"]
-    assert ["error" in file for file in told] == [True, False]
+    reported = json.loads(run("verify", images, recording, "--json", code=1).stdout)["files"]
+    assert ["error" in file for file in reported] == [True, False]
 
 
 def test_a_recording_without_a_sensor(recording):

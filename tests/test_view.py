@@ -10,11 +10,11 @@ import plyfile
 import pytest
 from PIL import Image
 
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Call, Processing
-from ertis_numba.stages.side_lobes import without_side_lobes
-from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, Scene, Sector, Taken, _axes
+from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, ReceivedImage, Sector, ViewedScene, _axes
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._choices import colour_table
 from ertis_numba.viewer._polar import cropped
@@ -47,10 +47,10 @@ IMAGES = {
 @pytest.mark.parametrize("name", IMAGES)
 def test_pictures_of_all_kinds_of_axes(name):
     polar = Polar(IMAGES[name])
-    picture = polar.picture(polar.levels(IMAGES[name].energy), TABLE)
+    picture = polar.picture(polar.levels(IMAGES[name].amplitude), TABLE)
     assert picture.shape == (*polar.shape, 3)
     assert (picture == TABLE[255]).all(axis=2).sum() >= (1 if name == "many ranges" else 4)
-    assert polar.levels(np.zeros_like(IMAGES[name].energy)).max() == 0
+    assert polar.levels(np.zeros_like(IMAGES[name].amplitude)).max() == 0
     assert (picture[[0, -1]] == PAGE).all()
 
 
@@ -59,7 +59,7 @@ def test_pictures_of_all_kinds_of_axes(name):
 def test_a_reflector_is_drawn_where_it_is(place, window_m):
     made = cropped(spot(*place), window_m)
     polar = Polar(made)
-    x, y = brightest(polar.picture(polar.levels(made.energy), TABLE)[:-66])
+    x, y = brightest(polar.picture(polar.levels(made.amplitude), TABLE)[:-66])
     azimuth_deg, range_m = polar.place_of(x, y)
     assert azimuth_deg == pytest.approx(place[0], abs=0.8)
     assert range_m == pytest.approx(place[1], abs=0.015)
@@ -98,10 +98,10 @@ def test_no_names_overlap(half_deg, range_m, monkeypatch):
 
 def test_levels_are_those_below_the_strongest():
     made = spot(0, 2.0)
-    levels = Polar(made, dynamic_range_db=40).levels(made.energy)
-    half = made.replace(energy=np.where(made.energy == made.energy.max(), made.energy, made.energy / 10))
+    levels = Polar(made, dynamic_range_db=40).levels(made.amplitude)
+    half = made.replace(amplitude=np.where(made.amplitude == made.amplitude.max(), made.amplitude, made.amplitude / 10))
     assert levels.max() == 255
-    there = Polar(half, dynamic_range_db=40).levels(half.energy)
+    there = Polar(half, dynamic_range_db=40).levels(half.amplitude)
     seen = (levels > 140) & (levels < 255)
     np.testing.assert_allclose(levels[seen].astype(int) - there[seen], 255 * 20 / 40, atol=1)
 
@@ -112,10 +112,10 @@ def test_a_window_outside_of_the_image_shows_its_end():
 
 
 def test_points_follow_threshold_and_window():
-    scene = Scene()
+    scene = ViewedScene()
     made = spot(-40, 1.5)
     weak = spot(30, 3.0, level=0.5 * 10 ** (-15 / 20))
-    scene.take(taken(made.replace(energy=np.maximum(made.energy, weak.energy)), TURNED))
+    scene.take(taken(made.replace(amplitude=np.maximum(made.amplitude, weak.amplitude)), TURNED))
 
     def points(**choices):
         drawn = scene.draw(Choices(**choices)).sensors["front"]
@@ -133,7 +133,7 @@ def test_points_follow_threshold_and_window():
 
 
 def test_points_stay_and_fade():
-    scene = Scene()
+    scene = ViewedScene()
     for number in range(4):
         scene.take(taken(spot(10 * number, 2.0), time_s=0.1 * number))
     latest = scene.draw(Choices()).sensors["front"]
@@ -147,7 +147,7 @@ def test_points_stay_and_fade():
 
 
 def test_what_two_sensors_see_becomes_one_image():
-    scene = Scene()
+    scene = ViewedScene()
     left = Pose((0.0, 1.0, 0.3))
     right = Pose((0.0, -1.0, 0.3), (0.0, 0.0, math.sin(math.radians(15)), math.cos(math.radians(15))))
     for name, pose, turned_deg in (("left", left, 0), ("right", right, 30)):
@@ -170,14 +170,14 @@ def test_what_two_sensors_see_becomes_one_image():
 
 @pytest.mark.parametrize("threshold_db", [-20.0, -3.0])
 def test_an_image_with_elevations_is_a_dome_of_echoes(threshold_db):
-    scene = Scene()
+    scene = ViewedScene()
     speckle = solid()
-    made = speckle.replace(energy=speckle.energy + np.float32(0.1))
+    made = speckle.replace(amplitude=speckle.amplitude + np.float32(0.1))
     scene.take(taken(made))
     frame = scene.draw(Choices(colours="viridis", threshold_db=threshold_db))
     (drawn,) = frame.sensors.values()
     assert isinstance(drawn.shape, Dome)
-    highest = without_side_lobes(made).energy.max(axis=1)
+    highest = without_side_lobes(made).amplitude.max(axis=1)
     seen = highest >= highest.max() * 10 ** (threshold_db / 20)
     assert 0 < np.count_nonzero(seen) <= len(seen)
     azimuth_rad = np.arctan2(drawn.shape.position_m[:, 1], drawn.shape.position_m[:, 0])
@@ -194,7 +194,7 @@ def test_maps_of_colours_rise_in_brightness():
 
 
 def test_files_hold_what_is_drawn():
-    scene = Scene()
+    scene = ViewedScene()
     choices = Choices(threshold_db=-30, range_m=(0.8, 4.0))
     scene.take(taken(spot(-40, 1.5, timestamp_ns=1_700_000_000_123_000_000), TURNED))
     scene.take(taken(spot(20, 3.5, sensor="other"), Pose((0.0, 0.0, 0.1))))
@@ -213,9 +213,9 @@ def test_the_points_that_are_saved_are_those_that_are_drawn():
     """Also where the strongest of the image lies beyond the window, and between directions."""
     rng = np.random.default_rng(5)
     noisy = image(np.linspace(-90, 90, 91))
-    energy = rng.rayleigh(0.05, noisy.energy.shape).astype(np.float32) + spot(11.3, 1.507).energy
-    scene = Scene()
-    scene.take(taken(noisy.replace(energy=energy), TURNED))
+    amplitude = rng.rayleigh(0.05, noisy.amplitude.shape).astype(np.float32) + spot(11.3, 1.507).amplitude
+    scene = ViewedScene()
+    scene.take(taken(noisy.replace(amplitude=amplitude), TURNED))
     for choices in (Choices(threshold_db=-12), Choices(threshold_db=-18, range_m=(1.5, 4.0))):
         drawn = scene.draw(choices).sensors["sensor"]
         vertex = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(choices))))["vertex"]
@@ -230,7 +230,7 @@ def test_points_have_the_uncertainty_of_their_own_call():
     first = spot(10, 1.5)
     wider = first.settings.replace(call=Call(start_frequency_hz=90e3, stop_frequency_hz=20e3))
     second = first.replace(settings=wider)
-    scenes = Scene(), Scene()
+    scenes = ViewedScene(), ViewedScene()
     scenes[0].take(taken(first, TURNED))
     for scene in scenes:
         scene.take(taken(second, TURNED, time_s=1.0))
@@ -240,7 +240,7 @@ def test_points_have_the_uncertainty_of_their_own_call():
 
 
 def test_nothing_is_drawn_beyond_the_image():
-    scene = Scene()
+    scene = ViewedScene()
     poses = {"a": Pose((0.0, 0.3, 0.0)), "b": Pose((0.0, -0.3, 0.0))}
     for name, pose in poses.items():
         scene.take(taken(spot(0, 2.0, sensor=name), pose))
@@ -267,8 +267,8 @@ def test_nothing_is_drawn_beyond_the_image():
         ({"colours": "jet"}, "colours 'jet' is unknown"),
     ],
 )
-def test_choices_that_cannot_be(changes, told):
-    with pytest.raises(ArgumentError, match=told):
+def test_choices_that_cannot_be(changes, reported):
+    with pytest.raises(ArgumentError, match=reported):
         Choices(**changes)
 
 
@@ -285,7 +285,7 @@ def seen(frame, name):
 
 
 def test_points_fade_with_time_and_not_with_images():
-    scene = Scene()
+    scene = ViewedScene()
     scene.take(taken(spot(0, 2.0), time_s=10.0))
     bright = scene.draw(Choices(decay_s=0.5), 10.0)
     dim = scene.draw(Choices(decay_s=0.5), 10.25)
@@ -299,7 +299,7 @@ def test_points_fade_with_time_and_not_with_images():
 
 @pytest.mark.parametrize(("interval_s", "due_s"), [(None, 10.0), (0.05, 1.0), (2.0, 6.0)])
 def test_who_is_silent_is_overdue_by_what_is_usual_of_it(interval_s, due_s):
-    scene = Scene()
+    scene = ViewedScene()
     scene.take(taken(spot(0, 2.0), time_s=10.0, interval_s=interval_s))
     timely = scene.draw(Choices(), 10.0 + due_s - 0.01)
     assert (timely.sensors["front"].overdue, timely.until_s) == (False, 10.0 + due_s)
@@ -313,7 +313,7 @@ def test_who_is_silent_is_overdue_by_what_is_usual_of_it(interval_s, due_s):
 
 
 def test_who_is_overdue_is_no_part_of_what_is_fused():
-    scene = Scene()
+    scene = ViewedScene()
     places = {"front": Pose((0.3, 0.0, 0.0)), "left": Pose((0.0, 0.3, 0.0)), "right": Pose((0.0, -0.3, 0.0))}
     for name, pose in places.items():
         scene.take(taken(spot(0, 2.0, sensor=name), pose))
@@ -333,7 +333,7 @@ def test_who_is_overdue_is_no_part_of_what_is_fused():
 
 
 def test_what_stays_the_same_is_not_drawn_again():
-    scene = Scene()
+    scene = ViewedScene()
     for name in ("front", "left"):
         scene.take(taken(spot(0, 2.0, sensor=name)))
     choices = Choices(decay_s=1.0)
@@ -347,14 +347,14 @@ def test_what_stays_the_same_is_not_drawn_again():
 
 
 def test_sensors_whose_places_nobody_knows_have_no_platform():
-    scene = Scene()
-    scene.take(Taken(spot(-40, 1.5), None, 0.0))
+    scene = ViewedScene()
+    scene.take(ReceivedImage(spot(-40, 1.5), None, 0.0))
     alone = scene.draw(Choices()).sensors["front"]
     assert (alone.pose, len(alone.position_m)) == (Pose(), 1)
     assert isinstance(alone.shape, Sector)
     comments = plyfile.PlyData.read(io.BytesIO(points_ply(scene.latest(Choices())))).comments
     assert "frame front" in comments
-    scene.take(Taken(spot(20, 3.5, sensor="left"), None, 0.0))
+    scene.take(ReceivedImage(spot(20, 3.5, sensor="left"), None, 0.0))
     frame = scene.draw(Choices())
     assert frame.fused is None
     for drawn in frame.sensors.values():

@@ -73,7 +73,7 @@ class Page:
         self.abroad.append(route.request.url)
         route.abort()
 
-    def told(self, name):
+    def reported(self, name):
         return self.page.inner_text(f"[data-name={name}]")
 
     def wait_until(self, name, condition):
@@ -139,7 +139,7 @@ def viewing(*arguments):
 
 
 @pytest.fixture(scope="module")
-def film(browser, tmp_path_factory):
+def playback(browser, tmp_path_factory):
     """The page of a file with three images of the same reflectors."""
     with open_recording(REFLECTORS) as recording, Pipeline(recording.settings) as pipeline:
         image = pipeline.process(recording[0])
@@ -160,9 +160,9 @@ def reflectors():
     return sensor["reflectors"]
 
 
-def spots(film):
+def spots(playback):
     """The reflectors in the first picture: x, y and level of each, in the pixels that were drawn."""
-    pixels, zoom = film.picture()
+    pixels, zoom = playback.picture()
     away, levels = KDTree(TABLE).query(pixels[: -round(66 * zoom)])  # but for the scale of colours
     levels[away > 25] = 0
     joined = ndimage.binary_closing(levels > 205, np.ones((3, 3)))
@@ -181,9 +181,9 @@ def eventually(holds):
         assert time.monotonic() < end_s, "it never was"
 
 
-def test_the_reflectors_drawn_are_where_the_scene_put_them(film):
-    polar = Polar(film.image)
-    places = [(*polar.place_of(x, y), level) for x, y, level in spots(film)]
+def test_the_reflectors_drawn_are_where_the_scene_put_them(playback):
+    polar = Polar(playback.image)
+    places = [(*polar.place_of(x, y), level) for x, y, level in spots(playback)]
     assert len(places) == len(reflectors())
     for each in reflectors():
         found = min(places, key=lambda place: abs(place[1] - each["range_m"]))
@@ -192,34 +192,34 @@ def test_the_reflectors_drawn_are_where_the_scene_put_them(film):
         assert found[2] == pytest.approx(255 * (1 + each["level_db"] / 40), abs=6)
 
 
-def test_a_higher_threshold_leaves_fewer_points(film):
-    film.slide("Dynamic range (dB)", 5)  # which cannot be
-    film.slide("Dynamic range (dB)", 40)
-    film.slide("Threshold (dB)", -30)
-    film.wait_until("points", "Number(text) >= 5")
-    many = int(film.told("points"))
-    film.slide("Threshold (dB)", -1)
-    film.wait_until("points", f"Number(text) < {many}")
-    assert int(film.told("points")) == sum(each["level_db"] > -1 for each in reflectors())
+def test_a_higher_threshold_leaves_fewer_points(playback):
+    playback.slide("Dynamic range (dB)", 5)  # which cannot be
+    playback.slide("Dynamic range (dB)", 40)
+    playback.slide("Threshold (dB)", -30)
+    playback.wait_until("points", "Number(text) >= 5")
+    many = int(playback.reported("points"))
+    playback.slide("Threshold (dB)", -1)
+    playback.wait_until("points", f"Number(text) < {many}")
+    assert int(playback.reported("points")) == sum(each["level_db"] > -1 for each in reflectors())
 
 
-def test_the_window_of_ranges_moves_the_axes(film):
-    slider = film.control(re.compile("^Range"))
+def test_the_window_of_ranges_moves_the_axes(playback):
+    slider = playback.control(re.compile("^Range"))
     thumb = slider.locator(".multi-slider-thumb").last
     box, track = thumb.bounding_box(), slider.locator(".multi-slider-track").bounding_box()
     y = box["y"] + box["height"] / 2
-    film.page.mouse.move(box["x"] + box["width"] / 2, y)
-    film.page.mouse.down()
-    film.page.mouse.move(track["x"] + 0.4 * track["width"], y, steps=4)
-    film.page.mouse.up()
+    playback.page.mouse.move(box["x"] + box["width"] / 2, y)
+    playback.page.mouse.down()
+    playback.page.mouse.move(track["x"] + 0.4 * track["width"], y, steps=4)
+    playback.page.mouse.up()
     # The window now ends at 2 m of 5: what is nearer lies 2.5 times as far from the sensor as before.
-    polar = Polar(film.image)
+    polar = Polar(playback.image)
     foot_px = np.array(polar.pixel_of(0, 0))
     near = [each for each in reflectors() if each["range_m"] < 1.9]
     wanted = [foot_px + 2.5 * (polar.pixel_of(each["azimuth_deg"], each["range_m"]) - foot_px) for each in near]
 
     def moved():
-        places = [place[:2] for place in spots(film)]
+        places = [place[:2] for place in spots(playback)]
         return len(places) == len(near) and all(
             np.linalg.norm(places - place, axis=1).min() < 0.05 * np.linalg.norm(place - foot_px) for place in wanted
         )
@@ -227,34 +227,34 @@ def test_the_window_of_ranges_moves_the_axes(film):
     eventually(moved)
 
 
-def test_the_time_line_chooses_what_is_shown(film):
-    film.slide("Measurement", 1)
-    film.wait_until("sequence", "text === '1'")
-    film.press("back")
-    film.wait_until("sequence", "text === '0'")
-    shown = int(film.told("frames"))
-    film.press("Play")
-    film.wait_until("state", "text.startsWith('0.20 s')")
-    assert int(film.told("frames")) > shown
-    assert film.told("captured") == "2001-09-09 01:46:40.200 UTC"
+def test_the_time_line_chooses_what_is_shown(playback):
+    playback.slide("Measurement", 1)
+    playback.wait_until("sequence", "text === '1'")
+    playback.press("back")
+    playback.wait_until("sequence", "text === '0'")
+    shown = int(playback.reported("frames"))
+    playback.press("Play")
+    playback.wait_until("state", "text.startsWith('0.20 s')")
+    assert int(playback.reported("frames")) > shown
+    assert playback.reported("captured") == "2001-09-09 01:46:40.200 UTC"
 
 
-def test_colours_are_of_the_map_that_was_chosen(film):
-    film.control("Colours").locator("input:not([type=hidden])").first.click()
-    film.page.get_by_role("option", name="viridis").click()
+def test_colours_are_of_the_map_that_was_chosen(playback):
+    playback.control("Colours").locator("input:not([type=hidden])").first.click()
+    playback.page.get_by_role("option", name="viridis").click()
     wanted = colour_table("viridis")[255].astype(int)
-    eventually(lambda: np.abs(film.picture()[0] - wanted).sum(axis=2).min() < 40)
+    eventually(lambda: np.abs(playback.picture()[0] - wanted).sum(axis=2).min() < 40)
 
 
-def test_what_is_saved_can_be_read(film, browser, tmp_path):
-    picture, name = film.saved("Picture (PNG)")
+def test_what_is_saved_can_be_read(playback, browser, tmp_path):
+    picture, name = playback.saved("Picture (PNG)")
     assert name == "img.png"
     image = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
     assert image.shape[1] == 520
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
-    film.slide("Threshold (dB)", -1)
-    film.wait_until("points", "Number(text) === 2")
-    points, name = film.saved("Points (PLY)")
+    playback.slide("Threshold (dB)", -1)
+    playback.wait_until("points", "Number(text) === 2")
+    points, name = playback.saved("Points (PLY)")
     assert name == "img.ply"
     vertex = plyfile.PlyData.read(io.BytesIO(points))["vertex"]
     assert len(vertex) == 2
@@ -263,10 +263,10 @@ def test_what_is_saved_can_be_read(film, browser, tmp_path):
     wanted = (strongest["range_m"] * math.cos(azimuth), strongest["range_m"] * math.sin(azimuth), 0.0)
     nearest = min(np.linalg.norm([vertex["x"][i] - wanted[0], vertex["y"][i] - wanted[1]]) for i in range(2))
     assert nearest < 0.02
-    film.press("Begin HTML recording")
-    film.press("Play")
-    film.wait_until("state", "text.startsWith('0.20 s')")
-    recording, name = film.saved("End HTML recording")
+    playback.press("Begin HTML recording")
+    playback.press("Play")
+    playback.wait_until("state", "text.startsWith('0.20 s')")
+    recording, name = playback.saved("End HTML recording")
     assert name == "img.html"
     (tmp_path / name).write_bytes(recording)
     page = Page(browser, (tmp_path / name).as_uri())
@@ -287,13 +287,13 @@ def measuring(address):
     processing = Processing(directions="2d:61", range_m=(0.5, 1.2))
     settings = Settings(recording=Recording(n_samples=40_960), processing=processing)
     sensor = Sensor(name="front", recording=settings.recording, processing=processing)
-    words = Simulator(Scene(sensors=(sensor,), points=(Point(azimuth_deg=20.0, range_m=0.9),))).render(0).words
+    words = Simulator(Scene(sensors=(sensor,), points=(Point(azimuth_deg=20.0, range_m=0.9),))).render(0).data
     ended = threading.Event()
 
     def measure(node):
         number = 0
         while not ended.wait(1 / RATE_HZ):
-            stamp = Stamp(sensor="front", sequence=number, sync_count=number, epoch=3, timestamp_ns=time.time_ns())
+            stamp = Stamp(sensor="front", sequence=number, sync_count=number, session_id=3, timestamp_ns=time.time_ns())
             node.append([Entry(Measurement(words, settings, stamp), time.monotonic_ns())])
             number += 1
 
@@ -332,21 +332,21 @@ def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
         process, url = stack.enter_context(viewing(served.publish))
         live = Page(browser, url)
         live.wait_until("frames", "Number(text) > 3")
-        first = int(live.told("frames"))
+        first = int(live.reported("frames"))
         lags_s = live.page.evaluate(LAG)
-        assert int(live.told("frames")) >= first + 10
+        assert int(live.reported("frames")) >= first + 10
         assert 0 < np.median(lags_s) < 1, lags_s
-        assert 0 < float(live.told("latency").removesuffix(" ms")) < 1000
-        assert live.told("state") == "live"
-        assert float(live.told("rate").removesuffix(" Hz")) > 1
-        assert live.told("dropped").startswith("0, ")  # at the beginning some come faster than tables are made
-        assert int(live.told("points")) >= 1
+        assert 0 < float(live.reported("latency").removesuffix(" ms")) < 1000
+        assert live.reported("state") == "live"
+        assert float(live.reported("rate").removesuffix(" Hz")) > 1
+        assert live.reported("dropped").startswith("0, ")  # at the beginning some come faster than tables are made
+        assert int(live.reported("points")) >= 1
         live.press("Pause")
         live.page.get_by_role("button", name="Play", exact=True).wait_for()
-        shown, sequence = int(live.told("frames")), int(live.told("sequence"))
+        shown, sequence = int(live.reported("frames")), int(live.reported("sequence"))
         live.press("Step")
         live.wait_until("frames", f"Number(text) === {shown + 1}")
-        assert int(live.told("sequence")) > sequence
+        assert int(live.reported("sequence")) > sequence
         live.press("Play")
         live.wait_until("frames", f"Number(text) > {shown + 1}")
         begun_s = time.monotonic()
@@ -356,21 +356,21 @@ def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
         live.close()
 
 
-def test_each_browser_has_a_recording_of_its_own(film, browser):
-    other = Page(browser, film.page.url)
+def test_each_browser_has_a_recording_of_its_own(playback, browser):
+    other = Page(browser, playback.page.url)
     begin, end = (
         other.page.get_by_role("button", name=f"{word} HTML recording", exact=True) for word in ("Begin", "End")
     )
     other.page.get_by_text("at most 256 MB", exact=True).wait_for()
-    film.press("Begin HTML recording")
-    film.page.get_by_text(re.compile(r"^\d+\.\d MB, at most 256 MB$")).wait_for()
+    playback.press("Begin HTML recording")
+    playback.page.get_by_text(re.compile(r"^\d+\.\d MB, at most 256 MB$")).wait_for()
     begin.wait_for()
     assert end.count() == 0
     begin.click()
     end.wait_for()
-    recording, _ = film.saved("End HTML recording")
+    recording, _ = playback.saved("End HTML recording")
     assert b"__VISER_EMBED_DATA__" in recording
-    film.page.get_by_role("button", name="Begin HTML recording", exact=True).wait_for()
+    playback.page.get_by_role("button", name="Begin HTML recording", exact=True).wait_for()
     assert end.count() == 1
     other.close()
 

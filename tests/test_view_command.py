@@ -15,8 +15,8 @@ from ertis_cli import view
 from ertis_cli.main import cli
 
 from ertis_numba.storage import write_energyscapes
-from ertis_numba.viewer import Scene, View
-from ertis_numba.viewer._recordings import MOST_BYTES
+from ertis_numba.viewer import ViewedScene, Viewer
+from ertis_numba.viewer._recordings import MAX_BYTES
 from tests.pages import ROOT, commands_in, run, run_here
 from tests.publishing import Publisher
 from tests.publishing import image as published
@@ -55,14 +55,14 @@ BIND = socket.socket.bind
         ),
     ],
 )
-def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, told):
+def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, reported):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     (tmp_path / "other.html").touch()
     named = {"IMG": path, "OTHER": tmp_path / "other.html", "p.html": tmp_path / "p.html", "p.png": tmp_path / "p.png"}
     before = {each: each.read_bytes() for each in tmp_path.iterdir()}
     done = CliRunner().invoke(cli, ["view", *(str(named.get(word, word)) for word in arguments)])
     assert done.exit_code != 0
-    assert told in f"{done.stderr} {done.exception}"
+    assert reported in f"{done.stderr} {done.exception}"
     assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
 
 
@@ -108,13 +108,13 @@ def test_a_live_view_as_a_page_of_its_own(tmp_path):
 def test_a_page_that_is_interrupted_is_not_written(tmp_path, monkeypatch, number):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3))
     page = tmp_path / "page.html"
-    draw = Scene.draw
+    draw = ViewedScene.draw
 
     def interrupted(*arguments):
         os.kill(os.getpid(), number)
         return draw(*arguments)
 
-    monkeypatch.setattr(Scene, "draw", interrupted)
+    monkeypatch.setattr(ViewedScene, "draw", interrupted)
     done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page)])
     assert done.exit_code == 128 + number, (done.stderr, done.exception)
     assert "frames of" not in done.stderr
@@ -134,7 +134,7 @@ def test_who_interrupts_the_compiler_is_told_that_it_ends_first(tmp_path, monkey
         os.kill(os.getpid(), signal.SIGINT)
         assert ended == [128 + signal.SIGINT]  # at once: an exception would break in the compiler
 
-    monkeypatch.setattr(View, "prepare", compiling)
+    monkeypatch.setattr(Viewer, "prepare", compiling)
     done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(tmp_path / "page.html")])
     assert done.exit_code == 128 + signal.SIGINT, (done.stderr, done.exception)
     assert done.stderr.splitlines()[0] == "ending when that is done; Ctrl-C again ends at once"
@@ -164,8 +164,8 @@ def test_the_page_on_the_view(tmp_path):
             if "--save-html" in words:
                 run_here(tmp_path, words)
             else:
-                told = json.loads(run_here(tmp_path, f"{words} --port 0 --no-open --json --duration 0.2"))
-                assert told["source"] == words.split()[1]
+                reported = json.loads(run_here(tmp_path, f"{words} --port 0 --no-open --json --duration 0.2"))
+                assert reported["source"] == words.split()[1]
     assert (tmp_path / "PAGE.html").stat().st_size > 500_000
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     done = run(tmp_path, sys.executable, "-W", "error", "-c", code)
@@ -173,9 +173,9 @@ def test_the_page_on_the_view(tmp_path):
 
 
 def test_the_limit_of_recordings_is_the_one_that_is_told():
-    told = f"at most {MOST_BYTES / 1e6:g} MB"
-    assert told in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
-    assert told in " ".join((ROOT / "docs" / "view.md").read_text().split())
+    reported = f"at most {MAX_BYTES / 1e6:g} MB"
+    assert reported in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
+    assert reported in " ".join((ROOT / "docs" / "view.md").read_text().split())
 
 
 class InTerminal(webbrowser.GenericBrowser):

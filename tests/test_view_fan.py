@@ -13,7 +13,7 @@ from tests.views import TABLE, brightest
 @pytest.mark.parametrize("first_deg", [-180.0, -178.0, -77.0, 0.0])
 def test_a_grid_all_around_has_no_gap(first_deg):
     made = image(first_deg + np.arange(0.0, 360.0, 2.0))
-    level = np.ones_like(made.energy)
+    level = np.ones_like(made.amplitude)
     level[0] = 1e-4  # between the last and this one is half of what is between them, in dB
     polar = Polar(made, dynamic_range_db=80.0)
     levels = polar.levels(level)
@@ -60,9 +60,9 @@ def test_a_picture_shows_where_somebody_looked(azimuth_deg, seen_deg):
 def test_a_reflector_behind_is_drawn_where_it_is():
     made = image(np.arange(100.0, 261.0, 2.0))
     across, along = (np.degrees(made.azimuth_rad) - 230) / 4, (made.range_m - 3.0) / 0.03
-    energy = np.exp(-0.5 * (across[:, None] ** 2 + along**2)).astype(np.float32)
+    amplitude = np.exp(-0.5 * (across[:, None] ** 2 + along**2)).astype(np.float32)
     polar = Polar(made)
-    azimuth_deg, range_m = polar.place_of(*brightest(polar.picture(polar.levels(energy), TABLE)[:-66]))
+    azimuth_deg, range_m = polar.place_of(*brightest(polar.picture(polar.levels(amplitude), TABLE)[:-66]))
     assert azimuth_deg == pytest.approx(-130, abs=0.8)
     assert range_m == pytest.approx(3.0, abs=0.015)
 

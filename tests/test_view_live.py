@@ -8,11 +8,11 @@ import pytest
 from ertis_numba.errors import RefusedError
 from ertis_numba.network.messages import Refused
 from ertis_numba.network.status import SensorStatus
-from ertis_numba.viewer import Choices, Live, Pose, View, _live
-from ertis_numba.viewer._page import Order
+from ertis_numba.viewer import Choices, Live, Pose, Viewer, _live
+from ertis_numba.viewer._page import ControlRequest
 from tests.publishing import Publisher, status
 from tests.publishing import image as published
-from tests.views import TABLE, Source, settled, spot, taken, wait_for
+from tests.views import TABLE, Source, acked_through, spot, taken, wait_for
 
 
 def test_the_latest_of_each_sensor_is_shown_and_others_are_counted():
@@ -30,7 +30,7 @@ def test_the_latest_of_each_sensor_is_shown_and_others_are_counted():
 
 
 def view_of(source, **choices):
-    return View(source, port=0, choices=Choices(**choices))
+    return Viewer(source, port=0, choices=Choices(**choices))
 
 
 def test_images_whose_clock_was_not_set_have_no_age_by_it():
@@ -49,7 +49,7 @@ def test_what_fades_is_drawn_again_though_nothing_comes():
         points = []
         for clock_s in (100.0, 100.3, 100.6):
             source.clock_s = clock_s
-            settled(view)
+            acked_through(view)
             points.append(view._frame.sensors["front"])  # noqa: SLF001  what the page was given
         assert [len(each.position_m) for each in points] == [1, 1, 0]
         assert [each.share_left.tolist() for each in points[:2]] == [[1.0], pytest.approx([0.4])]
@@ -61,11 +61,11 @@ def test_a_sensor_that_is_silent_is_seen_to_be():
     poses = {"a": Pose((0.0, 0.3, 0.0)), "b": Pose((0.0, -0.3, 0.0))}
     source.waiting = [taken(spot(0, 2.0, sensor=name), pose, 100.0, 0.1) for name, pose in poses.items()]
     with view_of(source) as view:
-        assert settled(view)["age"] == "a 0.0 s, b 0.0 s"
+        assert acked_through(view)["age"] == "a 0.0 s, b 0.0 s"
         assert view._frame.fused is not None  # noqa: SLF001
         source.clock_s = 3700.0
         source.waiting = [taken(spot(0, 2.0, sensor="a"), poses["a"], 3699.8, 0.1)]
-        assert settled(view)["age"] == "a 0.2 s, b 3600 s (overdue)"
+        assert acked_through(view)["age"] == "a 0.2 s, b 3600 s (overdue)"
         frame = view._frame  # noqa: SLF001
         assert frame.fused is None
         assert frame.sensors["b"].picture.sum() < frame.sensors["a"].picture.sum()
@@ -73,9 +73,9 @@ def test_a_sensor_that_is_silent_is_seen_to_be():
         labels = {name: shown.label for name, shown in view._page._shown.items()}  # noqa: SLF001
         assert labels == {"a": "a", "b": "b (overdue)"}
         source.clock_s = 3702.0  # now both are silent
-        assert settled(view)["age"] == "a 2.2 s (overdue), b 3602 s (overdue)"
+        assert acked_through(view)["age"] == "a 2.2 s (overdue), b 3602 s (overdue)"
         source.waiting = [taken(spot(0, 2.0, sensor="b"), poses["b"], 3702.0, 0.1)]
-        assert settled(view)["age"] == "a 2.2 s (overdue), b 0.0 s"
+        assert acked_through(view)["age"] == "a 2.2 s (overdue), b 0.0 s"
 
 
 def test_what_a_paused_view_does_not_show_is_counted():
@@ -87,26 +87,26 @@ def test_what_a_paused_view_does_not_show_is_counted():
 
     with view_of(source) as view:
         send(0)
-        assert settled(view)["held"] == "0"
-        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
-        settled(view)
+        assert acked_through(view)["held"] == "0"
+        view._orders.put(ControlRequest("play"))  # noqa: SLF001  as a browser does
+        acked_through(view)
         for number in range(1, 25):
             send(number)
             wait_for(lambda: view.run(duration_s=0.02) or not source.waiting)
-        told = settled(view)
-        assert (told["held"], told["frames"], told["sequence"]) == ("24", "1", "0")
-        assert (told["state"], told["age"]) == ("live, paused", "2.4 s")
+        reported = acked_through(view)
+        assert (reported["held"], reported["frames"], reported["sequence"]) == ("24", "1", "0")
+        assert (reported["state"], reported["age"]) == ("live, paused", "2.4 s")
         assert not view._frame.sensors["front"].overdue  # noqa: SLF001  a picture that is held stays as it is
-        view._orders.put(Order("step", 1))  # noqa: SLF001
-        settled(view)
+        view._orders.put(ControlRequest("step", 1))  # noqa: SLF001
+        acked_through(view)
         send(25)
-        told = settled(view)
-        assert (told["held"], told["frames"], told["sequence"]) == ("24", "2", "25")
-        view._orders.put(Order("play"))  # noqa: SLF001
-        settled(view)
+        reported = acked_through(view)
+        assert (reported["held"], reported["frames"], reported["sequence"]) == ("24", "2", "25")
+        view._orders.put(ControlRequest("play"))  # noqa: SLF001
+        acked_through(view)
         send(26)
-        told = settled(view)
-        assert (told["held"], told["sequence"], told["state"]) == ("24", "26", "live")
+        reported = acked_through(view)
+        assert (reported["held"], reported["sequence"], reported["state"]) == ("24", "26", "live")
         assert source.received == view.shown + 24
 
 
@@ -124,8 +124,8 @@ def test_measurements_have_the_names_of_their_sensors_in_the_order_of_the_pictur
     with view_of(source) as view:
         for number, name in enumerate(("right", "front", "left")):  # as they come
             source.waiting = [taken(spot(0, 2.0, sensor=name, sequence=7 + number), time_s=100.0)]
-            told = settled(view)
-        assert told["sequence"] == "front 8, left 9, right 7"
+            reported = acked_through(view)
+        assert reported["sequence"] == "front 8, left 9, right 7"
         shown = view._page._shown  # noqa: SLF001
         assert sorted(shown, key=lambda name: shown[name].order) == ["front", "left", "right"]
 
@@ -134,18 +134,18 @@ def test_the_state_says_whether_sensors_send():
     source = Source()
     source.latency_s = lambda _: 0.025
     with view_of(source) as view:
-        assert settled(view)["state"] == "connected, no sensor sends"
+        assert acked_through(view)["state"] == "connected, no sensor sends"
         source.waiting = [taken(spot(0, 2.0, sensor=name), time_s=100.0, interval_s=0.1) for name in "ab"]
-        told = settled(view)
-        assert (told["state"], told["latency"]) == ("live", "25 ms")
+        reported = acked_through(view)
+        assert (reported["state"], reported["latency"]) == ("live", "25 ms")
         source.clock_s = 105.0
         source.waiting = [taken(spot(0, 2.0, sensor="a"), time_s=105.0, interval_s=0.1)]
-        assert settled(view)["state"] == "live"
+        assert acked_through(view)["state"] == "live"
         source.clock_s = 110.0
-        told = settled(view)
-        assert (told["state"], told["latency"]) == ("all sensors overdue", "–")
+        reported = acked_through(view)
+        assert (reported["state"], reported["latency"]) == ("all sensors overdue", "–")
         source.connected, source.state = False, "waiting for the central node"
-        assert settled(view)["state"] == "waiting for the central node"
+        assert acked_through(view)["state"] == "waiting for the central node"
 
 
 def notes_of(live):
@@ -167,9 +167,9 @@ def test_that_nobody_answers_is_told_once(monkeypatch):
 
 
 def test_sensors_that_there_are_not_are_told(monkeypatch):
-    told = status(sensors={name: SensorStatus() for name in ("left", "front")})
+    reported = status(sensors={name: SensorStatus() for name in ("left", "front")})
     notes = []
-    statuses = itertools.takewhile(lambda _: len(notes) < 2, itertools.repeat(told, 20_000))
+    statuses = itertools.takewhile(lambda _: len(notes) < 2, itertools.repeat(reported, 20_000))
     with Publisher() as publisher, Live(publisher.address, sensors=["front", "nope"]) as live:
         with publisher.playing(statuses):
             wait_for(lambda: notes.extend(live.notes()) or notes)
@@ -206,24 +206,24 @@ def come(view, source, number, *names, clock_s, moment=None):
         taken(spot(0, 2.0, sensor=name, sequence=number, timestamp_ns=emitted_ns), time_s=clock_s, interval_s=0.2)
         for name in names
     ]
-    return settled(view, within_s=0.1)
+    return acked_through(view, within_s=0.1)
 
 
 def test_a_step_shows_all_sensors_that_send():
     source = Source()
     with view_of(source) as view:
         come(view, source, 0, "a", "b", "dead", clock_s=100.0)
-        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
+        view._orders.put(ControlRequest("play"))  # noqa: SLF001  as a browser does
         come(view, source, 20, "a", "b", clock_s=104.0)
-        view._orders.put(Order("step", 1))  # noqa: SLF001
-        told = come(view, source, 21, "b", clock_s=104.2)  # of the moment before the one that follows
-        assert (told["sequence"], told["held"]) == ("a 0, b 0, dead 0", "3")
+        view._orders.put(ControlRequest("step", 1))  # noqa: SLF001
+        reported = come(view, source, 21, "b", clock_s=104.2)  # of the moment before the one that follows
+        assert (reported["sequence"], reported["held"]) == ("a 0, b 0, dead 0", "3")
         assert come(view, source, 22, "a", clock_s=104.3)["sequence"] == "a 0, b 0, dead 0"
-        told = come(view, source, 22, "b", clock_s=104.4)
-        assert (told["sequence"], told["held"]) == ("a 22, b 22, dead 0", "3")
-        assert told["age"] == "a 0.1 s, b 0.0 s, dead 4.4 s (overdue)"
+        reported = come(view, source, 22, "b", clock_s=104.4)
+        assert (reported["sequence"], reported["held"]) == ("a 22, b 22, dead 0", "3")
+        assert reported["age"] == "a 0.1 s, b 0.0 s, dead 4.4 s (overdue)"
         come(view, source, 23, "a", "b", clock_s=104.6)
-        assert settled(view)["sequence"] == "a 22, b 22, dead 0"
+        assert acked_through(view)["sequence"] == "a 22, b 22, dead 0"
 
 
 def test_a_step_does_not_wait_for_a_sensor_that_measures_rarely():
@@ -232,11 +232,11 @@ def test_a_step_does_not_wait_for_a_sensor_that_measures_rarely():
     with view_of(source) as view:
         source.waiting = [rare[1]]
         come(view, source, 0, "a", clock_s=100.0)
-        view._orders.put(Order("play"))  # noqa: SLF001  as a browser does
+        view._orders.put(ControlRequest("play"))  # noqa: SLF001  as a browser does
         source.waiting = [rare[2]]
         come(view, source, 50, "a", clock_s=110.0)
         source.clock_s = 140.0
-        view._orders.put(Order("step", 1))  # noqa: SLF001
+        view._orders.put(ControlRequest("step", 1))  # noqa: SLF001
         come(view, source, 200, "a", clock_s=139.0)
-        told = come(view, source, 205, "a", clock_s=140.1)
-        assert told["sequence"] == "a 205, rare 2"  # the latest that has come of each
+        reported = come(view, source, 205, "a", clock_s=140.1)
+        assert reported["sequence"] == "a 205, rare 2"  # the latest that has come of each

@@ -4,16 +4,16 @@ import pytest
 
 from ertis_numba.frames import Stamp
 from ertis_numba.storage import write_energyscapes
-from ertis_numba.viewer import Film
-from ertis_numba.viewer._moments import moments_of
+from ertis_numba.viewer import Playback
+from ertis_numba.viewer._time_steps import time_steps_of
 from tests.views import spot
 
 BOOT_NS, NOW_NS, YEAR_S = 5 * 10**9, 1_763_817_458 * 10**9, 31_557_600
 
 
-def moments(**times_ns):
+def time_steps(**times_ns):
     stamps = {name: [Stamp(sensor=name, timestamp_ns=at_ns) for at_ns in each] for name, each in times_ns.items()}
-    return moments_of(stamps)
+    return time_steps_of(stamps)
 
 
 def steps(begin_ns, count, step_s=0.1):
@@ -42,7 +42,7 @@ def test_a_time_is_told_where_the_clock_was_set(at_ns, iso, utc):
 
 
 def test_a_clock_that_is_set_halfway_plays_on():
-    found, notes = moments(a=steps(BOOT_NS, 3) + steps(NOW_NS, 5))
+    found, notes = time_steps(a=steps(BOOT_NS, 3) + steps(NOW_NS, 5))
     assert times_s(found) == pytest.approx([number / 10 for number in range(8)])
     assert [dict(moment.measurements)["a"] for moment in found] == list(range(8))
     (note,) = notes
@@ -53,26 +53,26 @@ def test_a_clock_that_is_set_halfway_plays_on():
 
 
 def test_a_clock_that_is_lost_halfway_plays_on():
-    found, _ = moments(a=steps(NOW_NS, 3) + steps(BOOT_NS, 2) + steps(NOW_NS + 10**9, 2))
+    found, _ = time_steps(a=steps(NOW_NS, 3) + steps(BOOT_NS, 2) + steps(NOW_NS + 10**9, 2))
     assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1])
 
 
 @pytest.mark.parametrize("unset_ns", [[0] * 5, steps(BOOT_NS, 5)])
 def test_a_sensor_without_times_begins_with_those_that_have_some(unset_ns):
-    found, notes = moments(timed=steps(NOW_NS, 5), untimed=unset_ns)
+    found, notes = time_steps(timed=steps(NOW_NS, 5), untimed=unset_ns)
     assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert found[3].measurements == (("timed", 3), ("untimed", 3))
     assert [note[:34] for note in notes] == ["sensor 'untimed': 5 of 5 measureme"]
 
 
 def test_simulated_times_and_none_are_as_they_were():
-    assert moments(a=steps(0, 3, 0.25), b=steps(0, 3, 0.25))[1] == []
-    assert times_s(moments(a=steps(0, 3, 0.25))[0]) == [0.0, 0.25, 0.5]
-    found, notes = moments(a=[0, 0, 0], b=[0, 0])
+    assert time_steps(a=steps(0, 3, 0.25), b=steps(0, 3, 0.25))[1] == []
+    assert times_s(time_steps(a=steps(0, 3, 0.25))[0]) == [0.0, 0.25, 0.5]
+    found, notes = time_steps(a=[0, 0, 0], b=[0, 0])
     assert (times_s(found), notes) == (pytest.approx([0.0, 0.1, 0.2]), [])
     assert found[1].measurements == (("a", 1), ("b", 1))
-    assert moments(a=[0])[0][0].measurements == (("a", 0),)
-    assert moments() == ((), [])
+    assert time_steps(a=[0])[0][0].measurements == (("a", 0),)
+    assert time_steps() == ((), [])
 
 
 @pytest.mark.parametrize(
@@ -91,17 +91,17 @@ def test_simulated_times_and_none_are_as_they_were():
         ),
     ],
 )
-def test_long_pauses_are_short(times_ns, wanted_s, told):
-    found, notes = moments(a=times_ns)
+def test_long_pauses_are_short(times_ns, wanted_s, reported):
+    found, notes = time_steps(a=times_ns)
     assert times_s(found) == pytest.approx(wanted_s)
-    assert len(notes) == (told is not None)
-    assert not notes or notes[0].startswith(told)
+    assert len(notes) == (reported is not None)
+    assert not notes or notes[0].startswith(reported)
 
 
 def test_a_film_says_what_its_times_are(tmp_path):
     images = [spot(0, 1.0, sequence=number, timestamp_ns=at_ns) for number, at_ns in enumerate((BOOT_NS, NOW_NS))]
-    with Film(write_energyscapes(tmp_path / "img.h5", images)) as film:
-        assert times_s(film.moments) == pytest.approx([0, 0.1])
-        (note,) = film.notes()
+    with Playback(write_energyscapes(tmp_path / "img.h5", images)) as playback:
+        assert times_s(playback.time_steps) == pytest.approx([0, 0.1])
+        (note,) = playback.notes()
         assert note.startswith("sensor 'front': 1 of 2 measurements have no time")
-        assert film.notes() == []
+        assert playback.notes() == []

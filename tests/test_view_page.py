@@ -15,23 +15,23 @@ import zstandard
 
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.storage import write_energyscapes
-from ertis_numba.viewer import Choices, Film, View
+from ertis_numba.viewer import Choices, Playback, Viewer
 from ertis_numba.viewer import _recordings as recordings
 from ertis_numba.viewer import _view as viewing
 from ertis_numba.viewer._origins import is_loopback
-from ertis_numba.viewer._page import Order
+from ertis_numba.viewer._page import ControlRequest
 from tests.views import PATIENCE_S, Client, Source, spot, stamped, taken, wait_for
 
 
 def test_a_port_that_is_taken_is_refused(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with socket.socket() as other, Film(path) as film:
+    with socket.socket() as other, Playback(path) as playback:
         other.bind(("127.0.0.1", 0))
         other.listen()
         with pytest.raises(NetworkError, match=r"nothing can be served at 127.0.0.1:\d+ .*; give another host or port"):
-            View(film, port=other.getsockname()[1])
-    with Film(path) as film, pytest.raises(NetworkError, match=r"nothing can be served at 203\.0\.113\.1"):
-        View(film, host="203.0.113.1", port=0)
+            Viewer(playback, port=other.getsockname()[1])
+    with Playback(path) as playback, pytest.raises(NetworkError, match=r"nothing can be served at 203\.0\.113\.1"):
+        Viewer(playback, host="203.0.113.1", port=0)
 
 
 def answer(port, origin, host, *, path="/", cookie=None):
@@ -47,7 +47,7 @@ def answer(port, origin, host, *, path="/", cookie=None):
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST", "0.0.0.0"])
 def test_pages_of_other_sites_are_refused(host):
-    with View(Source(), host=host, port=0) as view:
+    with Viewer(Source(), host=host, port=0) as view:
         url = urlsplit(view.url)
         port, path = url.port, f"/?{url.query}"
         assert view.is_local == (host != "0.0.0.0")
@@ -76,7 +76,7 @@ def get(url, **headers):
 
 
 def test_page_that_other_machines_reach_needs_its_token():
-    with View(Source(), host="0.0.0.0", port=0) as view:
+    with Viewer(Source(), host="0.0.0.0", port=0) as view:
         url = urlsplit(view.url)
         here, bare = f"127.0.0.1:{url.port}", f"http://{url.netloc}/"
         for wrong in ("", "?token=", "?token=x", f"?{url.query[:-1]}", "?token=%C3%A9", "assets"):
@@ -95,7 +95,7 @@ def test_page_that_other_machines_reach_needs_its_token():
 
 
 def test_page_on_loopback_needs_no_token():
-    with View(Source(), port=0) as view:
+    with Viewer(Source(), port=0) as view:
         assert "token" not in view.url
         assert get(view.url)[0] == 200
 
@@ -109,8 +109,12 @@ def test_other_addresses_of_this_machine_are_loopback():
 def test_what_cannot_be_saved_or_chosen_is_told_and_the_view_goes_on(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [spot(0, 2.0, timestamp_ns=3 * 10**18)])
     client = Client()
-    with Film(path) as film, View(film, port=0) as view:
-        orders = [Order("threshold_db", 7.0), Order("points", client=client), Order("picture", client=client)]
+    with Playback(path) as playback, Viewer(playback, port=0) as view:
+        orders = [
+            ControlRequest("threshold_db", 7.0),
+            ControlRequest("points", client=client),
+            ControlRequest("picture", client=client),
+        ]
         wait_for(lambda: view.run(duration_s=0.05) or view.shown)
         for order in orders:
             view._orders.put(order)  # noqa: SLF001  as a browser does
@@ -144,10 +148,10 @@ def moving(count):
 def test_a_browser_does_not_end_the_recording_of_another(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3, step_s=0.01))
     one, other = Client(1), Client(2)
-    with Film(path) as film, View(film, port=0) as view:
+    with Playback(path) as playback, Viewer(playback, port=0) as view:
 
         def press(client, name="record"):
-            view._orders.put(Order(name, client=client))  # noqa: SLF001  as a browser does
+            view._orders.put(ControlRequest(name, client=client))  # noqa: SLF001  as a browser does
 
         press(one)
         view.run(duration_s=0.1)
@@ -172,13 +176,13 @@ def test_a_recording_lasts_as_long_as_somebody_recorded(tmp_path, monkeypatch):
     source, client = Source(), Client()
     clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr(viewing, "time", clock)
-    with View(source, port=0) as view:
+    with Viewer(source, port=0) as view:
 
         def come():
             source.waiting = [taken(spot(5 * len(turns), 2.0), time_s=source.clock_s)]
 
         def press():
-            view._orders.put(Order("record", client=client))  # noqa: SLF001  as a browser does
+            view._orders.put(ControlRequest("record", client=client))  # noqa: SLF001  as a browser does
 
         turns = [(0.0, come), (7.0, come), (600.0, press), (2.0, come), (3.0, press), (4.0, come), (5.0, view.stop)]
         turns.append((0.0, list))  # the one in which it ends
@@ -199,18 +203,18 @@ def test_a_recording_lasts_as_long_as_somebody_recorded(tmp_path, monkeypatch):
 def test_a_recording_is_made_by_who_began_it_though_a_browser_records(tmp_path):
     source, client = Source(), Client()
     source.waiting = [taken(spot(0, 2.0), time_s=source.clock_s)]
-    with View(source, port=0) as view:
-        view._orders.put(Order("record", client=client))  # noqa: SLF001  which once ended that of the command
+    with Viewer(source, port=0) as view:
+        view._orders.put(ControlRequest("record", client=client))  # noqa: SLF001  which once ended that of the command
         view.run(duration_s=0.2, html=tmp_path / "live.html")
         assert view.recorded == 1
     assert (tmp_path / "live.html").stat().st_size > 500_000
 
 
 def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
-    monkeypatch.setattr(recordings, "MOST_BYTES", 20_000)
+    monkeypatch.setattr(recordings, "MAX_BYTES", 20_000)
     path = write_energyscapes(tmp_path / "img.h5", moving(30))
     notes = []
-    with Film(path) as film, View(film, port=0, on_note=notes.append) as view:
+    with Playback(path) as playback, Viewer(playback, port=0, on_note=notes.append) as view:
         view.record(tmp_path / "page.html")
         assert 2 < view.recorded < 29
         assert view.shown == view.recorded
@@ -221,7 +225,7 @@ def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
 def test_a_film_that_is_stopped_leaves_no_page(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", moving(5))
     page = tmp_path / "page.html"
-    with Film(path) as film, View(film, port=0) as view:
+    with Playback(path) as playback, Viewer(playback, port=0) as view:
         show = view._page.show  # noqa: SLF001
 
         def shown(frame, place):
@@ -238,18 +242,18 @@ def test_a_film_that_is_stopped_leaves_no_page(tmp_path):
 
 
 def test_a_live_view_without_images_leaves_no_page(tmp_path):
-    with View(Source(), port=0) as view:
+    with Viewer(Source(), port=0) as view:
         view.run(duration_s=0.1, html=tmp_path / "page.html")
         assert view.recorded is None
     assert [*tmp_path.iterdir()] == []
 
 
 def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
-    monkeypatch.setattr(recordings, "MOST_BYTES", 20_000)
+    monkeypatch.setattr(recordings, "MAX_BYTES", 20_000)
     source, client, notes = Source(), Client(), []
     page = tmp_path / "live.html"
-    with View(source, port=0, on_note=notes.append) as view:
-        view._orders.put(Order("record", client=client))  # noqa: SLF001  as a browser does
+    with Viewer(source, port=0, on_note=notes.append) as view:
+        view._orders.put(ControlRequest("record", client=client))  # noqa: SLF001  as a browser does
         sent = []
 
         def send():
@@ -272,7 +276,7 @@ def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
 def test_what_is_recorded_is_counted_as_it_takes_room(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", moving(8))
     counted = []
-    with Film(path) as film, View(film, port=0) as view:
+    with Playback(path) as playback, Viewer(playback, port=0) as view:
         recorded = view._recordings  # noqa: SLF001
         add = recorded.add
         recorded.add = lambda *, frames: add(frames=frames) or counted.extend(recorded.n_bytes().values())
@@ -285,14 +289,18 @@ def test_what_is_recorded_is_counted_as_it_takes_room(tmp_path):
 def test_a_film_is_not_recorded_over_itself(tmp_path, record):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     before = path.read_bytes()
-    with Film(path) as film, View(film, port=0) as view, pytest.raises(ArgumentError, match="is the input itself"):
+    with (
+        Playback(path) as playback,
+        Viewer(playback, port=0) as view,
+        pytest.raises(ArgumentError, match="is the input itself"),
+    ):
         view.record(path, overwrite=True) if record else view.run(duration_s=0.1, html=path, overwrite=True)
     assert path.read_bytes() == before
 
 
 def test_a_recording_that_cannot_be_written_is_told(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with Film(path) as film, View(film, port=0) as view:
+    with Playback(path) as playback, Viewer(playback, port=0) as view:
         view._page.show = lambda *_: (tmp_path / "page.html").touch()  # noqa: SLF001  somebody was faster
         with pytest.raises(ArgumentError, match="exists; give another name"):
             view.record(tmp_path / "page.html")
@@ -311,26 +319,26 @@ def controls(view):
         ((10.0, 20.0), (10.0, 20.0), 20.0, "Range 10–20 m"),
     ],
 )
-def test_the_slider_of_ranges_shows_the_window(window_m, shown_m, top_m, told):
+def test_the_slider_of_ranges_shows_the_window(window_m, shown_m, top_m, reported):
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
-    with View(source, port=0, choices=Choices(range_m=window_m)) as view:
+    with Viewer(source, port=0, choices=Choices(range_m=window_m)) as view:
         view.run(duration_s=0.1)
         slider = controls(view)["range_m"]
-        assert (slider.value, slider.max, slider.label) == (pytest.approx(shown_m), pytest.approx(top_m), told)
-        view._orders.put(Order("range_m", (1.0, 2.0)))  # noqa: SLF001  as a browser does
+        assert (slider.value, slider.max, slider.label) == (pytest.approx(shown_m), pytest.approx(top_m), reported)
+        view._orders.put(ControlRequest("range_m", (1.0, 2.0)))  # noqa: SLF001  as a browser does
         view.run(duration_s=0.1)
         assert slider.label == "Range 1–2 m"
 
 
 def test_numbers_that_cannot_be_are_put_back(monkeypatch):
     source = Source()
-    with View(source, port=0, choices=Choices(threshold_db=-15.0)) as view:
+    with Viewer(source, port=0, choices=Choices(threshold_db=-15.0)) as view:
         box = controls(view)["threshold_db"]
 
         def type_in(number):
             box.value = number
-            view._orders.put(Order("threshold_db", number))  # noqa: SLF001  as a browser does
+            view._orders.put(ControlRequest("threshold_db", number))  # noqa: SLF001  as a browser does
             view.run(duration_s=0.05)
             return box.value, view.choices.threshold_db
 

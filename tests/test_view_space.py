@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ertis_numba.viewer import Choices, Pose, View
+from ertis_numba.viewer import Choices, Pose, Viewer
 from ertis_numba.viewer._space import round_step
-from tests.views import Source, settled, spot, taken
+from tests.views import Source, acked_through, spot, taken
 
 PLACES = {"left": Pose((0.0, 3.0, 0.0)), "front": Pose((2.0, 0.0, 0.0)), "right": Pose((0.0, -1.0, 0.0))}
 
@@ -27,10 +27,10 @@ def ground(view):
 def joined(*groups, **choices):
     """What the ground is when sensors have come in groups."""
     source = Source()
-    with View(source, port=0, choices=Choices(**choices)) as view:
+    with Viewer(source, port=0, choices=Choices(**choices)) as view:
         for group in groups:
             source.waiting = [of(name) for name in group]
-            settled(view)
+            acked_through(view)
         return ground(view)
 
 
@@ -45,17 +45,17 @@ def test_the_camera_does_not_depend_on_who_comes_first():
 @pytest.mark.parametrize("names", [["front"], list(PLACES)])
 def test_a_window_that_is_widened_is_seen(names):
     source = Source()
-    with View(source, port=0, choices=Choices(range_m=(0.6, 1.0))) as view:
+    with Viewer(source, port=0, choices=Choices(range_m=(0.6, 1.0))) as view:
         source.waiting = [of(name) for name in names]
-        settled(view)
+        acked_through(view)
         narrow, distances = ground(view)
         assert distances == ["0.2 m", "0.4 m", "0.6 m", "0.8 m", "1 m"][len(names) > 1 :]
         view.choices, view._changed = Choices(), True  # noqa: SLF001  as if somebody moved the slider
-        settled(view)
+        acked_through(view)
         assert ground(view) == joined(names)
         assert ground(view)[0][2] > 4 * narrow[2]
         view.choices, view._changed = Choices(range_m=(0.6, 1.0)), True  # noqa: SLF001
-        settled(view)
+        acked_through(view)
         assert ground(view) == joined(names)  # who looks closer goes there
 
 
@@ -66,16 +66,16 @@ def test_a_camera_that_somebody_has_moved_stays():
         return SimpleNamespace(camera=SimpleNamespace(position=np.ones(3), look_at=np.zeros(3)))
 
     mine, other = client(), client()
-    with View(source, port=0) as view:
+    with Viewer(source, port=0) as view:
         server = view._page._server  # noqa: SLF001
         server.get_clients = lambda: {0: mine, 1: other}
         source.waiting = [of("left")]
-        settled(view)
+        acked_through(view)
         first = np.asarray(mine.camera.position)
         assert first.tolist() == np.asarray(other.camera.position).tolist() == ground(view)[0][:3]
         other.camera.position = (9.0, 9.0, 9.0)
         source.waiting = [of("front")]
-        settled(view)
+        acked_through(view)
         assert [*mine.camera.position, *mine.camera.look_at] == ground(view)[0]
         assert np.asarray(mine.camera.position).tolist() != first.tolist()
         assert other.camera.position == (9.0, 9.0, 9.0)
@@ -84,11 +84,11 @@ def test_a_camera_that_somebody_has_moved_stays():
 def test_points_that_fade_become_small():
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
-    with View(source, port=0, choices=Choices(decay_s=1.0)) as view:
+    with Viewer(source, port=0, choices=Choices(decay_s=1.0)) as view:
         sizes = []
         for clock_s in (100.0, 100.4, 100.6, 100.9, 101.0):
             source.clock_s = clock_s
-            settled(view)
+            acked_through(view)
             clouds = view._page._space._nodes["front"]._points  # noqa: SLF001
             seen = [cloud for cloud in clouds if cloud.visible]
             assert sum(len(cloud.points) for cloud in seen) == (clock_s < 101)
@@ -98,13 +98,13 @@ def test_points_that_fade_become_small():
 
 def test_who_is_overdue_hides_nothing_of_what_others_see():
     source = Source()
-    with View(source, port=0) as view:
+    with Viewer(source, port=0) as view:
         source.waiting = [of("left")]
-        settled(view)
+        acked_through(view)
         node = view._page._space._nodes["left"]  # noqa: SLF001
         timely_m = node._shape.position[2]  # noqa: SLF001
         source.clock_s = 110.0
-        settled(view)
+        acked_through(view)
         assert node._shape.position[2] < timely_m < 0  # noqa: SLF001
 
 
@@ -120,9 +120,9 @@ def test_who_is_overdue_hides_nothing_of_what_others_see():
 def test_the_ground_suits_the_range(scale, distances):
     source = Source()
     made = spot(0, 2.0)
-    with View(source, port=0) as view:
+    with Viewer(source, port=0) as view:
         source.waiting = [taken(made.replace(range_m=made.range_m * scale))]
-        settled(view)
+        acked_through(view)
         space = view._page._space  # noqa: SLF001
         camera, (node,) = space._server.initial_camera, space._nodes.values()  # noqa: SLF001
         assert ground(view)[1] == distances

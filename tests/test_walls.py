@@ -94,9 +94,9 @@ def test_the_image_in_a_corner_is_there_once():
     """Emitter and microphone apart: of the two orders of the walls, one is possible."""
     scene = listener_and_emitter((0.0, 0.0, 0.0), (0.3, -0.5, 0.1), walls=(FRONT, SIDE))
     delay_s, amplitude = sorted_ways(scene, "walls", "spreading", "cross_emission")
-    ear_m = (0.0, 0.0, 0.0)
+    receiver_m = (0.0, 0.0, 0.0)
     wanted_m = lengths_m(
-        *([image_m, ear_m] for image_m in ((0.3, -0.5, 0.1), (0.3, 2.5, 0.1), (2.7, -0.5, 0.1), (2.7, 2.5, 0.1)))
+        *([image_m, receiver_m] for image_m in ((0.3, -0.5, 0.1), (0.3, 2.5, 0.1), (2.7, -0.5, 0.1), (2.7, 2.5, 0.1)))
     )
     order = np.argsort(wanted_m)
     walls = 10 ** (np.array([0, -6, -3, -9]) / 20)
@@ -124,8 +124,8 @@ def test_a_room_has_all_its_second_images_for_a_sensor_that_hears_itself():
 def test_reflections_are_counted():
     point = Point(position_m=(0.8, 0.2, 0.1))
     counts = [
-        len(sorted_ways(scene_of(point, sensor=EAR, walls=(FRONT,), max_reflections=most), "walls")[0])
-        for most in range(3)
+        len(sorted_ways(scene_of(point, sensor=EAR, walls=(FRONT,), max_reflections=largest), "walls")[0])
+        for largest in range(3)
     ]
     assert counts == [1, 4, 5]
     assert len(sorted_ways(scene_of(point, sensor=EAR, walls=(FRONT,)))[0]) == 1  # the effect is off

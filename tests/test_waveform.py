@@ -14,10 +14,10 @@ from ertis_numba.waveform import (
     call_samples,
     decimation_taps,
     filter_response,
+    integer_taps,
     matched_band_hz,
-    matched_filter,
+    matched_filter_spectrum,
     matched_guard_s,
-    whole_taps,
 )
 
 RATE_HZ = 450_000.0
@@ -45,7 +45,7 @@ def settings_of(call, **others):
 
 def compressed(signal, call, n_fft):
     """Return the analytic signal behind the matched filter: (sample,) complex."""
-    matched = matched_filter(settings_of(call), n_fft=n_fft)
+    matched = matched_filter_spectrum(settings_of(call), n_fft=n_fft)
     bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
     spectrum = np.zeros(n_fft, dtype=complex)
     spectrum[bins] = np.fft.rfft(signal, n_fft)[bins] * matched.values
@@ -121,7 +121,7 @@ def test_matched_filter_turns_the_call_into_one_peak(call):
 @given(calls, st.integers(2500, 9000))
 def test_matched_filter_of_any_call(call, n_fft):
     low_hz, high_hz = matched_band_hz(settings_of(call))
-    matched = matched_filter(settings_of(call), n_fft=n_fft)
+    matched = matched_filter_spectrum(settings_of(call), n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * RATE_HZ / n_fft
     assert 0 < low_hz <= frequency_hz[0]
     assert frequency_hz[-1] <= high_hz < RATE_HZ / 2
@@ -158,8 +158,8 @@ def test_matched_filter_of_decimated_signals_has_the_bins_of_the_record(call):
     """At the decimated rate a call that is short or has no ramp would alias."""
     made = Settings(call=call)
     assert made.decimation == 20
-    decimated = matched_filter(made, n_fft=2_000)
-    whole = matched_filter(made, n_fft=40_000, decimation=1)
+    decimated = matched_filter_spectrum(made, n_fft=2_000)
+    whole = matched_filter_spectrum(made, n_fft=40_000, decimation=1)
     assert decimated.first_bin == whole.first_bin
     assert_allclose(decimated.values, whole.values, rtol=1e-12, atol=1e-12 * np.abs(whole.values).max())
 
@@ -181,7 +181,7 @@ def test_band_edges_change_an_echo_as_documented(call, band_edges_hz, difference
     textbook = np.fft.ifft(np.append(np.abs(spectrum) ** 2, np.zeros(n_fft - len(spectrum))))
     textbook = np.abs(textbook) / np.abs(textbook[0])
     made = Settings(call=call, processing=Processing(band_edges_hz=band_edges_hz))
-    matched = matched_filter(made, n_fft=n_fft, decimation=1)
+    matched = matched_filter_spectrum(made, n_fft=n_fft, decimation=1)
     bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
     filtered = np.zeros(n_fft, dtype=complex)
     filtered[bins] = spectrum[bins] * matched.values
@@ -239,7 +239,7 @@ def test_decimation_that_leaves_too_little_is_refused(decimation):
 @given(decimation=st.integers(1, 100), share=st.floats(0.05, 0.5))
 def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
     taps = decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=share * 4.5e6 / decimation / 2)
-    whole = whole_taps(taps)
+    whole = integer_taps(taps)
     assert whole.dtype == np.int16
     assert np.abs(whole.astype(int)).sum() <= 32_767
     change = np.fft.rfft(whole / whole.sum(dtype=int) - taps, 8 * len(taps))
@@ -249,9 +249,9 @@ def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
 def test_taps_too_many_for_16_bits_are_refused():
     taps = decimation_taps(sample_rate_hz=4.5e6, decimation=500, pass_hz=0.8 * 4500)
     with pytest.raises(ArgumentError, match=r"decimation filter of \d+ taps is too long for 16 bits .* smaller"):
-        whole_taps(taps)
+        integer_taps(taps)
     with pytest.raises(ArgumentError, match="too long for 16 bits"):
-        whole_taps(np.full(70_001, 1 / 70_001))
+        integer_taps(np.full(70_001, 1 / 70_001))
 
 
 @pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])

@@ -41,7 +41,7 @@ def test_predicted_wavefront_error_is_that_of_the_exact_images():
         settings = near.replace(processing=near.processing.replace(wavefront=wavefront))
         with Pipeline(settings, "cpu", 1, predict=False) as pipeline:
             image = pipeline.process(measurement)
-        images.append(verification.exact_image(image, measurement).energy)
+        images.append(verification.exact_image(image, measurement).amplitude)
     true_db = verification.error_db(*images)
     predicted_db = plane_wave_error_db(Planner(near, CPU, threads=1).model, near, 0.9)
     assert predicted_db - 10 < true_db < predicted_db + 3

@@ -15,11 +15,11 @@ import pytest
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import Entry, Journal
-from ertis_numba.network.processing import Options
+from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.choice import Choice, Mode
-from ertis_numba.network.processing.notes import Forget
-from ertis_numba.network.processing.quarantine import Quarantine
-from ertis_numba.network.processing.runner import Kind, Lost
+from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue
+from ertis_numba.network.processing.pipe_messages import Release
+from ertis_numba.network.processing.runner import JobKind, Lost
 from ertis_numba.network.processing.sensors import Sensors
 from tests.cases import SHORT
 from tests.driven import ANY, MEASUREMENT, Lines, data, driven, hello
@@ -56,7 +56,7 @@ def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
     assert (status.respawned, status.retried, status.quarantined) == (1, 1, 0)
     assert status.workers[0].pid != pid
     ((_, about),) = [line for line in loop.lines if line[0] == "retried"]
-    assert (about["sensor"], about["epoch"], about["sequence"]) == ("front", 7, 0)
+    assert (about["sensor"], about["session_id"], about["sequence"]) == ("front", 7, 0)
 
 
 def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
@@ -90,12 +90,12 @@ def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path
     (path,) = tmp_path.glob("quarantine_*.h5.journal")
     with Journal.open(path) as journal:
         (entry,) = journal.entries()
-    assert np.array_equal(entry.measurement.words, MEASUREMENT.words)
+    assert np.array_equal(entry.measurement.data, MEASUREMENT.data)
     assert entry.measurement.stamp.sequence == 0
 
 
 def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.processing.pauses._PAUSE_S", 0.5)
+    monkeypatch.setattr("ertis_numba.network.processing.circuit_breaker._PAUSE_S", 0.5)
     with driven() as loop:
         for sensor in ("bad", "good"):
             loop.processing.know(hello(sensor), SHORT)
@@ -114,8 +114,8 @@ def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatc
         assert counts.dropped == {"failed twice": 3}
         loop.offer("bad")
         assert counts.dropped["too many of its sensor have failed"] == 1
-        told = loop.processing.drain_dropped()
-        assert told == [("bad", 7, number, "failed twice") for number in range(3)] + [
+        reported = loop.processing.drain_dropped()
+        assert reported == [("bad", 7, number, "failed twice") for number in range(3)] + [
             ("bad", 7, 3, "too many of its sensor have failed")
         ]
         assert loop.processing.drain_dropped() == []
@@ -127,10 +127,10 @@ def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatc
 
 def test_a_quarantine_has_an_end(tmp_path):
     log = Lines("processing")
-    quarantine = Quarantine(tmp_path, log)
+    quarantine = DeadLetterQueue(tmp_path, log)
     for number in range(110):
         stamp = replace(MEASUREMENT.stamp, sequence=number)
-        quarantine.put(Entry(replace(MEASUREMENT, stamp=stamp), 0, zlib.crc32(MEASUREMENT.words.tobytes())))
+        quarantine.put(Entry(replace(MEASUREMENT, stamp=stamp), 0, zlib.crc32(MEASUREMENT.data.tobytes())))
         while quarantine._waiting.qsize() > 8:  # noqa: SLF001
             os.sched_yield()
     quarantine.close()
@@ -141,10 +141,10 @@ def test_a_quarantine_has_an_end(tmp_path):
 
 
 def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.processing.quarantine._CLOSED_S", 0.05)
+    monkeypatch.setattr("ertis_numba.network.processing.dead_letter_queue._CLOSED_S", 0.05)
     answers = threading.Event()
-    monkeypatch.setattr(Quarantine, "_write", lambda *_: answers.wait(TIMEOUT_S))
-    quarantine = Quarantine(tmp_path, Lines("processing"))
+    monkeypatch.setattr(DeadLetterQueue, "_write", lambda *_: answers.wait(TIMEOUT_S))
+    quarantine = DeadLetterQueue(tmp_path, Lines("processing"))
     for _ in range(20):  # more than may wait
         quarantine.put(Entry(MEASUREMENT, 0, 0))
     quarantine.close()
@@ -161,7 +161,7 @@ def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_
         sent = []
         pipe, send = worker.child.pipe, worker.child.pipe.send
         pipe.send = lambda note, **files: (sent.append(note), send(note, **files))
-        kind = Kind(99, SHORT.replace(air=SHORT.air.replace(temperature_c=3.0)).to_toml(), MEASUREMENT.words.nbytes)
+        kind = JobKind(99, SHORT.replace(air=SHORT.air.replace(temperature_c=3.0)).to_toml(), MEASUREMENT.data.nbytes)
         runner.prepare(kind)
         runner.forget(kind)
         loop.until(lambda: loop.workers("idle"))
@@ -189,8 +189,8 @@ def test_a_worker_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
 class TestSensors:
     def sensors(self, **options):
         described, kinds, log = [], [], Lines("processing")
-        tell = lambda *about: described.append(about)  # noqa: E731
-        made = Sensors(Options(publish=ANY, **options), log, describe=tell, prepare=kinds.append)
+        notify = lambda *about: described.append(about)  # noqa: E731
+        made = Sensors(ProcessingOptions(publish=ANY, **options), log, describe=notify, prepare=kinds.append)
         return made, kinds, log
 
     def test_air_that_changes_slowly_makes_no_pipeline_of_each_measurement(self):
@@ -240,7 +240,7 @@ class TestSensors:
 def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
     with driven() as loop:
         loop.processing.know(hello(), SHORT)
-        loop.offer(words=MEASUREMENT.words[:-1])
+        loop.offer(words=MEASUREMENT.data[:-1])
         loop.offer()
         loop.settle()
         counts, status = loop.processing.counts("front"), loop.processing.status()
@@ -253,7 +253,7 @@ def test_a_worker_that_raises_is_asked_twice_and_lives():
         loop.processing.know(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
         runner = loop.processing._runner  # noqa: SLF001  to have a worker make a mistake
-        runner._workers[0].child.pipe.send(Forget(kind=1))  # noqa: SLF001  it has no pipeline: KeyError
+        runner._workers[0].child.pipe.send(Release(kind=1))  # noqa: SLF001  it has no pipeline: KeyError
         loop.offer()
         loop.settle()
         counts, status = loop.processing.counts("front"), loop.processing.status()
@@ -311,11 +311,11 @@ def test_nothing_is_left_when_the_central_node_is_killed():
 
 def test_what_is_asked_for_is_checked(tmp_path):
     with pytest.raises(ArgumentError, match=r"quarantine .* is no folder"):
-        Options(publish=ANY, quarantine=tmp_path / "missing")
+        ProcessingOptions(publish=ANY, quarantine=tmp_path / "missing")
     with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
-        Options(dtype="float64")
+        ProcessingOptions(dtype="float64")
     with pytest.raises(ArgumentError, match=r"processing\.range_m"):
-        Options(processing={"range_m": (2.0, 1.0)})
+        ProcessingOptions(processing={"range_m": (2.0, 1.0)})
 
 
 class TestChoice:

@@ -12,8 +12,8 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Array, Processing
+from ertis_numba.stages.focal_zones import zone_edges
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.zones import zone_edges
 from tests import reference
 from tests.cases import LINE_8, SHORT, noise
 from tests.hard_cases.echoes import echo_words
@@ -61,7 +61,7 @@ def exact(array, directions, *, spherical):
     settings = NEAR.replace(array=array, processing=NEAR.processing.replace(directions=directions))
     axes = Pipeline(settings)
     unit = unit_vectors(axes.grid.azimuth_rad, axes.grid.elevation_rad)
-    return reference.exact(noise(settings).words, settings, unit, axes.range_m, spherical=spherical)
+    return reference.exact(noise(settings).data, settings, unit, axes.range_m, spherical=spherical)
 
 
 @pytest.mark.parametrize("precision", ["float32", "int16"])
@@ -72,7 +72,7 @@ def test_near_ranges_are_within_the_budget(budget_db, precision):
     settings = tuned(NEAR, max_error_db=budget_db, precision=precision)
     pipeline, measurement = Pipeline(settings), noise(settings)
     image = pipeline.process(measurement)
-    assert error_db(settings, image.energy, spherical=True) < budget_db
+    assert error_db(settings, image.amplitude, spherical=True) < budget_db
 
 
 def test_interpolated_beams_are_within_the_budget_as_well():
@@ -80,15 +80,15 @@ def test_interpolated_beams_are_within_the_budget_as_well():
     settings = settings.replace(processing=NEAR.processing.replace(directions="2d:31"))
     pipeline, measurement = Pipeline(settings), noise(settings)
     image = pipeline.process(measurement)
-    assert pipeline.settings.accuracy.zones > 1
-    assert error_db(settings, image.energy, spherical=True) < -40
+    assert pipeline.settings.accuracy.focal_zones > 1
+    assert error_db(settings, image.amplitude, spherical=True) < -40
 
 
 def test_plane_waves_are_not():
     """They are what they should be themselves, and wrong of points at such ranges."""
     settings = NEAR.replace(processing=NEAR.processing.replace(wavefront="plane"))
     pipeline, measurement = Pipeline(settings), noise(settings)
-    image = pipeline.process(measurement).energy
+    image = pipeline.process(measurement).amplitude
     assert error_db(settings, image, spherical=False) < -35
     assert error_db(settings, image, spherical=True) > -20
 
@@ -101,7 +101,7 @@ def test_a_near_echo_is_as_bright_as_a_far_one():
         processing = NEAR.processing.replace(directions="2d:181", range_m=(0.1, 0.3), wavefront=wavefront)
         settings = NEAR.replace(processing=processing)
         pipeline = Pipeline(settings)
-        image = pipeline.process(Measurement(words, settings)).energy
+        image = pipeline.process(Measurement(words, settings)).amplitude
         direction, place = np.unravel_index(image.argmax(), image.shape)
         brightest[wavefront] = image.max()
         if wavefront == "spherical":
@@ -122,7 +122,7 @@ def test_the_planner_takes_no_more_zones_than_it_needs():
         settings = NEAR.replace(
             processing=NEAR.processing.replace(range_m=range_m), accuracy=Accuracy(max_error_db=budget_db)
         )
-        counts[name] = Planner(settings, kernels.load("cpu"), threads=1).choose().settings.accuracy.zones
+        counts[name] = Planner(settings, kernels.load("cpu"), threads=1).choose().settings.accuracy.focal_zones
     assert counts["exacter"] > 3 * counts["near"]
     assert counts["far"] < counts["near"] / 3
-    assert Pipeline(SHORT).settings.accuracy.zones == 1
+    assert Pipeline(SHORT).settings.accuracy.focal_zones == 1

@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from ertis_numba.frames import Stamp
-from ertis_numba.viewer import Pose, Taken
+from ertis_numba.viewer import Pose, ReceivedImage
 from ertis_numba.viewer._choices import colour_table
 from tests.files import image
 
@@ -18,12 +18,12 @@ def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp
     made = image(np.linspace(-90, 90, 91))
     across = (np.degrees(made.azimuth_rad) - azimuth_deg) / 4
     along = (made.range_m - range_m) / 0.03
-    energy = made.energy * 0.01 + (level * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
-    return made.replace(energy=energy.astype(np.float32), stamp=Stamp(sensor=sensor, sequence=sequence, **stamp))
+    amplitude = made.amplitude * 0.01 + (level * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
+    return made.replace(amplitude=amplitude.astype(np.float32), stamp=Stamp(sensor=sensor, sequence=sequence, **stamp))
 
 
 def taken(made, pose=None, time_s=0.0, interval_s=None):
-    return Taken(made, pose or Pose(), time_s, interval_s)
+    return ReceivedImage(made, pose or Pose(), time_s, interval_s)
 
 
 def brightest(picture):
@@ -67,7 +67,7 @@ class Client:
 class Source:
     """A live source whose clock and images are those that a test gives."""
 
-    is_film = False
+    is_playback = False
     title, state, connected = "source", "live", True
     dropped = skipped = received = 0
 
@@ -86,13 +86,13 @@ class Source:
         return None
 
 
-def settled(view, *, within_s=0.12):
+def acked_through(view, *, within_s=0.12):
     """Let a view draw what there is, and return what it told at last."""
     rows = {}
     page = view._page  # noqa: SLF001  what it tells goes to browsers only
-    tell = page.tell
-    page.tell = lambda told, *, playing: rows.update(told) or tell(told, playing=playing)
+    notify = page.notify
+    page.notify = lambda reported, *, playing: rows.update(reported) or notify(reported, playing=playing)
     view.run(duration_s=within_s)
-    view._tell()  # noqa: SLF001
-    page.tell = tell
+    view._emit_event()  # noqa: SLF001
+    page.notify = notify
     return {name: value for name, (_, value) in rows.items()}

@@ -19,8 +19,8 @@ def block_of(counter, words=None, n_samples=N_SAMPLES):
     return encode_block(counter % 2**32, np.asarray(words, dtype=np.uint32))
 
 
-def told(blocks):
-    return [encode_block(block.counter, block.words) for block in blocks]
+def reported(blocks):
+    return [encode_block(block.counter, block.data) for block in blocks]
 
 
 def counters(blocks):

@@ -10,13 +10,13 @@ import numpy as np
 from ertis_bench import machine, subject, timing
 from ertis_bench.plans import in_words, plans
 from ertis_numba import figures, kernels, verification
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.kernels import KernelSet
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, Settings
-from ertis_numba.stages.detect import find_peaks
 from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.texture import texture_of
+from ertis_numba.stages.signal_model import signal_model_of
 
 __all__ = ["DIRECTIONS", "PAPER", "TURN", "beats", "plot", "run"]
 
@@ -113,9 +113,9 @@ class _Subject:
         self._kernels, self._threads, self._say = kernel_set, kernel_set.max_threads, say
         say(f"{name}: computing the exact image")
         exact = verification.exact_image(Pipeline(settings).process(measurement), measurement)
-        self._exact = exact.energy
+        self._exact = exact.amplitude
         self._wanted: Sequence[Peak] = find_peaks(exact, top=verification.PEAKS)
-        self._texture = texture_of(measurement, settings, kernel_set, threads=self._threads)
+        self._signal_model = signal_model_of(measurement, settings, kernel_set, threads=self._threads)
 
     def rows(self, count: int) -> list[dict[str, Any]]:
         """Return a row per plan, those that err most first."""
@@ -156,7 +156,7 @@ class _Subject:
         return {
             "subject": self._name,
             "plan": name,
-            "error_db": round(verification.error_db(image.energy, self._exact), 1),
+            "error_db": round(verification.error_db(image.amplitude, self._exact), 1),
             "predicted_db": None if name == PAPER else round(self._predicted_db(pipeline.settings), 1),
             "time_ms": 0.0,
             "on_front": False,
@@ -167,7 +167,7 @@ class _Subject:
         }
 
     def _predicted_db(self, settings: Settings) -> float:
-        planner = Planner(settings, self._kernels, threads=self._threads, texture=self._texture)
+        planner = Planner(settings, self._kernels, threads=self._threads, signal_model=self._signal_model)
         return planner.chosen(settings.accuracy).error_db
 
 

@@ -90,17 +90,17 @@ def tried(seed: int) -> dict[str, Any] | None:
         with open_energyscapes(target) as images:
             image = images[0]
             predicted_db, stored = images.predicted_error_db, images.error_warning
-    if not np.any(image.energy):
+    if not np.any(image.amplitude):
         return None
     # Predictions for adaptive beamformers are measured in a sample of the directions: all are compared here.
     if settings.processing.beamformer == "delay_and_sum":
-        chosen, weights = verification.sampled(np.square(image.energy, dtype=np.float64).sum(axis=1), _DIRECTIONS)
+        chosen, weights = verification.sampled(np.square(image.amplitude, dtype=np.float64).sum(axis=1), _DIRECTIONS)
     else:
-        chosen, weights = np.arange(len(image.energy)), np.ones(len(image.energy))
-    verifier, ranges = verification.ExactImage(image, measurement), np.arange(image.energy.shape[1])
+        chosen, weights = np.arange(len(image.amplitude)), np.ones(len(image.amplitude))
+    verifier, ranges = verification.ExactImage(image, measurement), np.arange(image.amplitude.shape[1])
     exact = np.stack([verifier.amplitudes(direction, ranges) for direction in chosen.tolist()])
     scale = np.sqrt(weights)[:, None]
-    error_db = verification.error_db(scale * image.energy[chosen], scale * exact)
+    error_db = verification.error_db(scale * image.amplitude[chosen], scale * exact)
     warned = bool(stored) and stored in done.stderr
     kept = error_db <= settings.accuracy.max_error_db
     return {
@@ -158,7 +158,7 @@ def _settings(random: np.random.Generator) -> Settings:
             beamformer=beamformer,
             dmas_order=int(random.integers(2, min(8, max(2, n_mics)) + 1)),
             snapshots=int(random.integers(1, 9)),
-            loading=float(10 ** random.uniform(-3, 1)),
+            diagonal_loading=float(10 ** random.uniform(-3, 1)),
         ),
         accuracy=Accuracy(max_error_db=float(random.choice([-20.0, -35.0, -35.0, -60.0, random.uniform(-100, -20)]))),
     )

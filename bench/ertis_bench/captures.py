@@ -241,7 +241,7 @@ def _checked(target: Path, reported: list[Line], sent: dict[tuple[str, int], int
         with open_recording(target, sensor=sensor) as recording:
             for measurement in recording:
                 stamp = measurement.stamp
-                rows[sensor, stamp.sequence] = zlib.crc32(measurement.words.data), stamp.sync_count
+                rows[sensor, stamp.sequence] = zlib.crc32(measurement.data.data), stamp.sync_count
     stored = [line for line in reported if line["event"] == "stored"]
     keys = [(line["sensor"], line["sequence"]) for line in stored]
     return {
@@ -255,4 +255,4 @@ def _checked(target: Path, reported: list[Line], sent: dict[tuple[str, int], int
 
 def _row_bytes(target: Path) -> int:
     with open_recording(target, sensor=sensor_names(target)[0]) as recording:
-        return int(recording[0].words.nbytes)
+        return int(recording[0].data.nbytes)

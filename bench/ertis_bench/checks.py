@@ -26,15 +26,15 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     DataError
         The image is wrong.
     """
-    chosen = np.unique(np.linspace(0, len(image.energy) - 1, _DIRECTIONS + 2).astype(int)[1:-1])
+    chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _DIRECTIONS + 2).astype(int)[1:-1])
     exact = ExactImage(image, measurement)
-    ranges = np.arange(image.energy.shape[1])
+    ranges = np.arange(image.amplitude.shape[1])
     expected = np.stack([exact.amplitudes(direction, ranges) for direction in chosen.tolist()])
-    difference = np.linalg.norm(image.energy[chosen] - expected)
+    difference = np.linalg.norm(image.amplitude[chosen] - expected)
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
     if not error_db <= max_error_db:
         raise DataError(
-            f"image of {len(image.energy)} directions is {error_db:.1f} dB off the exact one; wanted at most "
+            f"image of {len(image.amplitude)} directions is {error_db:.1f} dB off the exact one; wanted at most "
             f"{max_error_db:g} dB: the times would be those of a wrong result"
         )
     return error_db
@@ -50,11 +50,11 @@ def require_same_reflector(image: Energyscape, other: Energyscape) -> None:
     DataError
         The other image is weak there.
     """
-    direction, distance = np.unravel_index(np.argmax(image.energy), image.energy.shape)
+    direction, distance = np.unravel_index(np.argmax(image.amplitude), image.amplitude.shape)
     vectors = unit_vectors(other.azimuth_rad, other.elevation_rad)
     there = unit_vectors(image.azimuth_rad[direction], image.elevation_rad[direction])
     near = np.ix_(vectors @ there > math.cos(_NEAR_RAD), np.abs(other.range_m - image.range_m[distance]) < _NEAR_M)
-    ratio = float(np.max(other.energy[near], initial=0.0) / np.max(other.energy))
+    ratio = float(np.max(other.amplitude[near], initial=0.0) / np.max(other.amplitude))
     level_db = 20 * math.log10(ratio) if ratio else -math.inf
     if not level_db >= -_SAME_LEVEL_DB:
         raise DataError(

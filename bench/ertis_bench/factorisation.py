@@ -14,7 +14,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.stages.accuracy import decibels
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamNodes
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.plan_elements import spectrum_of
 

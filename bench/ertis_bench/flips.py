@@ -24,11 +24,11 @@ import numpy as np
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, Entry, Gap, Journal, Sensor
+from ertis_numba.journal import SUFFIX, Entry, Journal, JournalGap, JournalSensor
 from ertis_numba.journal._tables import insertion
 from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.central_node._items import Run
 from ertis_numba.network.central_node._ledger import Ledger
+from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.keys import KeyPair, public_key
 from ertis_numba.network.sensor_node._disk import DiskSpool
 from ertis_numba.settings import Recording, Settings
@@ -36,7 +36,7 @@ from ertis_numba.settings import Recording, Settings
 __all__ = ["flips"]
 
 _SETTINGS: Final = Settings(recording=Recording(n_samples=4_096))
-_EPOCH: Final = 7
+_SESSION_ID: Final = 7
 _SENSORS: Final = ("left", "right")
 _BLOCK_BYTES: Final = 512
 _OTHER_AT_EACH_SEALING: Final = {"/@date_created", "/@history"}
@@ -151,11 +151,11 @@ def _journal(state: str) -> Callable[[Path], Judge]:
         from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes to be killed do without HDF5
         from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-        told = {tuple(each) for each in _made(state, folder)}
+        shown = {tuple(each) for each in _made(state, folder)}
         whole = shutil.copytree(folder, folder.with_name(f"{state}-whole"))
         seal(whole / f"rec.h5{SUFFIX}")
         wanted = _content(whole / "rec.h5")
-        if told != _measured(whole / "rec.h5"):
+        if shown != _measured(whole / "rec.h5"):
             raise RuntimeError(f"without damage, a journal ({state}) is not what was told")
 
         def read(work: Path) -> tuple[object, bool]:
@@ -186,7 +186,7 @@ def _recording(folder: Path) -> Judge:
 
 
 def _spool(folder: Path) -> Judge:
-    told = {tuple(each) for each in _made("spool", folder)}
+    shown = {tuple(each) for each in _made("spool", folder)}
 
     def read(work: Path) -> tuple[object, bool]:
         notes: list[str] = []
@@ -199,10 +199,10 @@ def _spool(folder: Path) -> Judge:
                 if entry is None:
                     is_gap = True
                 else:
-                    found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.words.tobytes())))
+                    found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.data.tobytes())))
         spool.close()
         # Discarded measurements may come back: the central node recognises them.
-        return found >= told, bool(notes) or is_gap
+        return found >= shown, bool(notes) or is_gap
 
     return lambda work: _judged(lambda: read(work), wanted=True)
 
@@ -210,13 +210,13 @@ def _spool(folder: Path) -> Judge:
 def _ledger(folder: Path) -> Judge:
     _made("ledger", folder)
     whole = Ledger(folder)
-    wanted = (whole.settled, whole.open, whole.unsealed, whole.gaps)
+    wanted = (whole.acked_through, whole.open, whole.unsealed, whole.gaps)
 
     def read(work: Path) -> tuple[object, bool]:
         ledger = Ledger(work)
-        if any(last > whole.settled.get(run, -1) for run, last in ledger.settled.items()):
+        if any(last > whole.acked_through.get(run, -1) for run, last in ledger.acked_through.items()):
             return None, False  # measurements to come would be thrown away, whatever is reported
-        return (ledger.settled, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
+        return (ledger.acked_through, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
 
     return lambda work: _judged(lambda: read(work), wanted)
 
@@ -286,11 +286,11 @@ def _entries(count: int, first: int = 0) -> Iterator[Entry]:
             words = np.random.default_rng([number, _SENSORS.index(sensor)]).integers(
                 0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32
             )
-            stamp = Stamp(sensor=sensor, sequence=number, epoch=_EPOCH, timestamp_ns=1_000_000_007 * number)
+            stamp = Stamp(sensor=sensor, sequence=number, session_id=_SESSION_ID, timestamp_ns=1_000_000_007 * number)
             yield Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=number)
 
 
-def _tell(entries: list[Entry]) -> None:
+def _emit_event(entries: list[Entry]) -> None:
     for entry in entries:
         stamp = entry.measurement.stamp
         sys.stdout.write(json.dumps([stamp.sensor, stamp.sequence, entry.crc32]) + "\n")
@@ -304,7 +304,7 @@ def _begin_another_commit(journal: Journal) -> None:
     execute("BEGIN")
     execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
     for number in range(60):
-        execute(insertion("measurements"), (1, _EPOCH, 10_000 + number, *[0] * 9, bytes(8192)))
+        execute(insertion("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
 
 
 def _live(state: str, folder: Path) -> None:
@@ -317,21 +317,25 @@ def _live(state: str, folder: Path) -> None:
         entries = list(_entries({"young": 12, "grown": 150, "large": 160}[state]))
         for begin in range(0, len(entries), size):
             journal.append(entries[begin : begin + size])
-            _tell(entries[begin : begin + size])
+            _emit_event(entries[begin : begin + size])
         if state == "large":
             _begin_another_commit(journal)
     elif state == "spool":
         spool = DiskSpool(folder, 10**9, None, on_note=lambda _: None)
         spool.open()
         for sensor in _SENSORS:
-            spool.add_sensor(Sensor.of(sensor, _SETTINGS))
+            spool.add_sensor(JournalSensor.of(sensor, _SETTINGS))
         entries = list(_entries(20))
         for entry in entries:
             spool.append([entry])
-        _tell(entries)
+        _emit_event(entries)
     elif state == "ledger":
-        runs = {Run(sensor, 2**40 + epoch): 1_000 * epoch for epoch in range(8) for sensor in _SENSORS}
-        gaps = [Gap("left", 3, 9, "the spool was full", 5)]
+        runs = {
+            SensorSession(sensor, 2**40 + session_id): 1_000 * session_id
+            for session_id in range(8)
+            for sensor in _SENSORS
+        }
+        gaps = [JournalGap("left", 3, 9, "the spool was full", 5)]
         tails = {run: {last - number: last * number for number in range(16)} for run, last in runs.items()}
         Ledger(folder).save(runs, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps, tails=tails)
     else:

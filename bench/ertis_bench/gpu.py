@@ -24,7 +24,18 @@ from typing import Any
 from ertis_bench import machine, subject
 from ertis_numba.errors import DeviceError
 
-__all__ = ["BUDGETS_S", "REFUSED", "Done", "execute", "newest", "part", "parts", "run", "sanitized", "tested"]
+__all__ = [
+    "BUDGETS_S",
+    "REFUSED",
+    "FinishedProcess",
+    "execute",
+    "newest",
+    "part",
+    "parts",
+    "run",
+    "sanitized",
+    "tested",
+]
 
 REFUSED = 3
 """Exit code of a process that has no GPU; what it says is why."""
@@ -54,11 +65,11 @@ _SUMMARIES = {
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
 }
 _PYTEST = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider")
-_MOST_TOLD = 20  # names of failed tests
+_MAX_REPORTED = 20  # names of failed tests
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class FinishedProcess:
     """How a process ended.
 
     Attributes
@@ -176,7 +187,7 @@ def tested() -> dict[str, Any]:
         "passed_on_gpu": len(on_gpu),
         "failed": len(bad),
         "skipped": len(skipped),
-        "names_failed": bad[:_MOST_TOLD],
+        "names_failed": bad[:_MAX_REPORTED],
     }
 
 
@@ -202,7 +213,7 @@ def _sanitizer() -> str | None:
     return shutil.which("compute-sanitizer") or shutil.which("compute-sanitizer", path=os.pathsep.join(folders))
 
 
-def execute(command: Sequence[str], limit_s: float) -> Done:
+def execute(command: Sequence[str], limit_s: float) -> FinishedProcess:
     """Run a command in the repository, and end it with all that it started where its time is over."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(
@@ -225,11 +236,11 @@ def execute(command: Sequence[str], limit_s: float) -> Done:
             text, _ = process.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired:
             _end(process)
-            return Done(None, process.communicate()[0])
+            return FinishedProcess(None, process.communicate()[0])
         except BaseException:
             _end(process)
             raise
-    return Done(process.returncode, text)
+    return FinishedProcess(process.returncode, text)
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
@@ -237,7 +248,7 @@ def _end(process: "subprocess.Popen[str]") -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def _failed(name: str, done: Done) -> str:
+def _failed(name: str, done: FinishedProcess) -> str:
     if done.code is None:
         return f"not done after {BUDGETS_S[name]} s"
     return f"failed ({done.code}): {done.last_line}"

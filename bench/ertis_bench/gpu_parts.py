@@ -210,15 +210,15 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
     """Return errors of an image, which are small: from the exact one, and from the processor's of the same plan."""
     image = plain.process(measurement)
     again = [recorded.process(measurement) for _ in range(3)]  # launched, recorded, played
-    if any(not np.array_equal(other.energy, image.energy) for other in again):
+    if any(not np.array_equal(other.amplitude, image.amplitude) for other in again):
         raise DataError("a recorded chain makes another image than a launched one; do not use graphs=True")
     error_db = checks.require_exact(image, measurement)
     same = Pipeline(plain.settings, device="cpu").process(measurement)
-    difference_db = verification.error_db(image.energy, same.energy)
+    difference_db = verification.error_db(image.amplitude, same.amplitude)
     wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
     if not difference_db <= wanted_db:
         raise DataError(
-            f"image of {len(image.energy)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; wanted at "
+            f"image of {len(image.amplitude)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; wanted at "
             f"most {wanted_db:g} dB: the times would be those of a wrong result"
         )
     return {"error_db": round(error_db, 1), "off_cpu_db": round(difference_db, 1)}
@@ -226,7 +226,7 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
 
 def _pinned(pipeline: Pipeline, measurement: Measurement) -> NDArray[np.float32]:
     """Return the array of an image as the pipeline makes it, which is the quickest to be filled."""
-    return pipeline.process(measurement).energy
+    return pipeline.process(measurement).amplitude
 
 
 def _streamed(plan: Settings, words: NDArray[Any], scale: Scale) -> dict[str, float]:
@@ -249,7 +249,7 @@ def _streamed(plan: Settings, words: NDArray[Any], scale: Scale) -> dict[str, fl
 
 def _words(measurement: Measurement) -> NDArray[Any]:
     n_samples = measurement.settings.recording.n_samples
-    return np.require(measurement.words, requirements=["C", "A", "W"]).reshape(n_samples, -1)
+    return np.require(measurement.data, requirements=["C", "A", "W"]).reshape(n_samples, -1)
 
 
 def _installed() -> dict[str, str]:

@@ -57,7 +57,7 @@ def stages(settings: Settings, words: NDArray[Any], *, count: int) -> dict[str, 
         ``stages_ms`` by name, their sums with and without ``TRANSFERS``, and ``queued``: whether all was launched while
         the GPU was still busy, each time.
     """
-    watch = _Watch()
+    watch = _LaunchStopwatch()
     chain = FastChain(settings, _watched(kernels.load("cuda"), watch), threads=1)
     image = chain.new_image()
     times_ms: list[dict[str, float]] = []
@@ -81,7 +81,7 @@ def stages(settings: Settings, words: NDArray[Any], *, count: int) -> dict[str, 
     }
 
 
-class _Watch(Stopwatch):
+class _LaunchStopwatch(Stopwatch):
     """A stopwatch that also knows how long the processor took to launch everything."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class _Watch(Stopwatch):
         return 1e3 * (self._end_s - self._begin_s)
 
 
-def _watched(kernel_set: KernelSet, watch: _Watch) -> KernelSet:
+def _watched(kernel_set: KernelSet, watch: _LaunchStopwatch) -> KernelSet:
     """Return kernels that set marks where a stage ends."""
     before = {"multiply_and_fold": "forward transforms", **dict.fromkeys(_BEAMFORM, "inverse transforms")}
     after = {"demodulate_words": "demodulate", "multiply_and_fold": "multiply and fold"}
@@ -113,33 +113,33 @@ def _watched(kernel_set: KernelSet, watch: _Watch) -> KernelSet:
         name: functools.partial(_run, getattr(kernel_set, name), watch, before.get(name), end)
         for name, end in after.items()
     }
-    return dataclasses.replace(kernel_set, memory=functools.partial(_Memory, kernel_set.memory, watch), **changes)
+    return dataclasses.replace(kernel_set, memory=functools.partial(_TimedMemory, kernel_set.memory, watch), **changes)
 
 
-def _run(kernel: Callable[..., None], watch: _Watch, before: str | None, after: str, *arguments: Any) -> None:
+def _run(kernel: Callable[..., None], watch: _LaunchStopwatch, before: str | None, after: str, *arguments: Any) -> None:
     if before:
         watch.mark(before)
     kernel(*arguments)
     watch.mark(after)
 
 
-class _Memory:
+class _TimedMemory:
     """A memory whose lanes set marks; all else is the device's."""
 
-    def __init__(self, make: Callable[..., Memory], watch: _Watch, *, graphs: bool = False) -> None:
+    def __init__(self, make: Callable[..., Memory], watch: _LaunchStopwatch, *, graphs: bool = False) -> None:
         self._memory, self._watch = make(graphs=graphs), watch
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._memory, name)
 
     def lane(self) -> Any:
-        return _Lane(self._memory.lane(), self._watch, self._memory.zeros((32,), np.float32))
+        return _TimedLane(self._memory.lane(), self._watch, self._memory.zeros((32,), np.float32))
 
 
-class _Lane:
+class _TimedLane:
     """A lane that is kept busy before the words are sent, and that sets marks at both transfers."""
 
-    def __init__(self, lane: Lane, watch: _Watch, sums: NDArray[np.float32]) -> None:
+    def __init__(self, lane: Lane, watch: _LaunchStopwatch, sums: NDArray[np.float32]) -> None:
         self._lane, self._watch, self._sums = lane, watch, sums
 
     def __getattr__(self, name: str) -> Any:

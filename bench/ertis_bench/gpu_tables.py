@@ -132,15 +132,15 @@ def _verdicts(report: dict[str, Any]) -> str:
     """Return what became of each part, failures included."""
     lines = []
     for name, part in report["parts"].items():
-        told = [part["status"]]
+        reported = [part["status"]]
         if name == "tests" and "passed" in part:
-            told.append(
+            reported.append(
                 f"{part['passed']} passed, {part['passed_on_gpu']} of them on the GPU; {part['failed']} failed, "
                 f"{part['skipped']} skipped"
             )
         if "errors" in part:
-            told.append(f"{part['errors']} errors in {part['tests_passed']} tests")
-        lines.append(f"- {name}: {'; '.join(told)} ({part['wall_s']:.0f} s)")
+            reported.append(f"{part['errors']} errors in {part['tests_passed']} tests")
+        lines.append(f"- {name}: {'; '.join(reported)} ({part['wall_s']:.0f} s)")
     return "\n".join(lines)
 
 
@@ -155,11 +155,11 @@ def _machine(report: dict[str, Any]) -> str:
         "power limit": card.get("power.limit"),
     }
     under_load = next((row["clocks.sm"] for row in _rows(report, "ceilings") if "clocks.sm" in row), None)
-    told = [f"{name} {value}" for name, value in {**known, "clock just after load": under_load}.items() if value]
+    reported = [f"{name} {value}" for name, value in {**known, "clock just after load": under_load}.items() if value]
     packages = ", ".join(f"{name} {value}" for name, value in card["packages"].items())
     return (
         f"Measured on {card['name']} ({card['multiprocessors']} multiprocessors, compute capability "
-        f"{card['compute_capability']}; {', '.join(told)}) beside {host['cpu']}, {host['cores']} cores; {packages}, "
+        f"{card['compute_capability']}; {', '.join(reported)}) beside {host['cpu']}, {host['cores']} cores; {packages}, "
         f"numba {host['numba']}, python {host['python']}."
     )
 

@@ -31,9 +31,9 @@ __all__ = ["appending", "sealing"]
 
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
 _SENSORS = ("left", "right")
-_EPOCH = 7
+_SESSION_ID = 7
 _LATE = 3  # measurements of the first sensor after which the second one comes
-_MOST_TOLD = 12  # commits until a process is killed
+_MAX_REPORTED = 12  # commits until a process is killed
 _LINES_OF_A_COMMIT = 170  # about
 _JITTER_S = 0.004
 _SAME_JOURNAL = 3  # processes that are killed one after the other over the same journal
@@ -48,7 +48,7 @@ def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     Returns
     -------
     dict of str to int
-        ``kills``, measurements ``told``; of them ``lost`` and ``wrong``; ``untold``, which are there although nobody
+        ``kills``, measurements ``reported``; of them ``lost`` and ``wrong``; ``unrecorded``, which are there although nobody
         told of them any more; and ``unexpected``, which are no such measurements.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
@@ -56,43 +56,43 @@ def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     path = folder / "rec.h5.journal"
     with _Nursery() as nursery:
         while found["kills"] < count:
-            told: set[tuple[str, int]] = set()
+            reported: set[tuple[str, int]] = set()
             for _ in range(min(_SAME_JOURNAL, count - found["kills"])):
-                told |= _killed_appending(nursery, path, rng, seed)
+                reported |= _killed_appending(nursery, path, rng, seed)
                 found["kills"] += 1
-            _look_into(path, told, seed, found)
+            _look_into(path, reported, seed, found)
     return found
 
 
 def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed: int) -> set[tuple[str, int]]:
     """Kill a process while it appends, and return the keys that it told."""
-    lines = rng.randrange(_MOST_TOLD * _LINES_OF_A_COMMIT) if rng.random() < 0.5 else None
+    lines = rng.randrange(_MAX_REPORTED * _LINES_OF_A_COMMIT) if rng.random() < 0.5 else None
     nursery.begin("append", path=str(path), seed=seed, dies_after_lines=lines)
-    told: list[str] = []
+    reported: list[str] = []
     if lines is None:
-        wanted = rng.randrange(_MOST_TOLD)
-        while len(told) < wanted:
-            told.append(nursery.line())
+        wanted = rng.randrange(_MAX_REPORTED)
+        while len(reported) < wanted:
+            reported.append(nursery.line())
         time.sleep(rng.uniform(0.0, _JITTER_S))
         nursery.kill()
-    told += nursery.end()
-    return {(sensor, int(sequence)) for sensor, sequence in map(str.split, told)}
+    reported += nursery.end()
+    return {(sensor, int(sequence)) for sensor, sequence in map(str.split, reported)}
 
 
-def _look_into(path: Path, told: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
+def _look_into(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
     """Count what is in a journal, and remove it."""
-    found["told"] += len(told)
+    found["told"] += len(reported)
     if not path.exists():  # killed before it was made
-        found["lost"] += len(told)
+        found["lost"] += len(reported)
         return
     with Journal.open(path) as journal:
         keys = {(key.sensor, key.sequence): key for key in journal.index()}
-        found["lost"] += len(told - keys.keys())
-        found["untold"] += len(keys.keys() - told)
+        found["lost"] += len(reported - keys.keys())
+        found["untold"] += len(keys.keys() - reported)
         for (sensor, sequence), key in keys.items():
             entry = journal.entry(key)
-            same = np.array_equal(entry.measurement.words, _words(seed, sensor, sequence))
-            found["wrong"] += not (same and entry.monotonic_ns == sequence and key.epoch == _EPOCH)
+            same = np.array_equal(entry.measurement.data, _words(seed, sensor, sequence))
+            found["wrong"] += not (same and entry.monotonic_ns == sequence and key.session_id == _SESSION_ID)
         for sensor in journal.sensors:
             numbers = [key.sequence for key in journal.index(sensor)]
             found["unexpected"] += numbers != list(range(len(numbers)))
@@ -112,13 +112,13 @@ def _append(*, path: str, seed: int) -> None:
             sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _LATE)])
             if sensor not in journal.sensors:
                 journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
-            stamp = Stamp(sensor=sensor, sequence=counts[sensor], epoch=_EPOCH)
+            stamp = Stamp(sensor=sensor, sequence=counts[sensor], session_id=_SESSION_ID)
             measurement = Measurement(_words(seed, sensor, counts[sensor]), _SETTINGS, stamp)
             entries.append(Entry(measurement, monotonic_ns=counts[sensor]))
             counts[sensor] += 1
         journal.append(entries)
         for entry in entries:
-            _tell(f"{entry.measurement.stamp.sensor} {entry.measurement.stamp.sequence}")
+            _emit_event(f"{entry.measurement.stamp.sensor} {entry.measurement.stamp.sequence}")
 
 
 def _words(seed: int, sensor: str, sequence: int) -> NDArray[np.uint32]:
@@ -166,12 +166,12 @@ def _crash(folder: Path, seed: int) -> None:
         for sequence in (1, 2, 3, 5, 6):
             for sensor in _SENSORS:
                 stamp = Stamp(
-                    sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence, epoch=_EPOCH
+                    sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence, session_id=_SESSION_ID
                 )
                 words = _words(seed, sensor, sequence)
                 journal.append([Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=sequence)])
-        journal.note_gap("left", 4, 4, "footer", epoch=_EPOCH)
-        journal.note_gap("absent", 0, 6, "it was silent", epoch=_EPOCH)
+        journal.note_gap("left", 4, 4, "footer", session_id=_SESSION_ID)
+        journal.note_gap("absent", 0, 6, "it was silent", session_id=_SESSION_ID)
         shutil.copytree(made, folder)  # nothing is written now: to the files, it is as if this process was killed
     shutil.rmtree(made)
 
@@ -183,9 +183,9 @@ def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, f
         path = shutil.copytree(crashed, work) / "rec.h5.journal"
         nursery.begin("seal", path=str(path), counts_lines=counts)
         begin_s = time.monotonic()
-        told = nursery.end()
+        reported = nursery.end()
         lasts_s = time.monotonic() - begin_s
-        n_lines = int(told[-1]) if counts else n_lines
+        n_lines = int(reported[-1]) if counts else n_lines
         made = (work / "rec.h5").read_bytes()
         shutil.rmtree(work)
     return n_lines, lasts_s, made
@@ -206,7 +206,7 @@ def _seal(*, path: str) -> None:
     from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes that only append do without HDF5
 
     seal(path)
-    _tell("sealed")
+    _emit_event("sealed")
 
 
 class _Nursery:
@@ -268,7 +268,7 @@ def _nurse() -> None:
         request = json.loads(line)
         if request["job"] is None:
             os.waitpid(pid, 0)
-            _tell("ended")
+            _emit_event("ended")
             continue
         if request["job"] == "seal":
             import ertis_numba.storage.sealing  # noqa: F401, PLC0415  so that the copies need not
@@ -280,7 +280,7 @@ def _nurse() -> None:
 def _live(request: dict[str, Any]) -> NoReturn:
     """Do a job, unless something ends this process before."""
     signal.alarm(_LIFE_S)
-    _tell(str(os.getpid()))
+    _emit_event(str(os.getpid()))
     try:
         counter = _LineCounter(request["lines"])
         if request["lines"] is not None or request["counts"]:
@@ -289,10 +289,10 @@ def _live(request: dict[str, Any]) -> NoReturn:
         jobs[request["job"]](**request["arguments"])
         sys.settrace(None)
         if request["counts"]:
-            _tell(str(counter.count))
+            _emit_event(str(counter.count))
     except BaseException as error:  # noqa: BLE001  whatever it is, the one who asked has to hear of it
         traceback.print_exc()
-        _tell(f"failed: {' '.join(str(error).split())}")
+        _emit_event(f"failed: {' '.join(str(error).split())}")
     finally:
         os._exit(0)
 
@@ -300,9 +300,9 @@ def _live(request: dict[str, Any]) -> NoReturn:
 class _LineCounter:
     """Counts the lines of this package's code that run, and kills the process before one."""
 
-    def __init__(self, most: int | None) -> None:
+    def __init__(self, largest: int | None) -> None:
         self.count = 0
-        self._most = most
+        self._max = largest
 
     def __call__(self, frame: FrameType, _event: str, _argument: object) -> Callable[..., Any] | None:
         """Look into a function that is called, if it is one of ours."""
@@ -310,12 +310,12 @@ class _LineCounter:
 
     def _line(self, _frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
         self.count += event == "line"
-        if self._most is not None and self.count > self._most:
+        if self._max is not None and self.count > self._max:
             os.kill(os.getpid(), signal.SIGKILL)
         return self._line
 
 
-def _tell(line: str) -> None:
+def _emit_event(line: str) -> None:
     os.write(1, f"{line}\n".encode())  # at once, and in one piece
 
 

@@ -17,7 +17,7 @@ from ertis_bench import checks, machine, subject
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_numba import cluster
-from ertis_numba.campaign import Begun, Campaign, Ended, Options, find
+from ertis_numba.campaign import Begun, Campaign, CampaignOptions, RecordingEnded, find
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
@@ -25,7 +25,7 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 __all__ = ["many", "run"]
 
 _MEASUREMENTS: Final = 20  # of each recording
-_EPOCH: Final = "1700000000"  # what would differ between files is when they were made
+_SESSION_ID: Final = "1700000000"  # what would differ between files is when they were made
 
 
 def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
@@ -44,12 +44,12 @@ def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any
         A recording failed, an image is wrong, or files differ.
     """
     before = os.environ.get("SOURCE_DATE_EPOCH")
-    os.environ["SOURCE_DATE_EPOCH"] = _EPOCH
+    os.environ["SOURCE_DATE_EPOCH"] = _SESSION_ID
     try:
         with tempfile.TemporaryDirectory(prefix="ertis-") as place, ExitStack() as stack:
             say(f"writing {count} recordings")
             folder, source = _recordings(Path(place) / "runs", count)
-            address = stack.enter_context(cluster.local(_cores()))
+            address = stack.enter_context(cluster.local_cluster(_cores()))
             times_s = _measured(folder, Path(place) / "out", _crews(address), rounds, say)
             size_bytes = sum(path.stat().st_size for path in folder.iterdir())
     finally:
@@ -99,7 +99,7 @@ def _measurements(first: Measurement, number: int) -> Iterator[Measurement]:
     """Yield a measurement again and again, a little later in its record each time."""
     for index in range(_MEASUREMENTS):
         stamp = replace(first.stamp, sequence=index, sync_count=index, timestamp_ns=50_000_000 * index)
-        yield replace(first, words=np.roll(first.words, number * _MEASUREMENTS + index), stamp=stamp)
+        yield replace(first, data=np.roll(first.data, number * _MEASUREMENTS + index), stamp=stamp)
 
 
 def _measured(
@@ -134,12 +134,12 @@ def _differences(files: dict[str, bytes], wanted: dict[str, bytes]) -> Iterator[
             yield f"{name}: {places.size} of {len(one)} bytes, from {places[0]} to {places[-1]}"
 
 
-def _timed(folder: Path, target: Path, *, threads: int | None = None, **crew: Any) -> tuple[float, float]:
+def _timed(folder: Path, target: Path, *, threads: int | None = None, **pool: Any) -> tuple[float, float]:
     begin_s = first_s = time.perf_counter()
-    for event in Campaign(find([folder]), target, Options(threads=threads), **crew).run():
+    for event in Campaign(find([folder]), target, CampaignOptions(threads=threads), **pool).run():
         if isinstance(event, Begun) and first_s == begin_s:
             first_s = time.perf_counter()
-        if isinstance(event, Ended) and event.outcome != "made":
+        if isinstance(event, RecordingEnded) and event.outcome != "made":
             raise DataError(f"{event.recording} is {event.outcome} ({event.error}); it is not timed")
     end_s = time.perf_counter()
     return end_s - begin_s, end_s - first_s

@@ -61,9 +61,9 @@ def in_words(accuracy: Accuracy) -> str:
     parts = [accuracy.precision, _SAMPLES.get(accuracy.interpolation, fitted).format(n=n_phases)]
     if accuracy.beam_taps:
         parts.append(f"nodes {accuracy.beam_taps} × {accuracy.beam_density:g}")
-    parts.append(f"{accuracy.stop_band_db:g} dB")
-    if accuracy.zones and accuracy.zones > 1:
-        parts.append(f"{accuracy.zones} zones")
+    parts.append(f"{accuracy.stopband_attenuation_db:g} dB")
+    if accuracy.focal_zones and accuracy.focal_zones > 1:
+        parts.append(f"{accuracy.focal_zones} zones")
     return ", ".join(parts)
 
 
@@ -73,7 +73,7 @@ def plans(kernels: KernelSet) -> list[Accuracy]:
 
 
 def _plan(
-    precision: str, way: str | int, n_phases: int, stop_band_db: float, nodes: tuple[int, float] | None
+    precision: str, way: str | int, n_phases: int, stopband_attenuation_db: float, nodes: tuple[int, float] | None
 ) -> Accuracy:
     beam_taps, beam_density = nodes or (0, 2.0)
     return Accuracy().replace(
@@ -83,6 +83,6 @@ def _plan(
         delay_taps=INTERPOLATIONS[way] if isinstance(way, str) else way,
         beam_taps=beam_taps,
         beam_density=beam_density,
-        stop_band_db=stop_band_db,
-        zones=1,
+        stopband_attenuation_db=stopband_attenuation_db,
+        focal_zones=1,
     )

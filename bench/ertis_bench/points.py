@@ -12,13 +12,13 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
-from ertis_numba.stages.points import PointExtractor
 from ertis_numba.waveform import call_at
 
 __all__ = ["BUDGETS_DB", "GRIDS", "RATIOS", "Trials", "form", "run"]
@@ -93,12 +93,12 @@ class Trials:
         cloud = self._extract(image)
         point = cloud.position_m[0].astype(np.float64)
         found_m = float(np.linalg.norm(point))
-        across_m = range_m * float(point / found_m @ self._least_resolved(azimuth_rad, elevation_rad))
+        across_m = range_m * float(point / found_m @ self._min_resolved(azimuth_rad, elevation_rad))
         if cloud.uncertainty_m is None:
             raise DataError("points have no uncertainty; give settings with a complete plan")
         return np.asarray(np.array([found_m - range_m, across_m]) / cloud.uncertainty_m[0].astype(np.float64))
 
-    def _least_resolved(
+    def _min_resolved(
         self, azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the unit vector across the line of sight along which the array extends least."""

@@ -73,11 +73,11 @@ def _plan(settings: Settings) -> dict[str, Any]:
     def steps(kernels: KernelSet) -> None:
         complete = planner.complete(settings, kernels, threads=1)
         chain = FastChain(complete, kernels, threads=1)
-        words, image = subject.measurement()[0].words, chain.new_image()
+        words, image = subject.measurement()[0].data, chain.new_image()
         sizes.update(
             accuracy={
                 name: getattr(complete.accuracy, name)
-                for name in ("oversampling", "delay_taps", "beam_taps", "beam_density", "stop_band_db")
+                for name in ("oversampling", "delay_taps", "beam_taps", "beam_density", "stopband_attenuation_db")
             },
             words_bytes=words.nbytes,
             image_bytes=image.nbytes,

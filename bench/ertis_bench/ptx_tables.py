@@ -78,8 +78,8 @@ def _by(sizes: list[int]) -> str:
     return "(" + ", ".join(map(str, sizes)) + ")"
 
 
-def _range(least: float, most: float) -> str:
-    return f"{most:.1f}" if f"{least:.1f}" == f"{most:.1f}" else f"{least:.1f}–{most:.1f}"
+def _range(smallest: float, largest: float) -> str:
+    return f"{largest:.1f}" if f"{smallest:.1f}" == f"{largest:.1f}" else f"{smallest:.1f}–{largest:.1f}"
 
 
 def _loops(loops: list[dict[str, Any]]) -> str:
@@ -114,12 +114,12 @@ def _totals(report: dict[str, Any]) -> str:
 
 def _ceiling(ceiling: dict[str, Any], goal: float) -> str:
     limits = " and ".join(f"{time_us:g} µs of {name}" for name, time_us in ceiling["ceilings_us"].items())
-    least, most = ceiling["of_ceiling"]
+    smallest, largest = ceiling["of_ceiling"]
     return (
         f"`delay_and_sum_envelope` of 3000 direct beams, {ceiling['points'] / 1e6:.0f} million points: ceilings are "
         f"{limits} (a sample of 8 bytes, four multiply-adds). Predicted: {_range(ceiling['least_us'], ceiling['us'])} "
-        f"µs, {100 * most:.0f} % of the tighter one if blocks find in the first cache what others have fetched, and "
-        f"{100 * least:.0f} % if none does; wanted are {100 * goal:.0f} %."
+        f"µs, {100 * largest:.0f} % of the tighter one if blocks find in the first cache what others have fetched, and "
+        f"{100 * smallest:.0f} % if none does; wanted are {100 * goal:.0f} %."
     )
 
 

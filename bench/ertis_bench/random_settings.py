@@ -11,9 +11,9 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.waveform import call_at
-from ertis_numba.words import word_format
 
 __all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 
@@ -155,7 +155,7 @@ def _processing(
         beamformer=beamformer,
         dmas_order=int(random.choice(orders)),
         snapshots=int(random.integers(1, 9)),
-        loading=float(10 ** random.uniform(-3, 1)),
+        diagonal_loading=float(10 ** random.uniform(-3, 1)),
         band_edges_hz=edges_hz if widened else None,
     )
 
@@ -181,7 +181,7 @@ def _words(random: np.random.Generator, settings: Settings) -> NDArray[Any]:
 
 def recorded(random: np.random.Generator, signals: NDArray[np.float64], settings: Settings) -> NDArray[Any]:
     """Return signals as the converters of a sensor would store them: numbers, or dithered bits packed into words."""
-    recording, form = settings.recording, word_format(settings)
+    recording, form = settings.recording, sample_format(settings)
     if not recording.is_pdm:
         scaled = signals.T * recording.full_scale
         limit = recording.full_scale - 1
@@ -189,7 +189,7 @@ def recorded(random: np.random.Generator, signals: NDArray[np.float64], settings
         return np.ascontiguousarray(np.clip(np.rint(scaled), -limit, limit) if whole else scaled).astype(form.dtype)
     bits = signals > random.uniform(-1, 1, signals.shape)
     word_bits = 8 * form.dtype.itemsize
-    padded = np.zeros((form.rows[1] * word_bits, signals.shape[1]), dtype=bool)
+    padded = np.zeros((form.shape_2d[1] * word_bits, signals.shape[1]), dtype=bool)
     padded[: len(bits)] = bits
     octets = np.packbits(padded.T, axis=1, bitorder="little")
     return np.ascontiguousarray(octets).view(form.dtype.newbyteorder("<")).reshape(form.shape)

@@ -106,7 +106,7 @@ def beamformed(y: Delayed, processing: Processing) -> Floats:
         return coherence_factor(y / len(y))
     if processing.beamformer == "dmas":
         return dmas(y / np.abs(y) ** (1 - 1 / processing.dmas_order), processing.dmas_order)
-    return capon(y, processing.snapshots, processing.loading)
+    return capon(y, processing.snapshots, processing.diagonal_loading)
 
 
 def amplitudes(y: Delayed) -> Floats:

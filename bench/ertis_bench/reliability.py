@@ -17,7 +17,7 @@ from ertis_numba.devices.bits import BitCheck
 from ertis_numba.devices.commands import LENGTH_STEP
 from ertis_numba.storage import open_recording
 
-__all__ = ["LONG", "ONE_SENSOR", "PARTS", "SHORT", "Extent", "run", "small_disk", "wire"]
+__all__ = ["LONG", "ONE_SENSOR", "PARTS", "SHORT", "TrialCounts", "run", "small_disk", "wire"]
 
 _ROOT = Path(__file__).parents[2]
 ONE_SENSOR = _ROOT / "data" / "synthetic" / "reflectors.h5"
@@ -27,7 +27,7 @@ _DISK_MB = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Extent:
+class TrialCounts:
     """How much is tried.
 
     Attributes
@@ -61,7 +61,7 @@ class Extent:
     n_flips: int
 
 
-SHORT = Extent(
+SHORT = TrialCounts(
     duration_s=5.0,
     n_groups=12,
     n_blocks=3_000,
@@ -72,7 +72,7 @@ SHORT = Extent(
     n_power_cuts=40,
     n_flips=60,
 )
-LONG = Extent(
+LONG = TrialCounts(
     duration_s=600.0,
     n_groups=1_200,
     n_blocks=100_000,
@@ -92,13 +92,13 @@ def run(
     return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only)
 
 
-def _chain(extent: Extent, folder: Path, _: int) -> dict[str, Any]:
+def _chain(extent: TrialCounts, folder: Path, _: int) -> dict[str, Any]:
     platform = folder / "platform.toml"
     platform.write_text(captures.platform(4, n_measurements=5).to_toml())
     return captures.chain(platform, folder, n_groups=extent.n_groups, rate_hz=10.0)
 
 
-def _disk_full(_: Extent, folder: Path, __: int) -> dict[str, Any] | None:
+def _disk_full(_: TrialCounts, folder: Path, __: int) -> dict[str, Any] | None:
     disk = folder / "disk"
     disk.mkdir()
     with small_disk(disk) as mounted:
@@ -108,7 +108,7 @@ def _disk_full(_: Extent, folder: Path, __: int) -> dict[str, Any] | None:
 def wire(n_blocks: int, seed: int, *, splices: bool = False) -> dict[str, Any]:
     """Send blocks of the least length, with the words of a sensor, over a line with faults."""
     with open_recording(ONE_SENSOR) as recording:
-        words = recording[0].words
+        words = recording[0].data
     check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ, splices=splices)
     found = wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check)
     # Not by asdict, which makes pairs the keys of a Counter.
@@ -131,7 +131,7 @@ def small_disk(folder: Path) -> Iterator[Path | None]:
             subprocess.run(["umount", str(folder)], check=True)  # noqa: S603, S607
 
 
-PARTS: Parts[Extent] = {
+PARTS: Parts[TrialCounts] = {
     "sustained": (
         "capturing at 20 Hz for {duration_s:g} s",
         lambda extent, folder, _: captures.sustained(ONE_SENSOR, folder, duration_s=extent.duration_s, rate_hz=20.0),

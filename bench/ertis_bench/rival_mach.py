@@ -54,7 +54,7 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
     """
     chain = FastChain(settings, kernels.load(device), threads=1)
     image = chain.new_image()
-    words = measurement.words.reshape(settings.recording.n_samples, -1)
+    words = measurement.data.reshape(settings.recording.n_samples, -1)
     analytic, lead = chain.analytic(words)
     chain.process(words, image)
     speed_m_s, layout = sound_speed_m_s(settings.air), microphones(settings.array)
@@ -111,7 +111,7 @@ def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, 
         {"one": functools.partial(run, here), "many": functools.partial(run, many)}, count=count, burst=count
     )
     median_ms = {name: timing.summary(times)["median_ms"] for name, times in times_ms.items()}
-    words = measurement.words.reshape(plan.recording.n_samples, -1)
+    words = measurement.data.reshape(plan.recording.n_samples, -1)
     ours_ms = stages(plan, words, count=count)["stages_ms"]["delay-and-sum with envelope"]
     return {
         "what": "delay-and-sum with envelope alone",

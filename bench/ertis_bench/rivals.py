@@ -87,7 +87,7 @@ def tables_of(settings: Settings, measurement: Measurement) -> Tables:
     changes: dict[str, Any] = {name: spy(name) for name in names}
     chain = FastChain(settings, dataclasses.replace(kernel_set, **changes), threads=1)
     image = chain.new_image()
-    chain.process(measurement.words.reshape(settings.recording.n_samples, -1), image)
+    chain.process(measurement.data.reshape(settings.recording.n_samples, -1), image)
     ((_, channels, taps, scale, factor, first, n_signals, signals),) = seen["demodulate_words"]
     ((_, responses, first_bin, folded),) = seen["multiply_and_fold"]
     zones = [arguments[1:5] for arguments in seen["delay_and_sum_envelope"]]
@@ -184,7 +184,7 @@ class ArrayChain:
         ]
 
     def __call__(self, words: NDArray[Any], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (direction, range), from ``words``, (sample, word)."""
+        """Fill ``out``, (direction, range), from ``data``, (sample, word)."""
         octets = self._library.upload(words.view(np.uint8).reshape(len(words), -1))
         analytic = self._analytic(self._signals(octets))
         image = self._library.zeros(out.shape, "float32")
@@ -249,8 +249,8 @@ def race(library: str, settings: Settings, measurement: Measurement, count: int)
     with Pipeline(settings.replace(accuracy=direct), device="cuda") as pipeline:
         tables = tables_of(pipeline.settings, measurement)
         chain = ArrayChain(tables, _MAKERS[library]())
-        image = pipeline.process(measurement).energy
-        words, out = np.array(measurement.words).reshape(len(measurement.words), -1), np.empty_like(image)
+        image = pipeline.process(measurement).amplitude
+        words, out = np.array(measurement.data).reshape(len(measurement.data), -1), np.empty_like(image)
         chain(words, out)
         difference_db = verification.error_db(out, image)
         if not difference_db <= _SAME_DB:

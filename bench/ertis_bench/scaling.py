@@ -83,20 +83,20 @@ def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
         pipeline, measurement = Pipeline(settings, "cpu", threads), subject.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
         checks.require_exact(image, measurement)
-        subject_of: Callable[[], object] = functools.partial(pipeline.process, measurement, out=image.energy)
+        subject_of: Callable[[], object] = functools.partial(pipeline.process, measurement, out=image.amplitude)
         if series == "batch":
             subject_of = functools.partial(pipeline.process_batch, [measurement] * int(value))
             checks.require_exact(pipeline.process_batch([measurement] * int(value))[-1], measurement)
         subjects[f"{value:g}"] = subject_of
-        n_ranges[f"{value:g}"] = image.energy.shape[1]
+        n_ranges[f"{value:g}"] = image.amplitude.shape[1]
     for name, times_ms in timing.round_robin(subjects, count=count).items():
         each_ms = times_ms / float(name) if series == "batch" else times_ms
         yield {"value": float(name), "n_ranges": n_ranges[name], **timing.summary(each_ms)}
 
 
 def _thread_counts() -> list[int]:
-    most = kernels.load("cpu").max_threads
-    return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < most] + [most]
+    largest = kernels.load("cpu").max_threads
+    return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < largest] + [largest]
 
 
 def _settings(plan: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:

@@ -29,7 +29,7 @@ MAX_END_S: Final = 1.0
 _SCENE = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _STARTS = 5
-_MOST_TRIES = 10  # for each signal, of which those count that reach a running process
+_MAX_TRIES = 10  # for each signal, of which those count that reach a running process
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")
@@ -111,7 +111,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
     with open_recording(source) as recording:
         measurement = recording[0]
-        raw.write_bytes(measurement.words.tobytes())
+        raw.write_bytes(measurement.data.tobytes())
         made = folder / "journal"
         made.mkdir()
         with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
@@ -134,7 +134,7 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
     lasts_s, _, _, _ = _one(command, paths, out, None, _UNDISTURBED_S)
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
-    for _ in range(_MOST_TRIES * count):
+    for _ in range(_MAX_TRIES * count):
         if found["signals"] == count:
             break
         number = rng.choice(_SIGNALS)

@@ -22,9 +22,9 @@ from ertis_numba.simulation import (
     Tone,
     Wall,
 )
+from ertis_numba.simulation.ab_render import image_change_db
 from ertis_numba.simulation.names import ASKED_FOR, EFFECTS
-from ertis_numba.simulation.plan import Plan, make_plan
-from ertis_numba.simulation.rehearsal import image_change_db
+from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import snapshot
@@ -130,11 +130,11 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     }
 
 
-def _change_db(scene: Scene, plan: Plan, everything: Plan) -> float:
+def _change_db(scene: Scene, plan: EffectPlan, everything: EffectPlan) -> float:
     """Return by how much the images of both plans differ."""
     sensor = scene.sensors[0]
     pipeline = Pipeline(sensor.settings())
-    images = [pipeline.process(Simulator(scene, plan=each).render()).energy for each in (plan, everything)]
+    images = [pipeline.process(Simulator(scene, plan=each).render()).amplitude for each in (plan, everything)]
     shot = snapshot(scene, sensor, 0.0)
     spacing_m = float(pipeline.range_m[1] - pipeline.range_m[0])
     return image_change_db(images[0], images[1], spacing_m=spacing_m, floor=Sight(shot, plan.active).floor)

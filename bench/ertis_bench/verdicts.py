@@ -14,9 +14,9 @@ from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.simulation import Scene, Sensor
+from ertis_numba.simulation.ab_render import image_change_db
 from ertis_numba.simulation.loudness import LOUD
-from ertis_numba.simulation.plan import Plan, make_plan
-from ertis_numba.simulation.rehearsal import image_change_db
+from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
@@ -26,7 +26,13 @@ __all__ = ["Trial", "run", "with_one"]
 
 _SURE = 300  # times the noise of modulators: it changes such a reflector by less than 0.03 dB
 _PLAN = Accuracy(
-    precision="float32", oversampling=4, delay_taps=2, beam_taps=0, beam_density=2.0, stop_band_db=60.0, zones=1
+    precision="float32",
+    oversampling=4,
+    delay_taps=2,
+    beam_taps=0,
+    beam_density=2.0,
+    stopband_attenuation_db=60.0,
+    focal_zones=1,
 )
 
 
@@ -60,9 +66,9 @@ def run(*, count: int, say: Callable[[str], None], first: int = 0) -> dict[str, 
     return {"scenes": count, "verdicts": tried, "rendered": rendered, "wrong": wrong}
 
 
-def with_one(plan: Plan, name: str, *, on: bool) -> Plan:
+def with_one(plan: EffectPlan, name: str, *, on: bool) -> EffectPlan:
     """Return a plan with another verdict on one effect."""
-    return Plan(
+    return EffectPlan(
         tuple(dataclasses.replace(verdict, on=on) if verdict.name == name else verdict for verdict in plan.verdicts)
     )
 
@@ -82,7 +88,7 @@ class Trial:
         self._signals = functools.lru_cache(maxsize=8)(self._rendered)
         self._image = functools.lru_cache(maxsize=8)(self._imaged)
 
-    def left_out(self, plan: Plan) -> list[dict[str, Any]]:
+    def left_out(self, plan: EffectPlan) -> list[dict[str, Any]]:
         """Return by how much each effect that the plan leaves out changes the images."""
         return [
             {
@@ -96,7 +102,7 @@ class Trial:
             if not verdict.on and verdict.estimate_db is not None
         ]
 
-    def total_change_db(self, plan: Plan, name: str) -> float:
+    def total_change_db(self, plan: EffectPlan, name: str) -> float:
         """Return by how much an effect changes the images, those from loud signals as words."""
         changed_db = self.change_db(plan, name)
         other = with_one(plan, name, on=name not in plan.active)
@@ -104,11 +110,11 @@ class Trial:
             return changed_db
         return max(changed_db, *(self.reflector_change_db(sensor, plan, other) for sensor in self.scene.sensors))
 
-    def loudest(self, plan: Plan) -> float:
+    def loudest(self, plan: EffectPlan) -> float:
         """Return the highest amplitude that modulators or converters receive."""
         return max(float(np.abs(self._signals(sensor.name, plan)).max()) for sensor in self.scene.sensors)
 
-    def change_db(self, plan: Plan, name: str) -> float:
+    def change_db(self, plan: EffectPlan, name: str) -> float:
         """Return by how much an effect changes images before modulators, which add other noise each time."""
         other = with_one(plan, name, on=name not in plan.active)
         changes_db = []
@@ -120,7 +126,7 @@ class Trial:
             changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
         return max(changes_db)
 
-    def reflector_change_db(self, sensor: Sensor, one: Plan, other: Plan) -> float:
+    def reflector_change_db(self, sensor: Sensor, one: EffectPlan, other: EffectPlan) -> float:
         """Return by how much the levels of reflectors far above the noise differ in images from words.
 
         What another draw of the noise changes as much is no difference.
@@ -130,10 +136,10 @@ class Trial:
         sure = shown.shown & (shown.levels(shown.heard) > _SURE * shown.noise)
         ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
 
-        def levels_db(seed: int, plan: Plan) -> NDArray[np.float64]:
+        def levels_db(seed: int, plan: EffectPlan) -> NDArray[np.float64]:
             scene = self.scene.replace(seed=seed)
             words = Simulator(scene, sensor=sensor.name, plan=plan).render(self.index)
-            image = pipeline.process(words).energy
+            image = pipeline.process(words).amplitude
             near = [np.abs(pipeline.range_m - range_m) < SAME_RANGE_M for range_m in ranges_m]
             return np.array([20 * math.log10(image[:, places].max()) for places in near if places.any()])
 
@@ -144,14 +150,14 @@ class Trial:
     def _shot(self, sensor: Sensor) -> Snapshot:
         return snapshot(self.scene, sensor, self.index / self.scene.rate_hz)
 
-    def _rendered(self, name: str, plan: Plan) -> NDArray[np.float64]:
+    def _rendered(self, name: str, plan: EffectPlan) -> NDArray[np.float64]:
         signals = Simulator(self.scene, sensor=name, plan=plan).signals(self.index)
         dbfs = self.scene.sensor(name).electronics.noise_dbfs
         if "microphone_noise" in plan.active and dbfs is not None:
             signals += 10 ** (dbfs / 20) * _white_noise(self.scene.seed, signals.shape)
         return signals
 
-    def _imaged(self, name: str, plan: Plan) -> NDArray[np.float32]:
+    def _imaged(self, name: str, plan: EffectPlan) -> NDArray[np.float32]:
         chain = _chain(self.scene.sensor(name).settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
         chain.process_signals(self._signals(name, plan), image)

@@ -63,8 +63,8 @@ def compared(seed: int) -> dict[str, Any]:
     measurement = random_measurement(seed)
     image = _image(measurement)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    exact = referee.exact(measurement.words, image.settings, directions, image.range_m)
-    true_db = verification.error_db(image.energy, exact)
+    exact = referee.exact(measurement.data, image.settings, directions, image.range_m)
+    true_db = verification.error_db(image.amplitude, exact)
     verified_db = verification.measure(image, measurement).error_db
     return {
         "seed": seed,
@@ -95,7 +95,7 @@ def _image(measurement: Measurement) -> Energyscape:
         pipeline = Pipeline(measurement.settings, "cpu", 1, max_error_db=0.0)
     with pipeline:
         image = pipeline.process(measurement)
-    if not np.any(image.energy):
+    if not np.any(image.amplitude):
         raise DataError(f"the image of {measurement.settings} is silent; draw louder words")
     return image
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ertis_numba.devices.blocks import COUNTERS, encode_block
 from ertis_numba.devices.emulator.faults import Faults, Spoilt, Stall, Unplug
-from ertis_numba.devices.protocol import Block, Instant, Receiver
+from ertis_numba.devices.protocol import Block, BlockReceiver, Instant
 
-__all__ = ["KINDS", "Report", "Wire", "send"]
+__all__ = ["KINDS", "BlockReport", "Wire", "send"]
 
 KINDS: Final[dict[str, float]] = {
     "flip": 0.12,
@@ -37,7 +37,7 @@ _KEPT: Final = 64  # emissions, as long as something of them may still be in the
 
 
 @dataclass(slots=True)
-class Report:
+class BlockReport:
     """What became of all blocks.
 
     Attributes
@@ -106,8 +106,8 @@ class Wire:
         bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
         seed: int = 0,
     ) -> None:
-        self.report = Report()
-        self._receiver = Receiver(n_samples, expected=counter, shortest_s=_SHORTEST_S, bits=bits)
+        self.report = BlockReport()
+        self._receiver = BlockReceiver(n_samples, expected=counter, shortest_s=_SHORTEST_S, bits=bits)
         self._faults, self._triggers, self._deadline_s = faults, triggers, deadline_s
         self._random = np.random.default_rng(seed)
         self._counter = counter
@@ -134,7 +134,7 @@ class Wire:
                 self._take(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
                 self._now_s += len(piece) / self._bytes_per_s
 
-    def finish(self) -> Report:
+    def finish(self) -> BlockReport:
         """Return what became of all blocks; nothing is sent any more."""
         receiver, report = self._receiver, self.report
         self._take(receiver.finish())
@@ -177,7 +177,7 @@ class Wire:
         """Compare what the receiver accepts with what was sent."""
         report = self.report
         for block in blocks:
-            words = block.words.astype("<u4").tobytes()
+            words = block.data.astype("<u4").tobytes()
             crc32 = zlib.crc32(words)
             sent = self._sent.get(block.counter)
             if sent is not None and crc32 == sent.crc32:
@@ -202,7 +202,7 @@ def send(
     deadline_s: float | None = None,
     bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
     progress: Callable[[], object] | None = None,
-) -> Report:
+) -> BlockReport:
     """Send ``n_blocks`` over a line with faults and return what became of them.
 
     Parameters

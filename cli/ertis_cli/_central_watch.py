@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
-from ertis_cli._lines import Lines
+from ertis_cli._lines import JsonLines
 from ertis_cli._signals import stopped_by_signals
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
 
-__all__ = ["CentralWatch", "archive", "most_bytes", "name", "report", "rotate_every", "rotate_size", "run", "size"]
+__all__ = ["CentralWatch", "archive", "max_bytes", "name", "report", "rotate_every", "rotate_size", "run", "size"]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -36,7 +36,7 @@ rotate_size: Decorator = click.option(
 rotate_every: Decorator = click.option(
     "--rotate-every", type=float, default=600.0, show_default=True, metavar="S", help="A new recording after so long."
 )
-most_bytes: Decorator = click.option(
+max_bytes: Decorator = click.option(
     "--most-bytes", type=int, default=4 * 2**20, show_default=True, help="Of a measurement; longer ones are refused."
 )
 
@@ -64,7 +64,7 @@ class CentralWatch:
     def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
 
-        self._out, self._err = Lines(sys.stdout), Lines(sys.stderr)  # the loop must not wait for who reads them
+        self._out, self._err = JsonLines(sys.stdout), JsonLines(sys.stderr)  # the loop must not wait for who reads them
         show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
         self.life, self.quiet, self.as_json = life, quiet, as_json
@@ -89,9 +89,11 @@ class CentralWatch:
         fields = {name: value for name, value in event.items() if name != "event" and value != ""}
         (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
 
-    def stored(self, sensor: str, epoch: int, sequence: int, crc32: int) -> None:
+    def stored(self, sensor: str, session_id: int, sequence: int, crc32: int) -> None:
         """Tell of a measurement that is durable."""
-        self._print({"event": "stored", "sensor": sensor, "epoch": epoch, "sequence": sequence, "crc32": crc32})
+        self._print(
+            {"event": "stored", "sensor": sensor, "session_id": session_id, "sequence": sequence, "crc32": crc32}
+        )
 
     def _print(self, event: dict[str, Any]) -> None:
         self._out.write(f"{json.dumps(event, allow_nan=False)}\n")
@@ -163,7 +165,7 @@ def run(
     node : CentralNode
     watch : CentralWatch
     made : list of Path
-        Of `ertis_cli._saving.taken_back`: folders that it makes.
+        Of `ertis_cli._saving.withdrawn`: folders that it makes.
     metrics : Metrics or None
     duration_s : float or None
 
@@ -208,7 +210,7 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
         missing.update(each.missing)
     left = 0 if archive is None else archive.sealing
     if watch.as_json:
-        told = {
+        reported = {
             "received": sum(each.received for each in sensors.values()),
             "stored": sum(each.stored for each in sensors.values()),
             "missing": missing,
@@ -222,7 +224,7 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
             "processing": status.processing,
             "sensors": sensors,
         }
-        options.print_json({"event": event} | msgspec.to_builtins(told))
+        options.print_json({"event": event} | msgspec.to_builtins(reported))
     options.say(
         f"{options.counted(sum(each.received for each in sensors.values()), 'measurement')} received, "
         f"{missing.total()} missing",

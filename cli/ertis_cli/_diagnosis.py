@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["CHECKS", "Finding", "State"]
+__all__ = ["CHECKS", "InstallationFinding", "State"]
 
 State = Literal["good", "note", "bad"]
 
@@ -42,7 +42,7 @@ _RUNS: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InstallationFinding:
     """Something that was looked at.
 
     Attributes
@@ -60,13 +60,15 @@ class Finding:
     remedy: str = ""
 
 
-def _versions(_folder: Path) -> Iterator[Finding]:
+def _versions(_folder: Path) -> Iterator[InstallationFinding]:
     try:
         own = version("ertis-numba")
     except PackageNotFoundError:
-        yield Finding("ertis", "bad", "runs, but is not installed", "install it by 'pip install ertis-numba'")
+        yield InstallationFinding(
+            "ertis", "bad", "runs, but is not installed", "install it by 'pip install ertis-numba'"
+        )
     else:
-        yield Finding("ertis", "good", f"{own} on Python {platform.python_version()}, {platform.system()}")
+        yield InstallationFinding("ertis", "good", f"{own} on Python {platform.python_version()}, {platform.system()}")
     missing = []
     found = []
     for name in _LIBRARIES:
@@ -74,12 +76,14 @@ def _versions(_folder: Path) -> Iterator[Finding]:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             missing.append(name)
-    yield Finding("libraries", "good", ", ".join(found))
+    yield InstallationFinding("libraries", "good", ", ".join(found))
     if missing:
-        yield Finding("libraries", "bad", f"{', '.join(missing)} missing", f"pip install {' '.join(missing)}")
+        yield InstallationFinding(
+            "libraries", "bad", f"{', '.join(missing)} missing", f"pip install {' '.join(missing)}"
+        )
     for extra, modules in _EXTRAS.items():
         there = all(importlib.util.find_spec(module) is not None for module in modules)
-        yield Finding(
+        yield InstallationFinding(
             f"extra {extra}",
             "good" if there else "note",
             "installed" if there else "not installed",
@@ -87,9 +91,9 @@ def _versions(_folder: Path) -> Iterator[Finding]:
         )
 
 
-def _processor(_folder: Path) -> Iterator[Finding]:
+def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
-    from ertis_numba.cores import usable_cores
+    from ertis_numba.cpu_cores import usable_cores
     from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
@@ -97,7 +101,7 @@ def _processor(_folder: Path) -> Iterator[Finding]:
     cores = usable_cores()
     threads = kernels.load("cpu").max_threads
     few = threads < cores
-    yield Finding(
+    yield InstallationFinding(
         "cores",
         "note" if few else "good",
         f"{cores} usable, {threads} used",
@@ -112,10 +116,12 @@ def _processor(_folder: Path) -> Iterator[Finding]:
             pipeline.process(silence)
             times_s.append(time.perf_counter() - begun_s)
         n_directions = len(pipeline.grid)
-    yield Finding("processing", "good", f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms")
+    yield InstallationFinding(
+        "processing", "good", f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms"
+    )
     layer = _threading_layer()
     slow = layer == "workqueue"
-    yield Finding(
+    yield InstallationFinding(
         "threads",
         "note" if slow else "good",
         f"Numba's {layer} layer" + (", in which several images at once take turns" if slow else ""),
@@ -136,30 +142,32 @@ def _threading_layer() -> str:
     return _cpu.threading_layer()
 
 
-def _gpu(_folder: Path) -> Iterator[Finding]:
+def _gpu(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
     from ertis_numba.errors import DeviceError
 
     driver = Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists()
     wanted = importlib.util.find_spec("cupy") is not None
     if not driver and not wanted:
-        yield Finding("GPU", "note", "no NVIDIA driver", "none is needed; for one, install ertis-numba[cu12] or [cu13]")
+        yield InstallationFinding(
+            "GPU", "note", "no NVIDIA driver", "none is needed; for one, install ertis-numba[cu12] or [cu13]"
+        )
         return
     try:
         found = kernels.load("cuda")
     except DeviceError as error:
         text, _, remedy = str(error).partition("; ")
-        yield Finding("GPU", "bad" if driver else "note", text, remedy)
+        yield InstallationFinding("GPU", "bad" if driver else "note", text, remedy)
         return
-    yield Finding("GPU", "good", f"{found.hardware or 'simulated'}; device 'auto' uses it")
+    yield InstallationFinding("GPU", "good", f"{found.hardware or 'simulated'}; device 'auto' uses it")
 
 
-def _serial(_folder: Path) -> Iterator[Finding]:
+def _serial(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba.devices.ports import find_ports
 
     ports = [port for port in find_ports() if port.may_be_sonar]
     if not ports:
-        yield Finding(
+        yield InstallationFinding(
             "sensors",
             "note",
             "none is plugged in",
@@ -167,9 +175,11 @@ def _serial(_folder: Path) -> Iterator[Finding]:
         )
     for port in ports:
         if os.access(port.path, os.R_OK | os.W_OK):
-            yield Finding("sensors", "good", f"{port} can be opened")
+            yield InstallationFinding("sensors", "good", f"{port} can be opened")
         else:
-            yield Finding("sensors", "bad", f"{port} may not be opened by you", _permission(Path(port.path)))
+            yield InstallationFinding(
+                "sensors", "bad", f"{port} may not be opened by you", _permission(Path(port.path))
+            )
 
 
 def _permission(path: Path) -> str:
@@ -190,12 +200,12 @@ def _permission(path: Path) -> str:
     )
 
 
-def _disk(folder: Path) -> Iterator[Finding]:
+def _disk(folder: Path) -> Iterator[InstallationFinding]:
     import shutil
 
     free = shutil.disk_usage(folder).free
     scarce = free < _ROOM_BYTES
-    yield Finding(
+    yield InstallationFinding(
         "room",
         "note" if scarce else "good",
         f"{free / 1e9:.0f} GB free in {folder}, {free / (60e6 * _SENSOR_MB_S):.0f} min of a sensor at 20 Hz",
@@ -204,13 +214,13 @@ def _disk(folder: Path) -> Iterator[Finding]:
     try:
         times_s = _commits_s(folder)
     except OSError as error:
-        yield Finding(
+        yield InstallationFinding(
             "disk", "bad", f"{folder} cannot be written ({error.strerror})", "give a folder that can (--folder)"
         )
         return
     speed_mb_s = 1e-6 * _COMMIT_BYTES * len(times_s) / sum(times_s)
     sensors = int(speed_mb_s / (2 * _SENSOR_MB_S))  # each byte is written to a journal, and sealed
-    yield Finding(
+    yield InstallationFinding(
         "disk",
         "good" if sensors else "bad",
         f"{speed_mb_s:.0f} MB/s durably, the slowest 5 MB in {1e3 * max(times_s):.0f} ms: {_so_many(sensors)} at 20 Hz",
@@ -235,14 +245,14 @@ def _commits_s(folder: Path) -> Sequence[float]:
     return times_s
 
 
-def _keys(_folder: Path) -> Iterator[Finding]:
+def _keys(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba.errors import SettingsError
     from ertis_numba.network.keys import KeyPair, default_folder
 
     folder = default_folder()
     found = sorted(folder.glob("*.secret.toml")) if folder.is_dir() else []
     if not found:
-        yield Finding(
+        yield InstallationFinding(
             "keys", "note", f"none in {folder}", "make some by 'ertis keys new', if other machines are to connect"
         )
     for path in found:
@@ -250,12 +260,12 @@ def _keys(_folder: Path) -> Iterator[Finding]:
             KeyPair.load(path)
         except SettingsError as error:
             text, _, remedy = str(error).partition("; ")
-            yield Finding("keys", "bad", text, remedy)
+            yield InstallationFinding("keys", "bad", text, remedy)
         else:
-            yield Finding("keys", "good", f"{path} is yours alone")
+            yield InstallationFinding("keys", "good", f"{path} is yours alone")
 
 
-CHECKS: Final[dict[str, Callable[[Path], Iterator[Finding]]]] = {
+CHECKS: Final[dict[str, Callable[[Path], Iterator[InstallationFinding]]]] = {
     "versions": _versions,
     "processor": _processor,
     "gpu": _gpu,

@@ -70,7 +70,7 @@ class SceneRenderer:
         key = name, active, index % self._scene.count
         with self._turn:
             if key not in self._words:
-                self._words[key] = self._engine(name, active=active).render(key[2]).words
+                self._words[key] = self._engine(name, active=active).render(key[2]).data
             return self._words[key]
 
     @property
@@ -80,7 +80,7 @@ class SceneRenderer:
 
     def _engine(self, name: str, *, active: bool) -> "Engine":
         if (name, active) not in self._engines:
-            from ertis_numba.settings import Processing, suit_ranges
+            from ertis_numba.settings import Processing, fit_ranges
             from ertis_numba.simulation.engine import Engine
             from ertis_numba.simulation.names import EFFECTS
 
@@ -89,7 +89,7 @@ class SceneRenderer:
                 sensors=tuple(
                     sensor.replace(
                         **self._configs[sensor.name]._asdict(),
-                        processing=suit_ranges(
+                        processing=fit_ranges(
                             Processing(), self._configs[sensor.name].recording, self._configs[sensor.name].call
                         ),
                         emitter=sensor.emitter if active else sensor.emitter.replace(silent=True),

@@ -11,26 +11,26 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
+    from ertis_numba.analysis.finder import PointFinder
     from ertis_numba.frames import PointCloud
     from ertis_numba.network.products import Arrival
     from ertis_numba.network.subscriber import SubscriberCounts
-    from ertis_numba.stages.finder import PointFinder
 
-__all__ = ["Heard"]
+__all__ = ["MicrophoneTable"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
 _SOON_S = 3.0
 _SILENT_S = 5.0
-_STAMP = ("sensor", "epoch", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
+_STAMP = ("sensor", "session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
 
-class Heard:
+class MicrophoneTable:
     """Prints what came: a line for each product, or for each event in JSON."""
 
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
-        self._said = self._noted = False
+        self._reported_names = self._noted = False
         self._subscribed_s: float | None = None  # None once something has come, or its absence was reported
 
     def head(self) -> None:
@@ -40,7 +40,7 @@ class Heard:
 
     def subscribed(self, address: str, sensors: tuple[str, ...], products: tuple[str, ...]) -> None:
         """Tell, once, that a publisher answers."""
-        if self._as_json and not self._said:
+        if self._as_json and not self._reported_names:
             options.print_json(
                 {
                     "event": "subscribed",
@@ -49,9 +49,9 @@ class Heard:
                     "products": list(products),
                 }
             )
-        if not self._said:
+        if not self._reported_names:
             self._subscribed_s = time.monotonic()
-        self._said = True
+        self._reported_names = True
 
     def silent(self, address: str, products: tuple[str, ...], n_received: int) -> None:
         """Report once, after a delay, that a connected publisher has sent nothing."""
@@ -70,7 +70,7 @@ class Heard:
 
     def unanswered(self, address: str, since_s: float) -> None:
         """Tell, after a while and once, that nobody has answered; where that is told, `note` tells who does then."""
-        if self._said or self._noted or since_s < _SOON_S:
+        if self._reported_names or self._noted or since_s < _SOON_S:
             return
         self._noted = True
         text = f"waiting for {address}: nobody answers there; is 'ertis serve' running?"
@@ -108,8 +108,8 @@ class Heard:
             _ROW.format(
                 sensor=getattr(header, "sensor", "-"),
                 sequence=getattr(header, "sequence", header.number),
-                age=_told(age_s),
-                made_in=_told(made_in_s),
+                age=_reported(age_s),
+                made_in=_reported(made_in_s),
                 dropped=counts.dropped,
                 text=text,
             )
@@ -144,8 +144,8 @@ class Heard:
         if isinstance(item, PointCloud):
             return self._of_points("points", item)
         if isinstance(item, Measurement):
-            crc32 = zlib.crc32(item.words.data)
-            return {"product": "raw", "crc32": crc32}, f"{item.words.nbytes} bytes, CRC-32 {crc32:08x}"
+            crc32 = zlib.crc32(item.data.data)
+            return {"product": "raw", "crc32": crc32}, f"{item.data.nbytes} bytes, CRC-32 {crc32:08x}"
         if isinstance(item, Group):
             odd = "".join(f", {flag}" for flag in item.flags)
             about = {"group": item.group, "sensors": item.sensors, "missing": item.missing, "flags": item.flags}
@@ -158,7 +158,7 @@ class Heard:
 
     @functools.cached_property
     def _find(self) -> "PointFinder":
-        from ertis_numba.stages.finder import PointFinder
+        from ertis_numba.analysis.finder import PointFinder
 
         return PointFinder()
 
@@ -182,5 +182,5 @@ class Heard:
         return about, f"{range_m:.3f} m at {azimuth_deg:+.1f}°, {elevation_deg:+.1f}°"
 
 
-def _told(time_s: float | None) -> str:
+def _reported(time_s: float | None) -> str:
     return "-" if time_s is None else f"{1e3 * time_s:.1f} ms"

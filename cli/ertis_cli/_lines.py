@@ -5,13 +5,13 @@ import queue
 import threading
 from typing import IO
 
-__all__ = ["Lines"]
+__all__ = ["JsonLines"]
 
-_MOST = 65_536
+_MAX = 65_536
 _CLOSED_S = 5.0
 
 
-class Lines:
+class JsonLines:
     """A stream whose writer never waits for its reader: a thread writes, in order.
 
     When too many wait, new ones are left out and counted. A stream that is no file of the system, as in tests, is
@@ -20,7 +20,7 @@ class Lines:
     Parameters
     ----------
     stream : file
-    most : int
+    largest : int
         Texts that may wait.
 
     Attributes
@@ -29,9 +29,9 @@ class Lines:
         Texts that were left out.
     """
 
-    def __init__(self, stream: IO[str], *, most: int = _MOST) -> None:
+    def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:
         self._stream = stream
-        self._waiting: queue.Queue[str | None] = queue.Queue(most)
+        self._waiting: queue.Queue[str | None] = queue.Queue(largest)
         self.lost = 0
         try:
             stream.flush()

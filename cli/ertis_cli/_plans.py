@@ -19,7 +19,7 @@ _INTERPOLATIONS = {
     "linear": "made of two of them along a straight line",
     "cubic": "made of four of them along Lagrange's cubic",
 }
-_LEAST_MS = 0.005
+_MIN_MS = 0.005
 _PART = "  {name:52}  {safe:>8}  {texture:>14}"
 
 
@@ -32,14 +32,14 @@ def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error
             raise click.UsageError(f"{name} is for --method fast; the paper's method has no plan", context)
 
 
-def said_of(sensor: str, told: dict[str, Any]) -> Iterator[str]:
+def said_of(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
     """Yield in words what the examination of a sensor's plan has told."""
-    if "plan" in told:
-        yield from _explained(sensor, told["plan"])
-    if "wavefront_error_db" in told:
-        yield wavefront_note(sensor, told["wavefront_error_db"], told["wavefront_error_range_m"])
-    if "verified" in told:
-        yield from _checked(sensor, told["verified"])
+    if "plan" in reported:
+        yield from _explained(sensor, reported["plan"])
+    if "wavefront_error_db" in reported:
+        yield wavefront_note(sensor, reported["wavefront_error_db"], reported["wavefront_error_range_m"])
+    if "verified" in reported:
+        yield from _checked(sensor, reported["verified"])
 
 
 def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
@@ -81,21 +81,21 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     else:
         yield "  every direction's own beam is summed"
     if plan["decimated"]:
-        yield f"  decimation with a stop band of {accuracy.stop_band_db:g} dB"
+        yield f"  decimation with a stop band of {accuracy.stopband_attenuation_db:g} dB"
     else:
         yield "  PCM as it is, without decimation"
     if plan["plane_waves"] is None:
-        zones = options.counted(accuracy.zones or 1, "zone")
+        zones = options.counted(accuracy.focal_zones or 1, "zone")
         yield f"  spherical wavefronts, with delays of their own in {zones} of ranges"
     else:
         ends = " and ".join(f"{end['error_db']:.1f} dB at {end['range_m']:g} m" for end in plan["plane_waves"])
         yield f"  plane wavefronts, which are wrong by {ends} against spherical ones, on top of the rest"
-    yield _PART.format(name="predicted error", safe="planned", texture="this recording")
+    yield _PART.format(name="predicted error", safe="planned", signal_model="this recording")
     total = {"due_to": "in total", **plan}
     for part in (*plan["parts"], total):
         cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("texture", "predicted"))}
         yield _PART.format(name=f"  {part['due_to']}", **cells)
-    stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _LEAST_MS)
+    stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _MIN_MS)
     yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; by the costs in {plan['costs']}"
     if plan["predicted_db"] > accuracy.max_error_db:
         yield (

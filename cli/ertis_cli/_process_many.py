@@ -16,13 +16,13 @@ from ertis_cli import _plans, _progress, _tables, options
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from ertis_numba.campaign import Ended, Event, Options
+    from ertis_numba.campaign import CampaignOptions, Event, RecordingEnded
 
 __all__ = ["are_meant", "process_many", "summary"]
 
-_MOST_ROWS = 20  # of a table that has all recordings
+_MAX_ROWS = 20  # of a table that has all recordings
 _WAVEFRONT = ("wavefront_error_db", "wavefront_error_range_m")
-_MOST_FAILED = 50  # of them are told again at the end
+_MAX_FAILED = 50  # of them are told again at the end
 
 
 def are_meant(paths: Sequence[str], target: str | None) -> bool:
@@ -39,7 +39,7 @@ def are_meant(paths: Sequence[str], target: str | None) -> bool:
 def process_many(
     paths: Sequence[str],
     target: str | None,
-    wanted: "Options",
+    wanted: "CampaignOptions",
     *,
     workers: int | None,
     scheduler: str | None,
@@ -122,7 +122,7 @@ class _Report:
 
     def __init__(self, recordings: Sequence[Path], *, quiet: bool, as_json: bool) -> None:
         self._count, self._quiet, self._as_json = len(recordings), quiet, as_json
-        self._rows: dict[Path, tuple[str, ...]] = dict.fromkeys(recordings[:_MOST_ROWS], ())
+        self._rows: dict[Path, tuple[str, ...]] = dict.fromkeys(recordings[:_MAX_ROWS], ())
         self._begun_s = time.monotonic()
         self._totals = dict.fromkeys(("made", "there", "passed over", "failed"), 0)
         self._measurements = 0
@@ -131,16 +131,16 @@ class _Report:
 
     def follow(self, event: "Event", shown: _Hidden) -> None:
         """Tell how a recording ended, as soon as it has."""
-        from ertis_numba.campaign import Ended
+        from ertis_numba.campaign import RecordingEnded
 
-        if not isinstance(event, Ended):
+        if not isinstance(event, RecordingEnded):
             return
         error = _named(event)
         self._totals[event.outcome] += 1
         self._measurements += event.made.get("measurements", 0)
         found = [_plane_error(row) for row in event.made.get("sensors", ())]
         self._wavefronts += sorted(filter(None, found))[-1:]
-        for line in _lines(event, told=not self._as_json):
+        for line in _lines(event, reported=not self._as_json):
             if not self._quiet:
                 shown.say(line)
         for warning in event.made.get("warnings", ()):
@@ -148,7 +148,7 @@ class _Report:
         if error:
             shown.say(f"ertis: failed: {error}")
             self._failed.append(str(event.recording))
-        if self._count <= _MOST_ROWS:
+        if self._count <= _MAX_ROWS:
             self._rows[event.recording] = _row(event)
         if self._as_json:
             options.print_json(_object(event) | ({"error": error} if error else {}))
@@ -181,10 +181,10 @@ class _Report:
             click.echo(_plans.wavefront_note(whose, *max(self._wavefronts)), err=True)
 
     def _print_table(self, took_s: float) -> None:
-        if self._count <= _MOST_ROWS:
+        if self._count <= _MAX_ROWS:
             _table([row for row in self._rows.values() if row]).print(err=True)
         elif self._failed:
-            rows = [(path, "failed", "", "") for path in self._failed[:_MOST_FAILED]]
+            rows = [(path, "failed", "", "") for path in self._failed[:_MAX_FAILED]]
             more = len(self._failed) - len(rows)
             _table(rows + ([(f"… and {more} more", "failed", "", "")] if more else [])).print(err=True)
         counts = ", ".join(f"{count} {name}" for name, count in self._totals.items() if count)
@@ -192,29 +192,29 @@ class _Report:
         click.echo(f"{options.counted(self._count, 'recording')}: {counts}; {done} in {took_s:.1f} s", err=True)
 
 
-def _named(event: "Ended") -> str:
+def _named(event: "RecordingEnded") -> str:
     """Return why a recording failed, with its name."""
     if not event.error or str(event.recording) in event.error:
         return event.error
     return f"{event.recording}: {event.error}"
 
 
-def _lines(event: "Ended", *, told: bool) -> Iterator[str]:
+def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
     """Yield what there is to say; of plans only where they are not in an object."""
     match event.outcome:
         case "made":
-            yield from _plan_lines(event, told=told)
+            yield from _plan_lines(event, reported=reported)
             yield from summary(event.output, event.made["sensors"], event.made["device"])
         case "there":
-            yield from _plan_lines(event, told=told)
+            yield from _plan_lines(event, reported=reported)
             yield f"{event.output}: made before"
         case "passed over":
             yield f"{event.recording}: is no recording but an energyscape file, passed over"
 
 
-def _plan_lines(event: "Ended", *, told: bool) -> Iterator[str]:
+def _plan_lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
     for row in event.made.get("sensors", ()):
-        if told:
+        if reported:
             kept = row if "plan" in row else {name: value for name, value in row.items() if name not in _WAVEFRONT}
             yield from _plans.said_of(row["sensor"], kept)
 
@@ -226,18 +226,18 @@ def _plane_error(row: dict[str, Any]) -> tuple[float, float] | None:
     return row[_WAVEFRONT[0]], row[_WAVEFRONT[1]]
 
 
-def _object(event: "Ended") -> dict[str, Any]:
+def _object(event: "RecordingEnded") -> dict[str, Any]:
     """Return what became of a recording as ``--json`` has it."""
-    told = {"recording": str(event.recording), "output": str(event.output), "outcome": event.outcome}
-    return told | {name: value for name, value in event.made.items() if name != "warnings"}
+    reported = {"recording": str(event.recording), "output": str(event.output), "outcome": event.outcome}
+    return reported | {name: value for name, value in event.made.items() if name != "warnings"}
 
 
-def _row(event: "Ended") -> tuple[str, ...]:
+def _row(event: "RecordingEnded") -> tuple[str, ...]:
     made = event.made
     figures = (f"{made['measurements']}", f"{made['median_ms']:.1f}") if "median_ms" in made else ("", "")
     return (str(event.recording), event.outcome, *figures)
 
 
-def _table(rows: Sequence[tuple[str, ...]]) -> _tables.Table:
+def _table(rows: Sequence[tuple[str, ...]]) -> _tables.TextTable:
     columns: dict[str, _tables.Side] = {"recording": "left", "outcome": "left", "measurements": "right", "ms": "right"}
-    return _tables.Table(columns, rows, {"failed": "red"})
+    return _tables.TextTable(columns, rows, {"failed": "red"})

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
     from ertis_numba.network.products import Arrival
 
-__all__ = ["PRODUCTS", "saving", "taken_back"]
+__all__ = ["PRODUCTS", "saving", "withdrawn"]
 
 PRODUCTS = ("energyscape", "raw")
 """What there are files for."""
@@ -21,7 +21,7 @@ Write = Callable[["Arrival"], None]
 
 
 @contextmanager
-def taken_back(*folders: Path | None) -> Iterator[list[Path]]:
+def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
     """Yield those of folders that are not there yet; where the block is refused, they are not there afterwards either.
 
     Clear the list when what is done with them has begun. A folder that holds more than a central node's own files
@@ -88,7 +88,7 @@ def _require_place(target: Path) -> None:
 
 def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield what takes measurements into a journal, which then becomes a recording, as a capture does it."""
-    from ertis_numba.atomic import check_target
+    from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
     from ertis_numba.journal import SUFFIX, Entry, Journal, seal_apart
 

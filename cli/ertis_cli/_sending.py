@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from ertis_numba.capture import Session
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.network.keys import ClientKeys
-    from ertis_numba.network.sensor_node import SensorNode, Settled
+    from ertis_numba.network.sensor_node import Acknowledged, SensorNode
     from ertis_numba.settings import Settings
 
 __all__ = ["Sending"]
 
 _SAFE_S = 3.0
 _SOON_S = 1.0
-_COUNTS = ("refused", "overwritten", "damaged", "unsettled")
+_COUNTS = ("refused", "overwritten", "damaged", "unacked")
 
 
 class _Watch(Watch):
@@ -30,11 +30,18 @@ class _Watch(Watch):
     word = "kept"
     node: "SensorNode | None" = None
 
-    def settled(self, settled: "Settled") -> None:
+    def acked_through(self, acked_through: "Acknowledged") -> None:
         """Tell of what the central node has."""
         if self._as_json:
-            event = {"event": "settled", "sensor": settled.sensor, "epoch": settled.epoch, "settled": settled.settled}
-            self._print(event | {"status": settled.status, "dropped": [list(each) for each in settled.dropped]})
+            event = {
+                "event": "acked_through",
+                "sensor": acked_through.sensor,
+                "session_id": acked_through.session_id,
+                "acked_through": acked_through.acked_through,
+            }
+            self._print(
+                event | {"status": acked_through.status, "dropped": [list(each) for each in acked_through.dropped]}
+            )
 
     def linked(self, text: str) -> None:
         """Tell what happened between this node and the central node."""
@@ -44,7 +51,7 @@ class _Watch(Watch):
 
     def _more(self) -> Iterator[str]:
         if self.node is not None:
-            yield f"{self.node.unsettled} to be settled"
+            yield f"{self.node.unacked} to be settled"
             yield f"central node: {self.node.central}"
 
 
@@ -104,7 +111,7 @@ class Sending:
             self.address,
             keys=keys,
             spool=self._spool,
-            on_settled=self.watch.settled,
+            on_acked=self.watch.acked_through,
             on_note=self.watch.linked,
             **self._sizes,
         )
@@ -150,13 +157,13 @@ class Sending:
         }
         for reason, count in dropped.items():
             self._say(f"{options.counted(count, 'measurement')} dropped by the central node, {reason}")
-        waiting = options.counted(total["unsettled"], "measurement")
-        if self._spool and total["unsettled"]:
+        waiting = options.counted(total["unacked"], "measurement")
+        if self._spool and total["unacked"]:
             self._say(f"{waiting} wait in {self._spool}; the next capture with --spool sends what is there")
-        lost = sum(total[name] for name in _COUNTS) - (total["unsettled"] if self._spool else 0)
+        lost = sum(total[name] for name in _COUNTS) - (total["unacked"] if self._spool else 0)
         self.n_lost = lost
-        told = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}"
-        return f"{told}{self._remedy()}" if lost else ""
+        reported = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}"
+        return f"{reported}{self._remedy()}" if lost else ""
 
     def _remedy(self) -> str:
         """Return what to do about measurements that were lost, after why they were where that is known."""
@@ -174,10 +181,10 @@ class Sending:
 
 def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
     from ertis_numba.errors import ArgumentError
-    from ertis_numba.journal import Sensor
+    from ertis_numba.journal import JournalSensor
 
-    least_mb = 1e-6 * Sensor.of("any", settings).n_bytes
-    if size_mb < least_mb:
+    min_mb = 1e-6 * JournalSensor.of("any", settings).n_bytes
+    if size_mb < min_mb:
         raise ArgumentError(
-            f"{option} is {size_mb:g} MB, and a measurement has {least_mb:.3g} MB; give room for some, or leave it out"
+            f"{option} is {size_mb:g} MB, and a measurement has {min_mb:.3g} MB; give room for some, or leave it out"
         )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions
     from rich.table import Table as Drawn
 
-__all__ = ["Side", "Table"]
+__all__ = ["Side", "TextTable"]
 
 Side = Literal["left", "right"]
 
@@ -22,7 +22,7 @@ _FOLDED = 16  # characters that a column of text has at least, where there is no
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TextTable:
     """Rows of cells under headings; rich can draw it.
 
     Parameters
@@ -50,7 +50,7 @@ class Table:
         console = Console(file=stream)
         # Where even numbers are too wide, the terminal breaks lines, rather than cells.
         places = range(len(self.columns))
-        console.width = max(console.width, sum(map(self._least, places)) + _GAP * (len(places) - 1))
+        console.width = max(console.width, sum(map(self._smallest, places)) + _GAP * (len(places) - 1))
         console.print(self)
 
     def lines(self) -> Iterator[str]:
@@ -70,7 +70,7 @@ class Table:
         drawn = Drawn(box=None, pad_edge=False, header_style="bold")
         for place, (heading, side) in enumerate(self.columns.items()):
             # Text is folded and headings are broken at their words, but numbers are left in one piece.
-            width = self._least(place) if is_tight and side == "right" else None
+            width = self._smallest(place) if is_tight and side == "right" else None
             name = " ".join(_words(heading)) if is_tight else heading
             drawn.add_column(name, justify=side, overflow="fold", width=width)
         for row in self.rows:
@@ -81,7 +81,7 @@ class Table:
         """Return the cells of each column, its heading first."""
         return list(zip(tuple(self.columns), *self.rows, strict=True))
 
-    def _least(self, place: int) -> int:
+    def _smallest(self, place: int) -> int:
         """Return the width that a column needs."""
         heading, *cells = self._cells()[place]
         widest = max(map(len, (*_words(heading), *cells)), default=0)

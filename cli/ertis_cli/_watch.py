@@ -66,7 +66,7 @@ class Watch:
                     {
                         "event": self.word,
                         "sensor": stamp.sensor,
-                        "epoch": stamp.epoch,
+                        "session_id": stamp.session_id,
                         "sequence": stamp.sequence,
                         "sync_count": stamp.sync_count,
                         "timestamp_ns": stamp.timestamp_ns,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from ertis_cli import _mountings, _network, options
-from ertis_cli._saving import taken_back
+from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
 from ertis_cli._signals import Signals, stopped_by_signals
 from ertis_cli._watch import Watch, report
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ertis_numba.capture import Session
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.setup import Setup
-    from ertis_numba.devices.sonar import Sonar
+    from ertis_numba.devices.sonar import SonarDriver
     from ertis_numba.settings import Settings
 
 __all__ = ["capture"]
@@ -175,18 +175,18 @@ def capture(
     if spool_mb is not None and spool is None:
         raise click.UsageError("--spool-size is given without --spool; give its folder, too")
     _network.require_duration(duration)
-    from ertis_numba.atomic import check_target
+    from ertis_numba.atomic_files import check_target
     from ertis_numba.capture import Session
 
     if target is not None:
         check_target(target, overwrite=force)
-    told = {"quiet": quiet, "as_json": as_json}
+    reported = {"quiet": quiet, "as_json": as_json}
     send = None
     if address is not None:
-        send = Sending(address, settings, spool=spool, spool_mb=spool_mb, ring_mb=ring_mb, **told)
-    watch = Watch(**told) if send is None else send.watch
+        send = Sending(address, settings, spool=spool, spool_mb=spool_mb, ring_mb=ring_mb, **reported)
+    watch = Watch(**reported) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
-        made = stack.enter_context(taken_back(spool))
+        made = stack.enter_context(withdrawn(spool))
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
         _wait_for(ports, wait_s, signals, quiet=quiet)
@@ -218,7 +218,7 @@ def capture(
             failure = send.run(session, checks, patience_s=patience)
         asked_to_end = list(signals.came)
     sent, n_lost = (None, 0) if send is None else (send.report, send.n_lost)
-    report(address or target, session, watch.took, more=sent, n_lost=n_lost, **told)
+    report(address or target, session, watch.took, more=sent, n_lost=n_lost, **reported)
     if failure is not None:
         raise failure
     if asked_to_end and (n is not None or duration is not None):
@@ -262,10 +262,10 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     try:
         sealed = seal_apart(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        told = f"{error}; the measurements are safe in {path}, seal them by 'ertis recover {path}'"
+        reported = f"{error}; the measurements are safe in {path}, seal them by 'ertis recover {path}'"
         if failure is None:
-            raise DataError(told) from error
-        click.echo(f"ertis: error: {told}", err=True)
+            raise DataError(reported) from error
+        click.echo(f"ertis: error: {reported}", err=True)
         raise failure from error
     except KeyboardInterrupt as interrupt:
         click.echo(str(interrupt), err=True)
@@ -316,15 +316,15 @@ def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
         raise
 
 
-def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, passive: bool) -> "list[Sonar]":
-    from ertis_numba.devices.sonar import Sonar
+def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, passive: bool) -> "list[SonarDriver]":
+    from ertis_numba.devices.sonar import SonarDriver
 
     with _interruptible(signals) as asked:
-        return [stack.enter_context(Sonar.open(port, passive=passive, stop=asked)) for port in ports]
+        return [stack.enter_context(SonarDriver.open(port, passive=passive, stop=asked)) for port in ports]
 
 
 def _configured(
-    sonars: "dict[str, Sonar]",
+    sonars: "dict[str, SonarDriver]",
     setup: "Setup",
     settings: "Settings",
     signals: Signals,
@@ -404,7 +404,7 @@ def _print_commands(setup: "Setup", *, as_json: bool) -> None:
         click.echo(f"{line:20}  {about}")
 
 
-def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[Sonar]") -> "dict[str, Sonar]":
+def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[SonarDriver]") -> "dict[str, SonarDriver]":
     """Return sensors by the names that they are to have: their serial numbers, or else those of the ports."""
     known = [sonar.serial_number or Path(port).name for port, sonar in zip(ports, opened, strict=True)]
     chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]

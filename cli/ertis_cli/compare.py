@@ -9,7 +9,7 @@ import click
 from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
-    from ertis_numba.stages.compare import Errors
+    from ertis_numba.analysis.compare import Errors
 
 __all__ = ["compare"]
 
@@ -38,10 +38,10 @@ def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) 
     reflector is found if a peak lies within 0.1 m and one and a half main lobes; a peak is false if no
     reflector explains it. Finding nothing is no failure: the exit code is 0.
     """
-    from ertis_numba.stages.compare import errors_of
+    from ertis_numba.analysis.compare import errors_of
 
     names = options.sensors_of(path, sensor)
-    options.note_untold_directions(path, names)
+    options.note_unlisted_directions(path, names)
     compared = {name: [comparison for _, comparison in options.comparisons(path, name, min_level)] for name in names}
     sensors = {name: errors_of(given) for name, given in compared.items()}
     whole = errors_of(comparison for given in compared.values() for comparison in given)
@@ -51,7 +51,7 @@ def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) 
         return
     columns: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(_NUMBERS, "right")}
     cells = [(name, _rounded(errors)) for name, errors in (*sensors.items(), ("all", whole))]
-    _tables.Table(columns, [(name, *(_cell(of[number]) for number in _NUMBERS)) for name, of in cells]).print()
+    _tables.TextTable(columns, [(name, *(_cell(of[number]) for number in _NUMBERS)) for name, of in cells]).print()
 
 
 def _rounded(errors: "Errors") -> dict[str, Any]:

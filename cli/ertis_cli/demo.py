@@ -72,7 +72,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     (item,) = _examples.named(_SCENE).values()
     scene.write_bytes(item.read_bytes())
     sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # links to the emulated sensors
-    run = _Run(os.environ | sensors, quiet=quiet)
+    run = _DemoRun(os.environ | sensors, quiet=quiet)
     ports = [word for name in _SENSORS for word in ("--port", name)]
     with ExitStack() as nodes:
         emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
@@ -118,7 +118,7 @@ def _make(folder: Path, *, force: bool) -> None:
 
 def _await_worker(address: str) -> None:
     """Wait until the central node can process measurements."""
-    from ertis_numba.network.asking import Asking
+    from ertis_numba.network.status_client import Asking
 
     with Asking(address) as node:
         while True:
@@ -128,7 +128,7 @@ def _await_worker(address: str) -> None:
             time.sleep(_STATUS_INTERVAL_S)
 
 
-class _Run:
+class _DemoRun:
     """Runner of ``ertis`` commands, each in a process of its own."""
 
     def __init__(self, environment: Mapping[str, str], *, quiet: bool) -> None:

@@ -37,7 +37,7 @@ def devices(*, names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         options.print_json({"devices": [_report(answer) for answer in listed]})
     elif listed:
-        _tables.Table(_COLUMNS, [_row(answer) for answer in listed]).print()
+        _tables.TextTable(_COLUMNS, [_row(answer) for answer in listed]).print()
     for answer in answers:
         if not names and answer.error is not None and answer.state != "in use":
             click.echo(str(answer.error), err=True)

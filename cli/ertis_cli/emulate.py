@@ -141,7 +141,7 @@ def emulate(
                     link=links[name],
                     log=log,
                     accepts=partial(_accepts, refusal, name),
-                    on_port=partial(_tell, name, quiet=quiet),
+                    on_port=partial(_emit_event, name, quiet=quiet),
                 )
             )
             for place, (name, (words, passive, refusal)) in enumerate(given.items())
@@ -247,7 +247,7 @@ def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> Non
                 chosen[pulse % len(chosen)]  # stores the rendered measurement
 
 
-def _tell(name: str, port: str, *, quiet: bool) -> None:
+def _emit_event(name: str, port: str, *, quiet: bool) -> None:
     options.say(f"{name} is back: {port}", quiet=quiet)
 
 

@@ -42,7 +42,7 @@ def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, a
     if not names:
         _list(as_json=as_json)
         return
-    from ertis_numba.atomic import check_target, replacing
+    from ertis_numba.atomic_files import atomic_write, check_target
 
     chosen: dict[str, Traversable] = {}
     for name in names:
@@ -53,7 +53,7 @@ def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, a
     for path in missing:
         check_target(path, overwrite=force)
     for path, content in missing.items():
-        with replacing(path, overwrite=force) as part:
+        with atomic_write(path, overwrite=force) as part:
             part.write_bytes(content)
     for path in contents:
         options.say(f"{path}{'' if path in missing else ': copied before'}", quiet=quiet or as_json)
@@ -66,7 +66,7 @@ def _list(*, as_json: bool) -> None:
     if as_json:
         options.print_json({"examples": [{"name": name, "description": about} for name, about in rows]})
         return
-    _tables.Table({"name": "left", "description": "left"}, rows).print()
+    _tables.TextTable({"name": "left", "description": "left"}, rows).print()
 
 
 def _holds(path: Path, content: bytes) -> bool:

@@ -124,7 +124,7 @@ def import_raw(
     rest_s = getattr(measurements, "rest_s", 0.0)
     if rest_s:
         options.say(f"note: {rest_s:.4g} s at the ends of files are left out", quiet=quiet)
-    _say_what_hinders(measurements.settings, quiet=quiet)
+    _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements)})
 
@@ -193,7 +193,7 @@ def _since_1970_ns(start: datetime | None) -> int:
     return since_1970_ns
 
 
-def _say_what_hinders(settings: "Settings", *, quiet: bool) -> None:
+def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
     """Tell now why the recording could not be processed by the settings that it holds."""
     from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import direction_grid

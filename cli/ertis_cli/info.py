@@ -11,7 +11,7 @@ import click
 from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
-    from ertis_numba.stages.health import Health
+    from ertis_numba.analysis.health import Health
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
 
 __all__ = ["info"]
@@ -44,7 +44,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
     an idle tone. At most 8 measurements are looked at, evenly spaced. The exit code is 0 whatever is found.
     """
     if of_health:
-        _tell_health(path, as_json=as_json)
+        _report_health(path, as_json=as_json)
         return
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
@@ -176,9 +176,9 @@ def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
     }
 
 
-def _tell_health(path: Path, *, as_json: bool) -> None:
+def _report_health(path: Path, *, as_json: bool) -> None:
     """Print the state of the microphones of each sensor."""
-    from ertis_numba.stages.health import health, merge
+    from ertis_numba.analysis.health import health, merge
     from ertis_numba.storage import open_recording
 
     sections: list[dict[str, Any]] = []
@@ -246,7 +246,7 @@ def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
         yield f"fault          {channels}: {item['fault']}, {figures} ({limit}){detail}; {item['remedy']}"
 
 
-def _microphones(section: dict[str, Any]) -> _tables.Table:
+def _microphones(section: dict[str, Any]) -> _tables.TextTable:
     """Return a row for each microphone of an array."""
     columns: dict[str, _tables.Side] = {"channel": "right", "state": "left"}
     columns |= dict.fromkeys([name.rjust(_WIDTH) for name in _COLUMNS], "right")
@@ -254,7 +254,7 @@ def _microphones(section: dict[str, Any]) -> _tables.Table:
         (str(row["channel"]), row["state"], *(_cell(row[name], digits) for name, (_, digits) in _COLUMNS.items()))
         for row in section["channels"]
     ]
-    return _tables.Table(columns, rows, {state: "green" if state == "ok" else "red" for _, state, *_ in rows})
+    return _tables.TextTable(columns, rows, {state: "green" if state == "ok" else "red" for _, state, *_ in rows})
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

@@ -32,4 +32,4 @@ def layout(*, name: str | None, as_json: bool) -> None:
         options.print_json({"layouts": rows})
         return
     columns: dict[str, _tables.Side] = {"name": "left", "microphones": "right", "bits of a word": "right"}
-    _tables.Table(columns, [tuple(map(str, row.values())) for row in rows]).print()
+    _tables.TextTable(columns, [tuple(map(str, row.values())) for row in rows]).print()

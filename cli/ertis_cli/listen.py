@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _network, options
-from ertis_cli._heard import Heard
+from ertis_cli._heard import MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED
 from ertis_cli._saving import saving
 from ertis_cli._signals import stopped_by_signals
@@ -74,10 +74,10 @@ def listen(
     from ertis_numba.network.subscriber import Subscriber
 
     if "energyscape" in products:  # takes half a second, in which the first images would be dropped
-        importlib.import_module("ertis_numba.stages.points")
+        importlib.import_module("ertis_numba.analysis.points")
     keys = _network.client_keys(key, server_key)
     notes: deque[str] = deque()
-    heard = Heard(as_json=as_json, quiet=quiet)
+    heard = MicrophoneTable(as_json=as_json, quiet=quiet)
     begun_s, failure = time.monotonic(), None
     end_s = math.inf if duration is None else begun_s + duration
     with (

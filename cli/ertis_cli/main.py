@@ -93,7 +93,7 @@ class _Commands(click.Group):
             if not standalone_mode:
                 raise
             if not _is_interruption(error):
-                _leave(*_told(error))
+                _leave(*_reported(error))
             if interruption.code != _INTERRUPTED:
                 sys.exit(interruption.code)
             _leave(_INTERRUPTED, "interrupted")
@@ -108,7 +108,7 @@ def _is_interruption(error: Exception) -> bool:
     return interruption.caused(error) or (interruption.code is not None and not _is_expected(error))
 
 
-def _told(error: Exception) -> tuple[int, str]:
+def _reported(error: Exception) -> tuple[int, str]:
     """Return the exit code of an error and the line to tell it; raise again what is a mistake in the program."""
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "ertis"
@@ -124,7 +124,7 @@ def _told(error: Exception) -> tuple[int, str]:
 
 def _of_system(error: Exception) -> str:
     """Return an error of the system as ours are told: what it is about, what came, the remedy; empty if it is ours."""
-    from ertis_numba.atomic import remedy
+    from ertis_numba.atomic_files import remedy
     from ertis_numba.errors import ErtisError
 
     if isinstance(error, ErtisError) or not isinstance(error, OSError) or not error.strerror:

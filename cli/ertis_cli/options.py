@@ -14,9 +14,9 @@ from click.shell_completion import CompletionItem
 from ertis_cli import _progress
 
 if TYPE_CHECKING:
+    from ertis_numba.analysis.compare import Comparison
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
-    from ertis_numba.stages.compare import Comparison
 
 __all__ = [
     "CHANNELS",
@@ -37,7 +37,7 @@ __all__ = [
     "input_file",
     "measurement",
     "min_level",
-    "note_untold_directions",
+    "note_unlisted_directions",
     "note_when_slow",
     "output",
     "pipeline",
@@ -53,7 +53,7 @@ __all__ = [
     "threads",
 ]
 
-_MOST_DEG = 90.0  # of azimuth and elevation, before an array
+_MAX_DEG = 90.0  # of azimuth and elevation, before an array
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -86,9 +86,9 @@ class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
         if colon:
             with suppress(ValueError):
                 angles_deg = float(azimuth), float(elevation)
-                if all(-_MOST_DEG <= angle_deg <= _MOST_DEG for angle_deg in angles_deg):
+                if all(-_MAX_DEG <= angle_deg <= _MAX_DEG for angle_deg in angles_deg):
                     return angles_deg
-        wanted = f"azimuth and elevation, each from -{_MOST_DEG:g} to {_MOST_DEG:g}, as in 30:0"
+        wanted = f"azimuth and elevation, each from -{_MAX_DEG:g} to {_MAX_DEG:g}, as in 30:0"
         return self.fail(f"{value!r} is no direction, give {wanted}", param, ctx)
 
 
@@ -174,8 +174,8 @@ def comparisons(
     path: Path, sensor: str, min_level_db: float, *, measurement: int | None = None
 ) -> "Iterator[tuple[int, Comparison]]":
     """Yield the number of each measurement, or of one, and how its energyscape compares with the truth."""
+    from ertis_numba.analysis.compare import compare
     from ertis_numba.errors import DataError
-    from ertis_numba.stages.compare import compare
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
@@ -196,7 +196,7 @@ def place(index: int, count: int) -> int:
     """Return the place of a measurement in a file of ``count``, or refuse it."""
     from ertis_numba import checks
 
-    return checks.whole("--measurement", index, 0, count - 1)
+    return checks.integer("--measurement", index, 0, count - 1)
 
 
 def settings_with(
@@ -213,7 +213,7 @@ def settings_with(
     channels to those that are left out. Other options are named like the fields of `Processing`; those that are None
     change nothing.
     """
-    settings = recorded if settings_file is None else recorded.changed_by(settings_file)
+    settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
     if without is not None:
         disabled = tuple(sorted({*(settings.array.disabled or ()), *without}))
         settings = settings.replace(array=settings.array.replace(disabled=disabled))
@@ -264,7 +264,7 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
     return names or [CompletionItem(incomplete, type="file")]
 
 
-def note_untold_directions(path: Path, sensors: Sequence[str]) -> None:
+def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
     """Say which sensors of an energyscape file have one microphone, and so tell ranges only."""
     from ertis_numba.geometry import microphones
     from ertis_numba.storage import open_energyscapes
@@ -310,11 +310,11 @@ def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[
     timer.daemon = True
     timer.start()
     context = click.get_current_context(silent=True)
-    told: dict[str, Any] = {} if context is None else context.meta
+    reported: dict[str, Any] = {} if context is None else context.meta
 
     def compiling() -> None:
-        if not told.get(COMPILING):
-            told[COMPILING] = True
+        if not reported.get(COMPILING):
+            reported[COMPILING] = True
             say(COMPILING, quiet=quiet)
 
     withdraw = on_compiling(compiling)

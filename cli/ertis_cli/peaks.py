@@ -11,8 +11,8 @@ import click
 from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
+    from ertis_numba.analysis.compare import Comparison, Match
     from ertis_numba.frames import Energyscape, Peak
-    from ertis_numba.stages.compare import Comparison, Match
 
 __all__ = ["peaks"]
 
@@ -99,7 +99,7 @@ def peaks(
     if detector != "cfar" and false_alarm is not None:
         raise click.UsageError("--false-alarm is for --detector cfar; give both", click.get_current_context())
     sensors = options.sensors_of(path, sensor)
-    options.note_untold_directions(path, sensors)
+    options.note_unlisted_directions(path, sensors)
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
             ({"sensor": name, "measurement": index}, comparison)
@@ -113,13 +113,13 @@ def peaks(
             "missed": [place | _rounded(item) for place, comparison in compared for item in comparison.missed],
         }
         cells = [row for place, comparison in compared for row in _beside_the_truth(place, comparison)]
-        table = _tables.Table(_COLUMNS | _ERROR_COLUMNS, cells)
+        table = _tables.TextTable(_COLUMNS | _ERROR_COLUMNS, cells)
     else:
         find = _finder(detector, _TOP if top is None else top, min_level, false_alarm, everything=everything)
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
         cells = [(*_cells(row, row), f"{row['level_dbfs']:.1f}") for row in rows]
-        table = _tables.Table({**_COLUMNS, "level_dbfs": "right"}, cells)
+        table = _tables.TextTable({**_COLUMNS, "level_dbfs": "right"}, cells)
     if as_json:
         options.print_json(report)
         return
@@ -134,11 +134,11 @@ def _finder(
 ) -> "Callable[[Energyscape], list[Peak]]":
     """Return what finds the reflectors of an image."""
     if detector == "cfar":
-        from ertis_numba.stages.cfar import cfar_peaks
+        from ertis_numba.analysis.cfar import cfar_peaks
 
         found = partial(cfar_peaks, top=top, false_alarm=_FALSE_ALARM if false_alarm is None else false_alarm)
         return found if min_level is None else partial(found, min_level_db=min_level)
-    from ertis_numba.stages.detect import find_peaks
+    from ertis_numba.analysis.detect import find_peaks
 
     return partial(
         find_peaks,
@@ -181,8 +181,8 @@ def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterat
     """Yield the cells of each true reflector of a measurement, then of the other peaks."""
     for match in comparison.matched:
         error = _error(match)
-        told = (f"{error[name]:{form}}" for name, form in _ERROR.items())
-        yield (*_cells(place, _rounded(match.reflector)), *told, match.reflector.name)
+        reported = (f"{error[name]:{form}}" for name, form in _ERROR.items())
+        yield (*_cells(place, _rounded(match.reflector)), *reported, match.reflector.name)
     for reflector in comparison.missed:
         yield (*_cells(place, _rounded(reflector)), "missed", "-", "-", reflector.name)
     for verdict, given in (("false", comparison.false), ("explained", comparison.explained)):

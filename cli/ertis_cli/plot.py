@@ -113,7 +113,7 @@ def plot(
     """
     from ertis_numba import checks, figures
     from ertis_numba.errors import DataError
-    from ertis_numba.storage import check_target, replacing
+    from ertis_numba.storage import atomic_write, check_target
 
     given: dict[str, object] = {
         "sensor": sensor,
@@ -153,7 +153,7 @@ def plot(
             elevation_deg=elevation_deg,
             **look,
         )
-        told = f"array of {path}"
+        reported = f"array of {path}"
     else:
         index = measurement or 0
         if kind in _OF_RECORDINGS:
@@ -166,10 +166,10 @@ def plot(
             look |= {name: value for name, value in places.items() if value is not None}
             figure, name = _drawn(kind, image, _reflectors(image, 5 if top is None else top), look), image.stamp.sensor
         report |= {"sensor": name, "measurement": index}
-        told = f"measurement {index} of {path}"
-    with replacing(target, overwrite=force) as part:
+        reported = f"measurement {index} of {path}"
+    with atomic_write(target, overwrite=force) as part:
         figures.save(figure, part, format=target.suffix.lower().lstrip("."))
-    options.say(f"{target}: {told}", quiet=quiet)
+    options.say(f"{target}: {reported}", quiet=quiet)
     if as_json:
         options.print_json(report)
 
@@ -183,7 +183,7 @@ def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak] | None", look: di
 
 
 def _reflectors(image: "Energyscape", top: int) -> "list[Peak] | None":
-    from ertis_numba.stages.detect import find_peaks
+    from ertis_numba.analysis.detect import find_peaks
 
     return find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
 

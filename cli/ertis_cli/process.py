@@ -13,7 +13,7 @@ from ertis_cli._config import typed
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ertis_numba.campaign import Options
+    from ertis_numba.campaign import CampaignOptions
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
 
@@ -174,9 +174,9 @@ def process(
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
 
-    from ertis_numba.campaign import Options
+    from ertis_numba.campaign import CampaignOptions
 
-    wanted = Options(
+    wanted = CampaignOptions(
         settings=changed,
         sensor=sensor,
         dtype=dtype,
@@ -228,7 +228,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
     )
 
 
-def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as_json: bool) -> dict[str, Any]:
+def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: bool, as_json: bool) -> dict[str, Any]:
     """Process one recording in this process, and return the report."""
     from ertis_numba.campaign import making
 
@@ -238,8 +238,8 @@ def _process_one(path: Path, target: Path, wanted: "Options", *, quiet: bool, as
             wait = functools.partial(options.pipeline, device=wanted.device, threads=wanted.threads, quiet=quiet)
             yield [stack.enter_context(wait(settings)) for settings in several]
 
-    def show(sensor: str, told: dict[str, Any]) -> None:
-        for line in () if as_json or quiet else _plans.said_of(sensor, told):
+    def show(sensor: str, reported: dict[str, Any]) -> None:
+        for line in () if as_json or quiet else _plans.said_of(sensor, reported):
             click.echo(line, err=True)
 
     with making(

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from ertis_cli import _central_watch, _network, _supervisor, options
-from ertis_cli._saving import taken_back
+from ertis_cli._saving import withdrawn
 
 __all__ = ["record"]
 
@@ -18,7 +18,7 @@ _FILE = click.Path(path_type=Path)
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
-@_central_watch.most_bytes
+@_central_watch.max_bytes
 @click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
@@ -33,7 +33,7 @@ def record(
     name: str,
     rotate_size: float,
     rotate_every: float,
-    most_bytes: int,
+    max_bytes: int,
     duration: float | None,
     key: str | None,
     allow: Path | None,
@@ -60,10 +60,10 @@ def record(
         life.addresses.get("address") or listen or DEFAULT_LISTEN,
         keys=_network.server_keys(key, allow),
         archive=archive,
-        most_bytes=most_bytes,
+        max_bytes=max_bytes,
         on_event=watch.event,
         on_stored=watch.stored if as_json and every else None,
     )
-    with taken_back(folder) as made:
+    with withdrawn(folder) as made:
         _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
     _central_watch.report(node.latest, watch, event="recorded")

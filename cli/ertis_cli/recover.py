@@ -44,9 +44,9 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
         if "error" in report and _failed(report):
             continue
         if report.get("lost") or report.get("damage"):
-            click.echo(f"ertis: warning: {_told(report)}", err=True)
+            click.echo(f"ertis: warning: {_reported(report)}", err=True)
         else:
-            options.say(_told(report), quiet=quiet)
+            options.say(_reported(report), quiet=quiet)
     if as_json:
         options.print_json({"journals": reports})
     incomplete = any(report.get("damaged") or report.get("lost") or report.get("damage") for report in reports)
@@ -61,22 +61,22 @@ def _found(place: Path) -> list[Path]:
 
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Seal a journal and return what became of it, as it is printed."""
-    from ertis_numba.errors import DataError, InUseError
+    from ertis_numba.errors import DataError, JournalInUseError
     from ertis_numba.journal import seal_apart
 
     with options.progress(range(_STEPS), length=_STEPS, label=journal.name, quiet=quiet) as shown:
         steps = iter(shown)
-        n_told = 0
+        n_reported = 0
 
         def progress(done: int, of: int) -> None:
-            nonlocal n_told
-            for _ in islice(steps, _STEPS * done // of - n_told):
-                n_told += 1
+            nonlocal n_reported
+            for _ in islice(steps, _STEPS * done // of - n_reported):
+                n_reported += 1
 
         try:
             sealed = seal_apart(journal, overwrite=force, progress=progress)
         except (DataError, OSError) as error:
-            return {"journal": str(journal), "error": str(error), "in_use": isinstance(error, InUseError)}
+            return {"journal": str(journal), "error": str(error), "in_use": isinstance(error, JournalInUseError)}
         except KeyboardInterrupt as interrupt:
             click.echo(str(interrupt), err=True)
             raise
@@ -93,7 +93,7 @@ def _refusal(report: dict[str, Any]) -> str:
     return f"{report['journal']}: {reasons}; the journal is kept as {report['set_aside']}"
 
 
-def _told(report: dict[str, Any]) -> str:
+def _reported(report: dict[str, Any]) -> str:
     """Return what became of a journal, in a line."""
     if "error" in report:
         return f"{report['journal']}: in use by a running capture; left alone"
@@ -101,11 +101,11 @@ def _told(report: dict[str, Any]) -> str:
         return f"{report['journal']}: kept as {report['set_aside']}"
     if report["recording"] is None:
         return f"{report['journal']}: no measurement was captured; removed"
-    told = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
+    reported = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
     if report["damaged"]:
-        told.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
+        reported.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
     if report["lost"] or report["damage"]:
-        told.append(f"up to {report['lost']} of them stored, then lost in the journal's damaged log")
+        reported.append(f"up to {report['lost']} of them stored, then lost in the journal's damaged log")
     if report["damage"]:
-        told.append(f"also lost: {report['damage']}")
-    return f"{report['recording']}: {', '.join(told)}"
+        reported.append(f"also lost: {report['damage']}")
+    return f"{report['recording']}: {', '.join(reported)}"

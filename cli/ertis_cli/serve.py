@@ -6,7 +6,7 @@ from typing import Any, Literal
 import click
 
 from ertis_cli import _central_watch, _network, _supervisor, options
-from ertis_cli._saving import taken_back
+from ertis_cli._saving import withdrawn
 
 __all__ = ["serve"]
 
@@ -20,7 +20,7 @@ _FOLDER = click.Path(path_type=Path)
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
-@_central_watch.most_bytes
+@_central_watch.max_bytes
 @click.option("--workers", type=click.IntRange(1, 256), metavar="N", help="Processes; as many as cores by default.")
 @options.threads
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own by default.")
@@ -66,7 +66,7 @@ def serve(
     name: str,
     rotate_size: float,
     rotate_every: float,
-    most_bytes: int,
+    max_bytes: int,
     workers: int | None,
     threads: int | None,
     directions: str | None,
@@ -96,7 +96,7 @@ def serve(
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
-    from ertis_numba.network.processing import Options, Processing
+    from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
     from ertis_numba.settings import Settings
 
     _network.require_duration(duration)
@@ -104,11 +104,11 @@ def serve(
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
     changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
     keys = _network.server_keys(key, allow)
-    with taken_back(folder, quarantine) as made:
+    with withdrawn(folder, quarantine) as made:
         if quarantine is not None:
             _make(quarantine)
-        processing = Processing(
-            Options(
+        processing = ImageProcessing(
+            ProcessingOptions(
                 publish=publish,
                 keys=keys,
                 processing={option: value for option, value in changes.items() if value is not None},
@@ -135,7 +135,7 @@ def serve(
             keys=keys,
             archive=archive,
             processing=processing,
-            most_bytes=most_bytes,
+            max_bytes=max_bytes,
             on_event=on_event,
             on_stored=watch.stored if as_json and every else None,
         )

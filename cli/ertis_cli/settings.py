@@ -10,7 +10,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.reference import Section
+    from ertis_numba.toml_reference import TableReference
 
 __all__ = ["settings"]
 
@@ -28,7 +28,7 @@ def settings(*, document: str, as_json: bool) -> None:
     KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and remove the # from
     the keys to set. Each key has its meaning, its type, its unit, its default and an example.
     """
-    from ertis_numba.reference import reference
+    from ertis_numba.toml_reference import reference
 
     sections = reference(document)
     if as_json:
@@ -37,7 +37,7 @@ def settings(*, document: str, as_json: bool) -> None:
     click.echo("\n".join(line for section in sections for line in _lines(section)))
 
 
-def _lines(section: "Section") -> Iterator[str]:
+def _lines(section: "TableReference") -> Iterator[str]:
     """Yield the lines of a table; all but its header are comments."""
     yield from textwrap.wrap(section.about, _WIDTH, initial_indent="# ", subsequent_indent="# ")
     if section.header:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from ertis_numba.frames import Measurement, Reflector
     from ertis_numba.simulation import Scene
-    from ertis_numba.simulation.plan import Plan
+    from ertis_numba.simulation.plan import EffectPlan
     from ertis_numba.simulation.render import Simulator
     from ertis_numba.storage import TruthLog
 
@@ -131,11 +131,11 @@ def simulate(
 
 def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflectors: int = 0) -> None:
     """Raise an error if the recording exceeds the free disk space."""
-    from ertis_numba.atomic import require_room
-    from ertis_numba.words import word_format
+    from ertis_numba.atomic_files import require_free_space
+    from ertis_numba.sample_format import sample_format
 
-    n_bytes = sum(word_format(scene.sensor(name).settings()).n_bytes + _COLUMN_BYTES for name in names)
-    require_room(
+    n_bytes = sum(sample_format(scene.sensor(name).settings()).n_bytes + _COLUMN_BYTES for name in names)
+    require_free_space(
         target.parent,
         scene.count * (n_bytes + n_reflectors * _REFLECTOR_BYTES),
         purpose=f"{options.counted(scene.count, 'measurement')} of {options.counted(len(names), 'sensor')}",
@@ -154,7 +154,7 @@ def _measurements(
             yield simulator.render(index)
 
 
-def _log(scene: "Scene", plan: "Plan", folder: Path) -> "TruthLog":
+def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "TruthLog":
     from ertis_numba.storage import TruthLog
 
     # With the verdicts written out, so that the words can be made again where a rehearsal would come out otherwise.
@@ -167,7 +167,7 @@ def _mounting(simulator: "Simulator") -> Any:
     return simulator.sensor.path().position_at(0.0), simulator.sensor.quaternion()
 
 
-def _effects(plan: "Plan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
+def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
     """Return what ``--explain`` tells of each effect; costs are those of one measurement of one sensor."""
     rendered = len(simulators) * simulators[0].scene.count
     return [
@@ -208,7 +208,7 @@ def _summary(target: Path, scene: "Scene", *, n_sensors: int, n_reflectors: int)
     return f"{target}: {measurements}{several}, {options.counted(n_reflectors, 'reflector')}"
 
 
-def _report(target: Path, scene: "Scene", plan: "Plan", firsts: "dict[str, list[Reflector]]") -> dict[str, Any]:
+def _report(target: Path, scene: "Scene", plan: "EffectPlan", firsts: "dict[str, list[Reflector]]") -> dict[str, Any]:
     return {
         "output": str(target),
         "measurements": scene.count,

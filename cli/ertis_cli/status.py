@@ -14,8 +14,8 @@ from ertis_cli._central_watch import size
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from ertis_numba.network.asking import Asking
     from ertis_numba.network.status import ArchiveStatus, Percentiles, Status
+    from ertis_numba.network.status_client import Asking
 
 __all__ = ["status"]
 
@@ -47,7 +47,7 @@ def status(
     admin are needed. A central node that goes away meanwhile is waited for.
     """
     from ertis_numba import checks
-    from ertis_numba.network.asking import Asking
+    from ertis_numba.network.status_client import Asking
 
     if once and watch:
         raise click.UsageError("--once and --watch exclude each other; give one of them")
@@ -89,7 +89,7 @@ def _print(now: "Status", away: str, *, as_json: bool) -> None:
 
         Console(file=sys.stdout).print(_drawn(now, away))
         return
-    above, table, below = _told(now, away)
+    above, table, below = _reported(now, away)
     for line in (*above, *table.lines(), *below):
         click.echo(line)
 
@@ -103,16 +103,16 @@ def _live() -> "Iterator[Any]":
 
 
 def _drawn(now: "Status", away: str = "") -> "Group":
-    """Return what `_told` does, drawn."""
+    """Return what `_reported` does, drawn."""
     from rich.console import Group
     from rich.text import Text
 
-    above, table, below = _told(now, away)
+    above, table, below = _reported(now, away)
     lines = [Text(line, "bold red" if line.startswith(_ALARMING) else "") for line in above]
     return Group(*lines, table, *map(Text, below))
 
 
-def _told(now: "Status", away: str) -> tuple[list[str], _tables.Table, list[str]]:
+def _reported(now: "Status", away: str) -> tuple[list[str], _tables.TextTable, list[str]]:
     """Return the sensors, with lines above and below; where it does not answer, those of before."""
     keys = "with keys" if now.keys else "without keys"
     head = (
@@ -128,7 +128,7 @@ def _told(now: "Status", away: str) -> tuple[list[str], _tables.Table, list[str]
     return above, _sensors(now), [*_below(now)]
 
 
-def _sensors(now: "Status") -> _tables.Table:
+def _sensors(now: "Status") -> _tables.TextTable:
     processing, archive = now.processing is not None, now.archive is not None
     headings = ["Hz", "received", *(["stored"] if archive else []), *(["published"] if processing else []), "queue"]
     columns: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(headings, "right"), "missing": "left"}
@@ -142,7 +142,7 @@ def _sensors(now: "Status") -> _tables.Table:
         row += [str(each.queue), _by_reason(each.missing)]
         row += [_by_reason(each.dropped), _times(each.image_latency)] if processing else []
         rows.append((name if each.connected else f"{name} (away)", *row))
-    return _tables.Table(columns, rows)
+    return _tables.TextTable(columns, rows)
 
 
 def _below(now: "Status") -> Iterator[str]:

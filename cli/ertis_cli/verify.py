@@ -58,17 +58,17 @@ def _line(report: "SensorReport") -> str:
     """Return what was found of a sensor."""
     if report.fault:
         return f"{report.sensor}: {report.fault}"
-    told = [options.counted(report.measurements, "measurement")]
+    reported = [options.counted(report.measurements, "measurement")]
     if report.gaps:
         gaps = "; ".join(f"{_span(gap.first, gap.last)}: {gap.reason}" for gap in report.gaps)
-        told.append(f"{report.missing} missing ({gaps})")
+        reported.append(f"{report.missing} missing ({gaps})")
     if report.damaged:
-        told.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
+        reported.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
     if report.disordered:
-        told.append(f"{len(report.disordered)} out of order (at {_places(report.disordered)})")
+        reported.append(f"{len(report.disordered)} out of order (at {_places(report.disordered)})")
     if report.remark:
-        told.append(report.remark)
-    return f"{report.sensor}: {', '.join(told)}{', whole' if report.whole else ''}"
+        reported.append(report.remark)
+    return f"{report.sensor}: {', '.join(reported)}{', whole' if report.whole else ''}"
 
 
 def _places(places: Iterable[int]) -> str:

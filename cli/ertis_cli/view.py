@@ -21,25 +21,25 @@ from ertis_cli import _mountings, _network, options
 from ertis_cli._signals import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
-    from ertis_numba.viewer import Film, Live, View
+    from ertis_numba.viewer import Live, Playback, Viewer
 
 __all__ = ["view"]
 
 _COLOURS = ("inferno", "viridis", "cividis", "magma")
-_LIVE, _FILM, _PAGE = "an address", "a file that is shown", "a file that --save-html writes as a page"
+_LIVE, _PLAYBACK, _PAGE = "an address", "a file that is shown", "a file that --save-html writes as a page"
 _HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
 _PAGES = (".html", ".htm")
 _TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
 _ENDING = "ending when the image at hand is made; Ctrl-C ends at once ..."
 _ONLY = {
-    "host": (_LIVE, _FILM),
-    "port": (_LIVE, _FILM),
-    "opened": (_LIVE, _FILM),
-    "loop": (_FILM,),
-    "duration": (_LIVE, _FILM),
+    "host": (_LIVE, _PLAYBACK),
+    "port": (_LIVE, _PLAYBACK),
+    "opened": (_LIVE, _PLAYBACK),
+    "loop": (_PLAYBACK,),
+    "duration": (_LIVE, _PLAYBACK),
     "key": (_LIVE,),
     "server_key": (_LIVE,),
-    "device": (_FILM, _PAGE),
+    "device": (_PLAYBACK, _PAGE),
 }
 """Options that not all have use for, and who has."""
 
@@ -114,7 +114,7 @@ def view(
     them on their platform in three dimensions. It needs the extra view, and no other host.
     """
     live = _is_address(what)
-    _require_use(_LIVE if live else _FILM if html is None else _PAGE)
+    _require_use(_LIVE if live else _PLAYBACK if html is None else _PAGE)
     _network.require_duration(duration)
     if html is not None:
         from ertis_numba import checks
@@ -122,7 +122,7 @@ def view(
 
         check_target(html, overwrite=force, sources=[] if live else [Path(what)])
         checks.choice("page format", html.suffix.lower(), _PAGES)
-    from ertis_numba.viewer import Choices, View
+    from ertis_numba.viewer import Choices, Viewer
 
     choices = Choices(
         threshold_db=threshold, dynamic_range_db=dynamic_range, range_m=range_m, decay_s=decay, colours=colours
@@ -134,7 +134,7 @@ def view(
             what, sensors, live=live, keys=(key, server_key), device=device, loop=loop, mounting=mounting
         ) as source,
         nullcontext() if live else _ended(source, signals, quiet=quiet),
-        View(
+        Viewer(
             source,
             host="127.0.0.1" if at_once else host,  # nobody is to look while a file becomes a page
             port=0 if at_once else port,
@@ -150,7 +150,7 @@ def view(
             if shown.recorded is None:
                 signals.end()
         else:
-            _tell(what, shown, quiet=quiet, as_json=as_json)
+            _emit_event(what, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
                 # Some return when they are closed, and others after seconds.
                 asked = {"asked": bool(opened)}
@@ -158,7 +158,7 @@ def view(
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
     gc.freeze()  # to look through all that libraries have made would take a fifth of a second that nobody waits for
     if html is not None:
-        _tell_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
+        _report_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
 
 
 def _is_address(what: str) -> bool:
@@ -192,21 +192,21 @@ def _source(
     device: Any,
     loop: bool,
     mounting: Path | None,
-) -> "Live | Film":
+) -> "Live | Playback":
     if live:
         from ertis_numba.viewer import Live
 
         given = _mountings.mountings(mounting, sensors or None)
         return Live(what, sensors=sensors or None, keys=_network.client_keys(*keys), mounting=given)
     from ertis_numba.storage import sensor_names
-    from ertis_numba.viewer import Film
+    from ertis_numba.viewer import Playback
 
     given = None if mounting is None else _mountings.mountings(mounting, sensors or sensor_names(what))
-    return Film(what, sensors=sensors or None, device=device, loop=loop, mounting=given)
+    return Playback(what, sensors=sensors or None, device=device, loop=loop, mounting=given)
 
 
 @contextmanager
-def _ended(source: "Live | Film", signals: Signals, *, quiet: bool) -> Iterator[None]:
+def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Iterator[None]:
     """Close a source after the block; who waits for that is told why."""
     try:
         yield
@@ -262,7 +262,7 @@ def _has_window(browser: webbrowser.BaseBrowser) -> bool:
     return getattr(browser, "background", True)
 
 
-def _tell(what: str, shown: "View", *, quiet: bool, as_json: bool) -> None:
+def _emit_event(what: str, shown: "Viewer", *, quiet: bool, as_json: bool) -> None:
     """Tell where the page is, and who else may reach it."""
     if as_json:
         options.print_json({"event": "viewing", "source": what, "url": shown.url})
@@ -271,7 +271,7 @@ def _tell(what: str, shown: "View", *, quiet: bool, as_json: bool) -> None:
         options.say("other machines need the token in that address; anyone with it can control this view", quiet=quiet)
 
 
-def _tell_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
+def _report_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
     """Tell what was written; it is an error if that is nothing."""
     if n_frames is None:
         raise click.ClickException(f"no image of {what} was shown, and {html} is not written; see that sensors send")

@@ -36,11 +36,13 @@ def build(folder: Path) -> None:
         ]
         environment = os.environ | {"SOURCE_DATE_EPOCH": DATE}
         made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - ours
-        told = json.loads(made.stdout)
+        reported = json.loads(made.stdout)
         report = {
             "scene": scene.name,
-            "seed": told["seed"],
-            "sensors": [entry | {"words_sha256": words_sha256(target, entry["sensor"])} for entry in told["sensors"]],
+            "seed": reported["seed"],
+            "sensors": [
+                entry | {"words_sha256": words_sha256(target, entry["sensor"])} for entry in reported["sensors"]
+            ],
         }
         target.with_suffix(".json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     write_sums(folder)
@@ -51,7 +53,7 @@ def words_sha256(path: Path, sensor: str) -> str:
     digest = hashlib.sha256()
     with open_recording(path, sensor=sensor) as recording:
         for measurement in recording:
-            words = measurement.words
+            words = measurement.data
             digest.update(words.astype(words.dtype.newbyteorder("<")).tobytes())
     return digest.hexdigest()
 

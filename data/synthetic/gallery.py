@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import ertis_numba as ertis
+from ertis_numba.analysis.compare import errors_of
 from ertis_numba.simulation import Scene
-from ertis_numba.simulation.plan import Plan, make_plan
-from ertis_numba.stages.compare import errors_of
+from ertis_numba.simulation.plan import EffectPlan, make_plan
 
 ROOT = Path(__file__).parents[2]
 SCENES = Path(__file__).parent / "scenes"
@@ -25,8 +25,8 @@ PAGE = ROOT / "docs" / "gallery.md"
 PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
-_MOST_MARKS = 8
-_MOST_BYTES = 150_000  # of a picture
+_MAX_MARKS = 8
+_MAX_BYTES = 150_000  # of a picture
 _SHEET = (1.0, 92)  # the share of a figure's width that is shown, and dots per inch
 _FRAME = (0.745, 84)  # the same of the figures of a strip: without colour bar and list
 _IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
@@ -80,7 +80,7 @@ def main() -> None:
         PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
 
 
-def take(scene: Scene, plan: Plan) -> Takes:
+def take(scene: Scene, plan: EffectPlan) -> Takes:
     """Return images and truth of all measurements of all sensors."""
     takes = {}
     for sensor in scene.sensors:
@@ -96,15 +96,15 @@ def draw(stem: str, takes: Takes, shown: Shown) -> None:
     figures = []
     for sensor, index in shown.frames:
         image, truth = takes[sensor][index]
-        told = ertis.compare(image, truth)
-        reflectors = [*(match.reflector for match in told.matched), *told.missed]
+        reported = ertis.compare(image, truth)
+        reflectors = [*(match.reflector for match in reported.matched), *reported.missed]
         # What stands there itself, not what walls show of it.
         figures.append(_figure(image, [each for each in reflectors if ">" not in each.name], shown.dynamic_range_db))
     save(figures, PICTURES / f"{stem}.png")
 
 
 def _figure(image: ertis.Energyscape, reflectors: Sequence[ertis.Reflector], dynamic_range_db: float) -> Figure:
-    strongest = sorted(reflectors, key=lambda reflector: -reflector.level_db)[:_MOST_MARKS]
+    strongest = sorted(reflectors, key=lambda reflector: -reflector.level_db)[:_MAX_MARKS]
     places = ("azimuth_deg", "elevation_deg", "range_m", "level_db")
     marks = [ertis.Peak(**{name: getattr(reflector, name) for name in places}) for reflector in strongest]
     return ertis.plot(image, dynamic_range_db=dynamic_range_db, peaks=marks)
@@ -119,7 +119,7 @@ def save(figures: Sequence[Figure], path: Path) -> None:
     for number, part in enumerate(parts):
         strip.paste(part.crop((0, 0, widths[number], part.height)), (sum(widths[:number]), 0))
     strip.save(path, optimize=True)
-    if path.stat().st_size > _MOST_BYTES:  # where colours are many, 256 are enough; where they are few, they show
+    if path.stat().st_size > _MAX_BYTES:  # where colours are many, 256 are enough; where they are few, they show
         strip.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
@@ -129,7 +129,7 @@ def _raster(figure: Figure, dpi: int) -> Image.Image:
     return Image.open(file).convert("RGB")
 
 
-def effects_table(plan: Plan) -> str:
+def effects_table(plan: EffectPlan) -> str:
     """Return what ``--explain`` says of the effects for which the scene has something, as Markdown."""
     rows = [
         (

@@ -6,19 +6,19 @@ and no other one.
 """
 
 from ertis_numba.campaign.campaign import Campaign
-from ertis_numba.campaign.events import Advanced, Begun, Ended, Event
+from ertis_numba.campaign.events import Advanced, Begun, Event, RecordingEnded
 from ertis_numba.campaign.making import Making, making
-from ertis_numba.campaign.orders import Options
+from ertis_numba.campaign.orders import CampaignOptions
 from ertis_numba.campaign.recordings import Source, find, outputs
 
 __all__ = [
     "Advanced",
     "Begun",
     "Campaign",
-    "Ended",
+    "CampaignOptions",
     "Event",
     "Making",
-    "Options",
+    "RecordingEnded",
     "Source",
     "find",
     "making",

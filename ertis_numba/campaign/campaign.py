@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.campaign.events import Advanced, Begun, Ended, Event, Outcome
+from ertis_numba.campaign.events import Advanced, Begun, Event, Outcome, RecordingEnded
+from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, sole
-from ertis_numba.campaign.made import difference
-from ertis_numba.campaign.orders import HOW, MOST_BYTES, Crew, Do, News, Options, Order
+from ertis_numba.campaign.orders import HOW, MAX_BYTES, CampaignOptions, Do, News, WorkerPool, WorkOrder
 from ertis_numba.campaign.plans import Plans
 from ertis_numba.campaign.recordings import Source, outputs
-from ertis_numba.cores import usable_cores
+from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained
 from ertis_numba.settings import Accuracy, Settings
@@ -35,8 +35,8 @@ class _Case:
     wanted: dict[str, Settings] = field(default_factory=dict)
     is_there: bool = False
 
-    def ended(self, outcome: Outcome, **more: Any) -> Ended:
-        return Ended(self.found.path, self.target, outcome, **more)
+    def ended(self, outcome: Outcome, **more: Any) -> RecordingEnded:
+        return RecordingEnded(self.found.path, self.target, outcome, **more)
 
 
 class Campaign:
@@ -67,16 +67,16 @@ class Campaign:
         self,
         recordings: Sequence[Source],
         folder: str | Path,
-        options: Options | None = None,
+        options: CampaignOptions | None = None,
         *,
         workers: int | None = None,
         scheduler: str | None = None,
     ) -> None:
         if workers is not None:
-            checks.whole("workers", workers, 1)
+            checks.integer("workers", workers, 1)
             if scheduler is not None:
                 raise ArgumentError("workers are given and a scheduler, which has its own; give one of both")
-        self.folder, self._options = Path(folder), options or Options()
+        self.folder, self._options = Path(folder), options or CampaignOptions()
         targets = outputs(recordings, self.folder)
         self._names = {target.name for target in targets}
         self._waiting = deque(_Case(*pair) for pair in zip(recordings, targets, strict=True))
@@ -84,7 +84,7 @@ class Campaign:
         self._plans = Plans()
         self._unplanned: deque[_Case] = deque()
         self._ready: deque[_Case] = deque()
-        self._given: dict[int, tuple[Order, _Case]] = {}
+        self._given: dict[int, tuple[WorkOrder, _Case]] = {}
         self._n_orders = 0
 
     @property
@@ -109,43 +109,43 @@ class Campaign:
         with sole(self.folder):
             clear_parts(self.folder, self._names)
             try:
-                with closing(self._crew()) as crew:
-                    while self._feed(crew):
-                        for news in crew.wait(_WAIT_S):
-                            yield from self._heard(crew, news)
+                with closing(self._pool()) as pool:
+                    while self._feed(pool):
+                        for news in pool.wait(_WAIT_S):
+                            yield from self._heard(pool, news)
             finally:
                 clear_parts(self.folder, self._names)
 
-    def _crew(self) -> Crew:
+    def _pool(self) -> WorkerPool:
         if self._scheduler is not None:
             from ertis_numba.campaign.members import Members  # noqa: PLC0415  it loads dask
 
             return Members(self._scheduler)
-        from ertis_numba.campaign.processes import Processes  # noqa: PLC0415
+        from ertis_numba.campaign.processes import ProcessPool  # noqa: PLC0415
 
-        return Processes(self.workers)
+        return ProcessPool(self.workers)
 
-    def _feed(self, crew: Crew) -> bool:
+    def _feed(self, pool: WorkerPool) -> bool:
         """Give orders to whoever is free; return whether there is anything to wait for."""
-        while crew.free > 0 and (pair := self._next(crew)) is not None:
+        while pool.free > 0 and (pair := self._next(pool)) is not None:
             self._given[pair[0].number] = pair
-            crew.give(pair[0])
+            pool.give(pair[0])
         return bool(self._given)
 
-    def _next(self, crew: Crew) -> tuple[Order, _Case] | None:
+    def _next(self, pool: WorkerPool) -> tuple[WorkOrder, _Case] | None:
         """Return what is to be done next: what is nearest to its end comes first."""
         if self._ready:
             case = self._ready.popleft()
-            return self._order("check" if case.is_there else "make", self._to_make(case, crew.size)), case
-        if (planned := self._to_plan(crew.size)) is not None:
+            return self._order("check" if case.is_there else "make", self._pending_output(case, pool.size)), case
+        if (planned := self._to_plan(pool.size)) is not None:
             return planned
         in_hand = len(self._given) + len(self._unplanned)
-        if self._waiting and in_hand < crew.size + _AHEAD:
+        if self._waiting and in_hand < pool.size + _AHEAD:
             case = self._waiting.popleft()
             return self._order("look", self._paths(case) | {"sensor": self._options.sensor}), case
         return None
 
-    def _to_plan(self, n_workers: int) -> tuple[Order, _Case] | None:
+    def _to_plan(self, n_workers: int) -> tuple[WorkOrder, _Case] | None:
         """Return an order to plan, unless all that is to be planned for has to wait."""
         for case in self._unplanned:
             settings = next(each for each in case.wanted.values() if self._plans.of(each) is None)
@@ -155,9 +155,9 @@ class Campaign:
                 return self._order("plan", about), case
         return None
 
-    def _order(self, do: Do, about: dict[str, Any]) -> Order:
+    def _order(self, do: Do, about: dict[str, Any]) -> WorkOrder:
         self._n_orders += 1
-        return Order(self._n_orders, do, about)
+        return WorkOrder(self._n_orders, do, about)
 
     def _paths(self, case: _Case) -> dict[str, Any]:
         far = self._scheduler is not None  # where the current folder is another one
@@ -168,7 +168,7 @@ class Campaign:
         share = 1 if self._scheduler is not None else n_workers
         return {"device": self._options.device, "threads": self._options.threads, "share": share}
 
-    def _to_make(self, case: _Case, n_workers: int) -> dict[str, Any]:
+    def _pending_output(self, case: _Case, n_workers: int) -> dict[str, Any]:
         options = self._options
         planned = {}
         for name, settings in case.wanted.items():
@@ -180,12 +180,12 @@ class Campaign:
             **self._shares(n_workers),
             **{name: getattr(options, name) for name in HOW},
             "sensors": planned,
-            "most_bytes": MOST_BYTES / n_workers,
+            "most_bytes": MAX_BYTES / n_workers,
             # Dask starts again what a worker had that was lost, even if all but the news of it had been done.
             "overwrite": options.overwrite or self._scheduler is not None,
         }
 
-    def _heard(self, crew: Crew, news: News) -> Iterator[Event]:
+    def _heard(self, pool: WorkerPool, news: News) -> Iterator[Event]:
         if news.number not in self._given:
             return
         order, case = self._given[news.number]
@@ -197,7 +197,7 @@ class Campaign:
         if order.do == "plan":
             self._plans.end(Settings.from_toml(order.about["settings"], "settings"), news.result)
             if "by_chance" not in news.result:
-                yield from self._planned(crew, case, news.result)
+                yield from self._planned(pool, case, news.result)
                 return
         if "error" in news.result:
             if order.do == "make" and "by_chance" in news.result:
@@ -208,16 +208,16 @@ class Campaign:
         else:
             yield case.ended("there" if case.is_there else "made", made=news.result)
 
-    def _looked(self, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
-        if told.get("passed_over"):
+    def _looked(self, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
+        if reported.get("passed_over"):
             yield case.ended("passed over")
             return
         try:
-            for name, text in told["sensors"].items():
+            for name, text in reported["sensors"].items():
                 recorded = Settings.from_toml(text, f"{case.found.path}: settings")
                 case.wanted[name] = self_contained(_absolute(self._options.settings(recorded)))
-            case.measurements = told["measurements"]
-            made = told["made"]
+            case.measurements = reported["measurements"]
+            made = reported["made"]
             differs = "" if made is None else difference(made, case.wanted, self._options.mounting)
         except (ErtisError, OSError) as error:
             yield case.ended("failed", error=" ".join(str(error).split()))
@@ -232,16 +232,16 @@ class Campaign:
 
     def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
         """Let go of what is made, unless there is something to find out of how it was made."""
-        if not self._options.looks_closely:
+        if not self._options.is_thorough:
             yield case.ended("there")
             return
         case.is_there = True
         case.wanted = {name: Settings.from_toml(held["settings"], "settings") for name, held in sensors.items()}
         yield from self._forward(case)
 
-    def _planned(self, crew: Crew, case: _Case, told: dict[str, Any]) -> Iterator[Event]:
-        if told.get("device") == "cuda" and self._workers is None and self._scheduler is None:
-            crew.limit(1)  # a GPU serves one recording faster than it serves several
+    def _planned(self, pool: WorkerPool, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
+        if reported.get("device") == "cuda" and self._workers is None and self._scheduler is None:
+            pool.limit(1)  # a GPU serves one recording faster than it serves several
         cases = [case, *self._unplanned]
         self._unplanned.clear()
         for each in cases:

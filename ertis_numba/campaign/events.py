@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-__all__ = ["Advanced", "Begun", "Ended", "Event", "Outcome"]
+__all__ = ["Advanced", "Begun", "Event", "Outcome", "RecordingEnded"]
 
 Outcome = Literal["made", "there", "passed over", "failed"]
 
@@ -26,7 +26,7 @@ class Advanced:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class RecordingEnded:
     """What became of a recording.
 
     Attributes
@@ -47,4 +47,4 @@ class Ended:
     made: dict[str, Any] = field(default_factory=dict)
 
 
-Event = Begun | Advanced | Ended
+Event = Begun | Advanced | RecordingEnded

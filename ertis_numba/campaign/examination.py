@@ -68,7 +68,7 @@ def examine(
 def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
     """Return a plan and what is expected of it."""
     chosen = {name: planner.chosen(settings.accuracy) for name, planner in planners.items()}
-    safe, texture = chosen["safe"], chosen["texture"]
+    safe, signal_model = chosen["safe"], chosen["texture"]
     return {
         "accuracy": {name: getattr(settings.accuracy, name) for name in settings.accuracy.__struct_fields__},
         "parts": [
@@ -76,13 +76,13 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
                 "name": name,
                 "due_to": due_to,
                 "safe_db": round(decibels(safe.parts[name]), 1),
-                "predicted_db": round(decibels(texture.parts[name]), 1),
+                "predicted_db": round(decibels(signal_model.parts[name]), 1),
             }
             for name, due_to in PARTS.items()
             if safe.parts[name]
         ],
         "safe_db": round(safe.error_db, 1),
-        "predicted_db": round(texture.error_db, 1),
+        "predicted_db": round(signal_model.error_db, 1),
         "stages_ms": {name: round(time_ms, 3) for name, time_ms in safe.stages_ms.items()},
         "time_ms": round(safe.time_ms, 3),
         "costs": str(planners["safe"].costs_file),

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ertis_numba import kernels
-from ertis_numba.campaign.orders import Options
+from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.campaign.orders import CampaignOptions
 from ertis_numba.campaign.sensor_run import SensorRun, faults_of
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
-from ertis_numba.stages.call_match import CallMatch, first_call_match
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
@@ -54,7 +54,7 @@ class Making:
             for recording, run in zip(self._recordings, self._runs, strict=True)
         ]
         times_ms = [time_ms for run in self._runs for time_ms in run.times_ms]
-        outside = ("directions", "ranges", *self._runs[0].told) if len(rows) == 1 else ()
+        outside = ("directions", "ranges", *self._runs[0].reported) if len(rows) == 1 else ()
         return {
             "measurements": len(times_ms),
             **{name: rows[0][name] for name in outside},
@@ -68,12 +68,12 @@ class Making:
 def making(
     path: Path,
     target: Path,
-    options: Options,
+    options: CampaignOptions,
     *,
     sensors: Sequence[str],
     settings: Mapping[str, Settings] | None = None,
     pipelines: _Pipelines,
-    most_bytes: float | None = None,
+    max_bytes: float | None = None,
     warn: Callable[[str], None] = lambda _: None,
     show: _Show = lambda *_: None,
 ) -> Iterator[Making]:
@@ -89,7 +89,7 @@ def making(
         To process by; those that ``options`` makes of the recorded ones by default.
     pipelines : callable
         Returns a context with a pipeline for each of some settings.
-    most_bytes : float, optional
+    max_bytes : float, optional
         See `SensorRun`.
     warn : callable
         Called with a line for each sensor that has faulty microphones, whose echoes do not match the
@@ -116,7 +116,7 @@ def making(
         )
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
-            SensorRun(pipeline, batch=options.batch, most_bytes=most_bytes)
+            SensorRun(pipeline, batch=options.batch, max_bytes=max_bytes)
             for pipeline in stack.enter_context(pipelines(chosen))
         ]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
@@ -124,13 +124,13 @@ def making(
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
             writer.note_call(recording.sensor, run.call_warning)
-            writer.note_wavefront(recording.sensor, run.told.get("wavefront_error_db"))
+            writer.note_wavefront(recording.sensor, run.reported.get("wavefront_error_db"))
         yield Making(recordings, runs, writer)
 
 
 def checked(
     path: Path,
-    options: Options,
+    options: CampaignOptions,
     *,
     settings: Mapping[str, Settings],
     pipelines: _Pipelines,
@@ -160,8 +160,8 @@ def checked(
         runs = [SensorRun(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
             _look_over(run, recording, check.result(), options, warn, lambda *_: None)
-        rows = [{"sensor": recording.sensor, **run.told} for recording, run in zip(recordings, runs, strict=True)]
-        return {**(runs[0].told if len(runs) == 1 else {}), "sensors": rows}
+        rows = [{"sensor": recording.sensor, **run.reported} for recording, run in zip(recordings, runs, strict=True)]
+        return {**(runs[0].reported if len(runs) == 1 else {}), "sensors": rows}
 
 
 def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dict[str, float]:
@@ -172,9 +172,9 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
     error_db = round(plane_wave_error_db(planner.model, settings, settings.processing.range_m[0]), 1)
     if error_db <= settings.accuracy.max_error_db:
         return {}
-    told = {"wavefront_error_db": error_db, "wavefront_error_range_m": settings.processing.range_m[0]}
-    show(recording.sensor, told)
-    return told
+    reported = {"wavefront_error_db": error_db, "wavefront_error_range_m": settings.processing.range_m[0]}
+    show(recording.sensor, reported)
+    return reported
 
 
 def _begin_checks(
@@ -199,7 +199,7 @@ def _look_over(
     run: SensorRun,
     recording: RecordingReader,
     checks: _Checks,
-    options: Options,
+    options: CampaignOptions,
     warn: Callable[[str], None],
     show: _Show,
 ) -> None:
@@ -218,7 +218,7 @@ def _look_over(
         threads = kernel_set.max_threads if options.threads is None else options.threads
         heard = planner_of(run.pipeline.process(first), first, kernel_set, threads=threads)
         run.prediction = predict(heard)
-        run.told |= _wavefront(heard, recording, show)
+        run.reported |= _wavefront(heard, recording, show)
         if run.prediction.warning:
             remedy = "give a lower --max-error"
             if not options.verify:
@@ -232,5 +232,5 @@ def _look_over(
         run.pipeline, first, threads=options.threads, explain=options.explain, verify=options.verify, heard=heard
     )
     for name, part in parts:
-        run.told[name] = part
+        run.reported[name] = part
         show(recording.sensor, {name: part})

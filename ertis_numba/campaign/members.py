@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Any, Final
 
 from ertis_numba import cluster
-from ertis_numba.campaign.orders import News, Order
+from ertis_numba.campaign.orders import News, WorkOrder
 from ertis_numba.campaign.work import follow
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage.schema import software_versions
@@ -17,7 +17,7 @@ __all__ = ["Members", "follow_there"]
 
 _CONNECT_S: Final = 10.0
 _LOOK_S: Final = 1.0
-_TELL_S: Final = 0.5
+_REPORT_INTERVAL_S: Final = 0.5
 
 
 class Members:
@@ -42,11 +42,13 @@ class Members:
     def __init__(self, address: str) -> None:
         self._address = address
         self._topic = f"ertis-{secrets.token_hex(4)}"
-        self._told: queue.SimpleQueue[News] = queue.SimpleQueue()
+        self._reported: queue.SimpleQueue[News] = queue.SimpleQueue()
         self._futures: dict[int, cluster.Future] = {}
         with ExitStack() as stack:
             self._client = cluster.connect(address, timeout_s=_CONNECT_S)
-            stack.enter_context(cluster.silence())  # what it would print of a scheduler that is lost is told in a line
+            stack.enter_context(
+                cluster.silence_loggers()
+            )  # what it would print of a scheduler that is lost is told in a line
             stack.callback(self._client.close, timeout=2)
             cluster.require_workers(self._client, address, timeout_s=_CONNECT_S)
             self._size = len(self._client.nthreads())
@@ -67,7 +69,7 @@ class Members:
     def limit(self, size: int) -> None:
         """See `Crew`; each worker of a cluster has its own device."""
 
-    def give(self, order: Order) -> None:
+    def give(self, order: WorkOrder) -> None:
         """See `Crew`."""
         future = self._client.submit(
             follow_there,
@@ -79,7 +81,7 @@ class Members:
             pure=False,
         )
         self._futures[order.number] = future
-        future.add_done_callback(lambda done, number=order.number: self._told.put(_news(number, done)))
+        future.add_done_callback(lambda done, number=order.number: self._reported.put(_news(number, done)))
 
     def wait(self, timeout_s: float) -> list[News]:
         """See `Crew`."""
@@ -89,11 +91,11 @@ class Members:
             )
         self._look()
         try:
-            news = [self._told.get(timeout=timeout_s)]
+            news = [self._reported.get(timeout=timeout_s)]
         except queue.Empty:
             return []
-        while not self._told.empty():
-            news.append(self._told.get())
+        while not self._reported.empty():
+            news.append(self._reported.get())
         for each in news:
             if each.result is not None:
                 self._futures.pop(each.number, None)
@@ -107,8 +109,8 @@ class Members:
 
     def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
         """Take what a task tells; in a thread of the client."""
-        _, told = event
-        self._told.put(News(told["number"], told["done"]))
+        _, reported = event
+        self._reported.put(News(reported["number"], reported["done"]))
 
     def _look(self) -> None:
         """Count the workers again, now and then."""
@@ -138,20 +140,20 @@ class _UnwantedError(Exception):
 
 def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
     """Follow an order as `work.follow` does, on a worker of the cluster; ``topic`` is where it tells how far it is."""
-    here = cluster.worker()
+    here = cluster.current_worker()
     for name, wanted in about["versions"].items():
         came = software_versions()[name]
         if came != wanted:
             return {"error": f"worker {here.address} has {name} {came}, wanted {wanted}; install the same everywhere"}
-    told_s = 0.0
+    reported_s = 0.0
 
-    def tell(done: int) -> None:
-        nonlocal told_s
+    def notify(done: int) -> None:
+        nonlocal reported_s
         task = here.state.tasks.get(f"{topic}-{number}")
         if task is None or task.state == "cancelled":
             raise _UnwantedError
-        if time.monotonic() > told_s + _TELL_S:
-            told_s = time.monotonic()
+        if time.monotonic() > reported_s + _REPORT_INTERVAL_S:
+            reported_s = time.monotonic()
             here.log_event(topic, {"number": number, "done": done})
 
-    return follow(do, {**about, "at_most": here.state.nthreads}, tell)
+    return follow(do, {**about, "at_most": here.state.nthreads}, notify)

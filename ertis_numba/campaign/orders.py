@@ -8,14 +8,14 @@ from ertis_numba import checks
 from ertis_numba.settings import Settings
 from ertis_numba.storage.recording import Mounting
 
-__all__ = ["HOW", "MOST_BYTES", "Crew", "Do", "News", "Options", "Order"]
+__all__ = ["HOW", "MAX_BYTES", "CampaignOptions", "Do", "News", "WorkOrder", "WorkerPool"]
 
-MOST_BYTES: Final = 256e6
+MAX_BYTES: Final = 256e6
 """Of images that wait to be written, of all workers together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
+class CampaignOptions:
     """How each recording is to be processed.
 
     Attributes
@@ -59,23 +59,23 @@ class Options:
     def __post_init__(self) -> None:
         checks.choice("dtype", self.dtype, ("float32", "float16"))
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
-        checks.whole("batch", self.batch, 1)
+        checks.integer("batch", self.batch, 1)
 
     @property
-    def looks_closely(self) -> bool:
+    def is_thorough(self) -> bool:
         """Whether there is more to find out of a recording than what its image is, even of one that is made already."""
         return self.strict or self.explain or self.verify
 
 
 HOW: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
-"""What an order has of `Options` as it is."""
+"""What an order has of `CampaignOptions` as it is."""
 
 
 Do = Literal["look", "plan", "make", "check"]
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class WorkOrder:
     """Something for a worker to do.
 
     Attributes
@@ -110,7 +110,7 @@ class News:
     result: dict[str, Any] | None = None
 
 
-class Crew(Protocol):
+class WorkerPool(Protocol):
     """Those who follow orders."""
 
     @property
@@ -124,7 +124,7 @@ class Crew(Protocol):
     def limit(self, size: int) -> None:
         """Follow fewer orders at a time from now on; those that were given are followed to their end."""
 
-    def give(self, order: Order) -> None:
+    def give(self, order: WorkOrder) -> None:
         """Have something done; returns at once."""
 
     def wait(self, timeout_s: float) -> list[News]:

@@ -37,16 +37,16 @@ class Plans:
         self._under_way[key] = new
         return "new" if new else "known"
 
-    def end(self, settings: Settings, told: Mapping[str, Any]) -> None:
+    def end(self, settings: Settings, reported: Mapping[str, Any]) -> None:
         """Take what came of it; what went wrong by chance is tried again by whoever wants the same plan."""
         key = _key(settings)
         self._under_way.pop(key)
-        if "by_chance" in told:
+        if "by_chance" in reported:
             return
-        if "error" in told:
-            self._found[key] = str(told["error"])
+        if "error" in reported:
+            self._found[key] = str(reported["error"])
         else:
-            self._found[key] = Settings.from_toml(told["settings"], "settings").accuracy
+            self._found[key] = Settings.from_toml(reported["settings"], "settings").accuracy
             self._kinds.add(_kind(settings))
 
 

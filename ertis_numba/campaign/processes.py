@@ -11,29 +11,29 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
-from ertis_numba.campaign.orders import News, Order
+from ertis_numba.campaign.orders import News, WorkOrder
 from ertis_numba.errors import DeviceError
 
-__all__ = ["Processes"]
+__all__ = ["ProcessPool"]
 
-_MODULE: Final = "ertis_numba.campaign._process"
-_MOST_STILLBORN: Final = 3  # that end in a row before they have done anything
+_MODULE: Final = "ertis_numba.campaign.worker_process"
+_MAX_STILLBORN: Final = 3  # that end in a row before they have done anything
 _LAST_WORDS: Final = 20  # lines
 
 
 @dataclass(slots=True, eq=False)
-class _Worker:
+class _WorkerProcess:
     """A process, and what it does at present."""
 
     process: "subprocess.Popen[str]"
-    order: Order | None = None
+    order: WorkOrder | None = None
     begun: bool = False
     ready: bool = False
-    said: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_WORDS))
+    stated: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_WORDS))
     threads: list[threading.Thread] = field(default_factory=list)
 
 
-class Processes:
+class ProcessPool:
     """See `Crew`: Python processes that are new interpreters, not forks, which OpenMP and HDF5 would not survive.
 
     Ctrl-C in a terminal does not reach them; they end with this process, however that ends.
@@ -50,8 +50,8 @@ class Processes:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._told: queue.SimpleQueue[tuple[_Worker, str | None]] = queue.SimpleQueue()
-        self._workers: list[_Worker] = []
+        self._reported: queue.SimpleQueue[tuple[_WorkerProcess, str | None]] = queue.SimpleQueue()
+        self._workers: list[_WorkerProcess] = []
         self._stillborn = 0
         try:
             for _ in range(size):
@@ -81,7 +81,7 @@ class Processes:
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
 
-    def give(self, order: Order) -> None:
+    def give(self, order: WorkOrder) -> None:
         """See `Crew`."""
         worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
         worker.order, worker.begun = order, False
@@ -94,12 +94,12 @@ class Processes:
     def wait(self, timeout_s: float) -> list[News]:
         """See `Crew`."""
         try:
-            told = [self._told.get(timeout=timeout_s)]
+            reported = [self._reported.get(timeout=timeout_s)]
         except queue.Empty:
             return []
-        while not self._told.empty():
-            told.append(self._told.get())
-        return [news for worker, line in told if (news := self._heard(worker, line)) is not None]
+        while not self._reported.empty():
+            reported.append(self._reported.get())
+        return [news for worker, line in reported if (news := self._heard(worker, line)) is not None]
 
     def close(self) -> None:
         """See `Crew`."""
@@ -108,7 +108,7 @@ class Processes:
         for worker in list(self._workers):
             self._end(worker)
 
-    def _start(self) -> _Worker:
+    def _start(self) -> _WorkerProcess:
         # -P: a file in the current folder that is named like one of Python's must not be taken for it.
         process = subprocess.Popen(  # noqa: S603  this very package
             [sys.executable, "-P", "-m", _MODULE],
@@ -121,7 +121,7 @@ class Processes:
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
         )
-        worker = _Worker(process)
+        worker = _WorkerProcess(process)
         for work, stream in ((self._listen, process.stdout), (self._overhear, process.stderr)):
             thread = threading.Thread(target=work, args=(worker, stream), daemon=True)
             thread.start()
@@ -129,34 +129,34 @@ class Processes:
         self._workers.append(worker)
         return worker
 
-    def _listen(self, worker: _Worker, stream: IO[str]) -> None:
+    def _listen(self, worker: _WorkerProcess, stream: IO[str]) -> None:
         for line in stream:
-            self._told.put((worker, line))
-        self._told.put((worker, None))
+            self._reported.put((worker, line))
+        self._reported.put((worker, None))
 
     @staticmethod
-    def _overhear(worker: _Worker, stream: IO[str]) -> None:
-        worker.said.extend(line.strip() for line in stream if line.strip())
+    def _overhear(worker: _WorkerProcess, stream: IO[str]) -> None:
+        worker.stated.extend(line.strip() for line in stream if line.strip())
 
-    def _heard(self, worker: _Worker, line: str | None) -> News | None:
+    def _heard(self, worker: _WorkerProcess, line: str | None) -> News | None:
         if line is None:
             return self._died(worker)
         try:
-            told: dict[str, Any] = json.loads(line)
+            reported: dict[str, Any] = json.loads(line)
         except ValueError:  # what is killed may have told half of it
             return None
-        if "number" not in told:
+        if "number" not in reported:
             worker.ready, self._stillborn = True, 0
             return None
         worker.begun = True
-        news = News(told["number"], told.get("done", 0), told.get("result"))
+        news = News(reported["number"], reported.get("done", 0), reported.get("result"))
         if news.result is not None:
             worker.order = None
             if len(self._workers) > self._size:
                 self._end(worker)
         return news
 
-    def _died(self, worker: _Worker) -> News | None:
+    def _died(self, worker: _WorkerProcess) -> News | None:
         if worker not in self._workers:
             return None
         order = worker.order
@@ -164,7 +164,7 @@ class Processes:
         how = _how_it_ended(worker)
         if not worker.ready:
             self._stillborn += 1
-        if self._stillborn >= _MOST_STILLBORN:
+        if self._stillborn >= _MAX_STILLBORN:
             raise DeviceError(f"processes to work in end at once: the last one {how}; try 'ertis process' on one file")
         if order is not None and not worker.begun:
             self.give(order)
@@ -174,7 +174,7 @@ class Processes:
         text = f"{_path(order)}: the process that worked on it {how}; where memory runs out, give fewer --workers"
         return News(order.number, result={"error": text, "by_chance": True})
 
-    def _end(self, worker: _Worker) -> None:
+    def _end(self, worker: _WorkerProcess) -> None:
         """End a process at once and let go of it."""
         self._workers.remove(worker)
         worker.process.kill()
@@ -187,14 +187,14 @@ class Processes:
                     stream.close()
 
 
-def _path(order: Order | None) -> str:
+def _path(order: WorkOrder | None) -> str:
     return "" if order is None else str(order.about.get("path", ""))
 
 
-def _how_it_ended(worker: _Worker) -> str:
+def _how_it_ended(worker: _WorkerProcess) -> str:
     code = worker.process.returncode
     if code < 0:
         with suppress(ValueError):
             return f"was ended by {signal.Signals(-code).name}"
-    said = f", saying {worker.said[-1]!r}" if worker.said else ""
-    return f"ended with {code}{said}"
+    stated = f", saying {worker.stated[-1]!r}" if worker.stated else ""
+    return f"ended with {code}{stated}"

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ertis_numba.campaign.orders import MOST_BYTES
+from ertis_numba.analysis.health import health
+from ertis_numba.analysis.health.kinds import DISABLE
+from ertis_numba.campaign.orders import MAX_BYTES
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.health import health
-from ertis_numba.stages.health.kinds import DISABLE
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 
 if TYPE_CHECKING:
@@ -48,28 +48,28 @@ class SensorRun:
     pipeline : Pipeline
     batch : int
         Measurements worked on at the same time, fewer where images are large.
-    most_bytes : float, optional
-        Of images that wait to be written; `MOST_BYTES` by default.
+    max_bytes : float, optional
+        Of images that wait to be written; `MAX_BYTES` by default.
 
     Attributes
     ----------
     pipeline : Pipeline
     times_ms : list of float
-    told : dict
+    reported : dict
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
     call_warning : str
         Warning that echoes do not match the call; empty if they do.
     """
 
-    def __init__(self, pipeline: Pipeline, *, batch: int, most_bytes: float | None = None) -> None:
+    def __init__(self, pipeline: Pipeline, *, batch: int, max_bytes: float | None = None) -> None:
         self.pipeline = pipeline
         self.times_ms: list[float] = []
-        self.told: dict[str, Any] = {}
+        self.reported: dict[str, Any] = {}
         self.prediction: Prediction | None = None
         self.call_warning = ""
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
-        self._size = max(1, min(batch, int((most_bytes or MOST_BYTES) / image_bytes)))
+        self._size = max(1, min(batch, int((max_bytes or MAX_BYTES) / image_bytes)))
 
     def known(self, measurement: Measurement) -> Measurement:
         """Return a measurement as it is now known: a settings file may know better what array, call or air it was."""
@@ -114,7 +114,7 @@ class SensorRun:
             "median_ms": round(statistics.median(self.times_ms), 3),
             **(self.prediction.as_dict() if self.prediction else {}),
             **({"call_warning": self.call_warning} if self.call_warning else {}),
-            **self.told,
+            **self.reported,
         }
 
 

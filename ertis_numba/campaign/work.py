@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import kernels
-from ertis_numba.atomic import remedy
+from ertis_numba.atomic_files import remedy
+from ertis_numba.campaign.existing_output import look_at
 from ertis_numba.campaign.folder import final_name
-from ertis_numba.campaign.made import look_at
 from ertis_numba.campaign.making import checked, making
-from ertis_numba.campaign.orders import HOW, Options
+from ertis_numba.campaign.orders import HOW, CampaignOptions
 from ertis_numba.errors import ErtisError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
@@ -25,25 +25,25 @@ from ertis_numba.storage import file_kind, open_recording, sensor_names
 
 __all__ = ["follow"]
 
-Tell = Callable[[int], None]
+ReportProgress = Callable[[int], None]
 _Key = tuple[str, str, int | None]
 
 _turn = threading.Lock()
 _kept: dict[_Key, Pipeline] = {}  # that nobody uses at present
 
 
-def follow(do: str, about: Mapping[str, Any], tell: Tell = lambda _: None) -> dict[str, Any]:
+def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
     """Follow an order, and return what came of it; what is expected to fail is told as ``error``.
 
     Parameters
     ----------
     do : {"look", "plan", "make", "check"}
     about : mapping
-    tell : callable
+    notify : callable
         Called with the number of measurements that are done; what it raises ends the work.
     """
     try:
-        return _ORDERS[do](about, tell)
+        return _ORDERS[do](about, notify)
     except ErtisError as error:
         return {"error": " ".join(str(error).split())}
     except (OSError, MemoryError) as error:  # they need not come another time
@@ -57,7 +57,7 @@ def _in_a_line(error: OSError | MemoryError) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _look(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
+def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Say what a recording holds, and what of it is made already."""
     path = Path(about["path"])
     if not about["named"] and file_kind(path) == "energyscape":
@@ -72,7 +72,7 @@ def _look(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
         }
 
 
-def _plan(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
+def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Settle what settings leave open; ``warm`` also compiles what it takes, which whoever comes later finds."""
     settings = Settings.from_toml(about["settings"], "settings")
     threads = _threads(about, settings)
@@ -89,7 +89,7 @@ def _plan(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
     return {"settings": planned.to_toml(), "device": device}
 
 
-def _make(about: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
+def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
     """Make the energyscape file of a recording."""
     options, how = _how(about)
     warnings: list[str] = []
@@ -98,28 +98,28 @@ def _make(about: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
         Path(about["target"]),
         options,
         sensors=list(how["settings"]),
-        most_bytes=about["most_bytes"],
+        max_bytes=about["most_bytes"],
         warn=warnings.append,
         **how,
     ) as work:
         with closing(work.run()) as steps:
             for done in steps:
-                tell(done)
+                notify(done)
         return {**work.report(), "warnings": warnings}
 
 
-def _check(about: Mapping[str, Any], _: Tell) -> dict[str, Any]:
+def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Say of a recording whose energyscapes are there what would have been said before they were made."""
     options, how = _how(about)
     warnings: list[str] = []
     return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
 
 
-def _how(about: Mapping[str, Any]) -> tuple[Options, dict[str, Any]]:
+def _how(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
     """Return the options, the settings of each sensor and where pipelines come from."""
     settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
     threads = _threads(about, next(iter(settings.values())))
-    options = Options(**{name: about[name] for name in HOW}, threads=threads)
+    options = CampaignOptions(**{name: about[name] for name in HOW}, threads=threads)
     pipelines = functools.partial(_pipelines, device=about["device"], threads=threads)
     return options, {"settings": settings, "pipelines": pipelines}
 
@@ -128,8 +128,8 @@ def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
     """Return how many threads a measurement may have, where workers share the cores of a machine."""
     if about["threads"] is not None or settings.processing.method == "paper":
         return None if about["threads"] is None else int(about["threads"])
-    most = kernels.load(about["device"]).max_threads
-    return max(1, min(most // int(about["share"]), int(about.get("at_most", most))))
+    largest = kernels.load(about["device"]).max_threads
+    return max(1, min(largest // int(about["share"]), int(about.get("at_most", largest))))
 
 
 @contextmanager
@@ -164,7 +164,7 @@ def _keep(pipelines: Mapping[_Key, Pipeline]) -> None:
         each.close()
 
 
-_ORDERS: Final[dict[str, Callable[[Mapping[str, Any], Tell], dict[str, Any]]]] = {
+_ORDERS: Final[dict[str, Callable[[Mapping[str, Any], ReportProgress], dict[str, Any]]]] = {
     "look": _look,
     "plan": _plan,
     "make": _make,

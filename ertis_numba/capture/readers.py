@@ -7,10 +7,20 @@ import time
 from dataclasses import dataclass
 
 from ertis_numba.devices.blocks import COUNTERS, Block
-from ertis_numba.devices.sonar import Sonar
-from ertis_numba.errors import SonarError, SonarGoneError
+from ertis_numba.devices.sonar import SonarDriver
+from ertis_numba.errors import SonarDisconnectedError, SonarError
 
-__all__ = ["Arrived", "Ended", "Event", "Failed", "Note", "Pace", "Reader", "Restarted", "Returned"]
+__all__ = [
+    "Arrived",
+    "Event",
+    "MeasurementFailed",
+    "Note",
+    "Restarted",
+    "Returned",
+    "SensorEnded",
+    "SensorReader",
+    "TriggerClock",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +54,7 @@ class Arrived:
 
 
 @dataclass(frozen=True, slots=True)
-class Failed:
+class MeasurementFailed:
     """A measurement that was asked for did not come."""
 
     sensor: str
@@ -81,18 +91,18 @@ class Returned:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class SensorEnded:
     """A sensor gives no more."""
 
     sensor: str
     error: Exception | None
 
 
-Event = Arrived | Failed | Note | Restarted | Returned | Ended
+Event = Arrived | MeasurementFailed | Note | Restarted | Returned | SensorEnded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pace:
+class TriggerClock:
     """When commands are given: ticks that all sensors share.
 
     Attributes
@@ -109,7 +119,7 @@ class Pace:
     n: int | None
 
 
-class Reader(threading.Thread):
+class SensorReader(threading.Thread):
     """Takes the blocks of one sensor, and survives that it is unplugged.
 
     Nothing else may use the sensor while this runs.
@@ -128,7 +138,13 @@ class Reader(threading.Thread):
     """
 
     def __init__(
-        self, sensor: str, sonar: Sonar, *, pace: Pace | None, patience_s: float, events: "queue.Queue[Event]"
+        self,
+        sensor: str,
+        sonar: SonarDriver,
+        *,
+        pace: TriggerClock | None,
+        patience_s: float,
+        events: "queue.Queue[Event]",
     ) -> None:
         super().__init__(name=f"reader of {sensor}", daemon=True)
         self._sensor, self._sonar, self._pace = sensor, sonar, pace
@@ -159,7 +175,7 @@ class Reader(threading.Thread):
                 self._command(self._pace)
         except Exception as failure:  # noqa: BLE001  whatever it was, whoever waits for this thread must hear of it
             error = failure
-        self._put(Ended(self._sensor, error))
+        self._put(SensorEnded(self._sensor, error))
 
     def _listen(self) -> None:
         while not self._stop_asked.is_set():
@@ -178,7 +194,7 @@ class Reader(threading.Thread):
                             waited_s=waited_s,
                         )
                     )
-            except SonarGoneError as error:
+            except SonarDisconnectedError as error:
                 self._put(Note(self._sensor, str(error)))
                 self._come_back()
             else:
@@ -188,7 +204,7 @@ class Reader(threading.Thread):
         """Whether to stop listening: not within a measurement, of which the rest comes or whose deadline passes."""
         return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
-    def _command(self, pace: Pace) -> None:
+    def _command(self, pace: TriggerClock) -> None:
         tick = taken = 0
         latest_s = time.monotonic()
         while pace.n is None or taken < pace.n:
@@ -197,12 +213,12 @@ class Reader(threading.Thread):
                 return
             try:
                 block = self._sonar.measure()
-            except SonarGoneError as error:
-                self._put(Failed(self._sensor, self._count, tick, "the sensor was unplugged", str(error)))
+            except SonarDisconnectedError as error:
+                self._put(MeasurementFailed(self._sensor, self._count, tick, "the sensor was unplugged", str(error)))
                 self._come_back()
                 latest_s = time.monotonic()
             except SonarError as error:
-                self._put(Failed(self._sensor, self._count, tick, "it did not arrive in time", str(error)))
+                self._put(MeasurementFailed(self._sensor, self._count, tick, "it did not arrive in time", str(error)))
                 if time.monotonic() - latest_s > self._patience_s:
                     raise
             else:

@@ -11,15 +11,25 @@ from typing import Protocol
 
 from ertis_numba import checks
 from ertis_numba.capture.gap_reasons import gap_reason
-from ertis_numba.capture.readers import Arrived, Ended, Event, Failed, Note, Pace, Reader, Restarted, Returned
+from ertis_numba.capture.readers import (
+    Arrived,
+    Event,
+    MeasurementFailed,
+    Note,
+    Restarted,
+    Returned,
+    SensorEnded,
+    SensorReader,
+    TriggerClock,
+)
 from ertis_numba.capture.sync_counts import SyncCounts
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
 from ertis_numba.settings import Settings
 
-__all__ = ["Counts", "Session", "Sink"]
+__all__ = ["CaptureCounts", "Session", "Sink"]
 
 _WAITING_BYTES = 40_000_000  # of blocks that wait for the disk; then sensors wait
 _RECENT_S = 3.0  # over which the rate is told
@@ -44,12 +54,12 @@ class Sink(Protocol):
     def append(self, entries: Sequence[Entry]) -> Sequence[Entry] | None:
         """Store measurements; when this returns they are durable: all of them, or those that it returns."""
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Store which of a sensor's numbers are missing, and why."""
 
 
 @dataclass(slots=True)
-class Counts:
+class CaptureCounts:
     """What became of one sensor's measurements so far.
 
     Attributes
@@ -117,7 +127,7 @@ class Session:
         How long a sensor may be silent or unplugged before it is given up.
     mounting : dict of str to (translation_m, rotation_xyzw), optional
         Where sensors are, as in `ertis_numba.journal.Journal.add_sensor`; at the origin by default.
-    epoch : int, optional
+    session_id : int, optional
         Number of this run, without which the sequence of another could not be told from this one's; drawn by default.
     on_stored : callable, optional
         Called with the entries of each commit, when they are durable.
@@ -137,7 +147,7 @@ class Session:
 
     def __init__(  # noqa: PLR0913  how to measure, when to end, and whom to tell
         self,
-        sonars: Mapping[str, Sonar],
+        sonars: Mapping[str, SonarDriver],
         settings: Settings,
         *,
         trigger: str,
@@ -146,7 +156,7 @@ class Session:
         duration_s: float | None = None,
         patience_s: float = 30.0,
         mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
-        epoch: int | None = None,
+        session_id: int | None = None,
         on_stored: Callable[[list[Entry]], None] = lambda _: None,
         on_note: Callable[[str, str], None] = lambda _sensor, _text: None,
         on_back: Callable[[str, float], None] = lambda _sensor, _away_s: None,
@@ -158,11 +168,13 @@ class Session:
         self._sonars, self._settings, self._mounting = dict(sonars), settings, dict(mounting or {})
         self._synced = trigger == "sync"
         self._rate_hz = checks.between("rate", rate_hz, 1e-3, 1e3)
-        self._n = None if n is None else checks.whole("n", n, 1)
+        self._n = None if n is None else checks.integer("n", n, 1)
         self._duration_s = None if duration_s is None else checks.positive("duration", duration_s)
         self._patience_s = checks.positive("patience", patience_s)
         self._on_stored, self._on_note, self._on_back, self._on_tick = on_stored, on_note, on_back, on_tick
-        self._epoch = secrets.randbits(62) if epoch is None else checks.whole("epoch", epoch, 0, 2**63 - 1)
+        self._session_id = (
+            secrets.randbits(62) if session_id is None else checks.integer("session_id", session_id, 0, 2**63 - 1)
+        )
         self._record_ns = round(1e9 * settings.recording.duration_s)
         self._stop = threading.Event()
         self._errors: dict[str, Exception] = {}
@@ -172,7 +184,7 @@ class Session:
         self._groups: dict[int, int] = {}
         self._closed = -(2**63)  # the latest group that is not open any more
         self._ended: set[str] = set()
-        self.counts = {sensor: Counts() for sensor in sonars}
+        self.counts = {sensor: CaptureCounts() for sensor in sonars}
         self.complete = self.incomplete = 0
 
     def stop(self) -> None:
@@ -191,7 +203,7 @@ class Session:
         """
         n_bytes = 4 * self._settings.recording.n_samples
         events: queue.Queue[Event] = queue.Queue(max(2, _WAITING_BYTES // n_bytes))
-        readers: list[Reader] = []
+        readers: list[SensorReader] = []
         try:
             self._begin(sink, readers, events)
             self._take(sink, readers, events)
@@ -210,7 +222,7 @@ class Session:
         if self._errors:
             raise SonarError("; ".join(f"{sensor}: {error}" for sensor, error in self._errors.items()))
 
-    def _begin(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
+    def _begin(self, sink: Sink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
         for sensor, sonar in self._sonars.items():
             translation_m, rotation_xyzw = self._mounting.get(sensor, (None, None))
             sink.add_sensor(
@@ -224,13 +236,13 @@ class Session:
             for sonar in self._sonars.values():
                 if not sonar.passive:
                     sonar.arm()
-        pace = None if self._synced else Pace(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
+        pace = None if self._synced else TriggerClock(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
         for sensor, sonar in self._sonars.items():
-            readers.append(Reader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events))
+            readers.append(SensorReader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events))
         for reader in readers:
             reader.start()
 
-    def _take(self, sink: Sink, readers: list[Reader], events: "queue.Queue[Event]") -> None:
+    def _take(self, sink: Sink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         while len(self._ended) < len(readers):
             if self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s):
@@ -257,7 +269,7 @@ class Session:
                 case Arrived(tick=int(tick)):
                     self._note_tick(event.sensor, tick)
                     ready.append((event, tick))
-                case Failed():
+                case MeasurementFailed():
                     self._note_tick(event.sensor, event.tick)
                     self._store(sink, ready)
                     ready = []
@@ -272,7 +284,7 @@ class Session:
                     self.counts[sensor].unplugged += 1
                     ready += self._begin_anew(sensor, "the sensor was unplugged")
                     self._on_back(sensor, away_s)
-                case Ended(sensor, error):
+                case SensorEnded(sensor, error):
                     self._ended.add(sensor)
                     if error is not None:
                         self._errors[sensor] = error
@@ -336,11 +348,11 @@ class Session:
             sensor=event.sensor,
             sequence=sequence,
             sync_count=number,
-            epoch=self._epoch,
+            session_id=self._session_id,
             timestamp_ns=block.arrived.realtime_ns - self._record_ns,  # a block follows when all of it is recorded
             timestamp_uncertainty_ns=min(block.arrived.uncertainty_ns, 2**32 - 1),
         )
-        measurement = Measurement(block.words, self._settings, stamp)
+        measurement = Measurement(block.data, self._settings, stamp)
         return Entry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
 
     def _miss_until(self, sink: Sink, sensor: str, stop: int, why: str) -> None:
@@ -349,7 +361,7 @@ class Session:
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
             self._append(sink)  # what was measured before the gap comes before it
-            sink.note_gap(sensor, first, stop - 1, why, epoch=self._epoch)
+            sink.note_gap(sensor, first, stop - 1, why, session_id=self._session_id)
             self.counts[sensor].missing[why] += stop - first
             track.sequence = stop - 1
 

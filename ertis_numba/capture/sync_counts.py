@@ -25,7 +25,7 @@ class _Held(Generic[Item]):
 
 
 @dataclass(slots=True)
-class _Sensor(Generic[Item]):
+class _SensorPulses(Generic[Item]):
     offset: int | None = None  # from the sensor's own counter to the pulse's number
     held: list[_Held[Item]] = field(default_factory=list)
 
@@ -53,7 +53,7 @@ class SyncCounts(Generic[Item]):
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
-        self._sensors: dict[str, _Sensor[Item]] = {name: _Sensor() for name in sensors}
+        self._sensors: dict[str, _SensorPulses[Item]] = {name: _SensorPulses() for name in sensors}
         self._first = sensors[0]
         self._shortest_ns = round(shortest_s * 1e9)
         self._pulses: dict[int, int] = {}  # number: time of its first block
@@ -98,7 +98,7 @@ class SyncCounts(Generic[Item]):
                 found += self._released(state)
         return found
 
-    def _released(self, state: _Sensor[Item]) -> list[tuple[Item, int]]:
+    def _released(self, state: _SensorPulses[Item]) -> list[tuple[Item, int]]:
         found = []
         for each in state.held:
             number = each.counter + (state.offset or 0)
@@ -112,7 +112,7 @@ class SyncCounts(Generic[Item]):
         """Time between pulses, the shortest possible while it is not known."""
         return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
-    def _decided(self, name: str, state: _Sensor[Item], now_ns: int, *, at_once: bool) -> bool:
+    def _decided(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
         """Decide about the offset of a sensor that holds blocks; return whether it is known now."""
         waited = at_once or now_ns - state.held[0].arrived_ns > _HELD_S * 1e9
         if not self._pulses:

@@ -68,7 +68,7 @@ class BitCheck:
         *,
         splices: bool = False,
     ) -> None:
-        self._n_samples = checks.whole("n_samples", n_samples, _EQUAL_WORDS)
+        self._n_samples = checks.integer("n_samples", n_samples, _EQUAL_WORDS)
         checks.positive("pdm_rate_hz", pdm_rate_hz)
         self._enabled = np.ones(CHANNELS, dtype=bool) if enabled is None else np.asarray(enabled, dtype=bool)
         checks.shape("enabled", self._enabled.shape, (CHANNELS,))
@@ -79,7 +79,7 @@ class BitCheck:
             Filter(n_samples, np.ones(MEAN_OF, dtype=np.int16), 1 / MEAN_OF, MEAN_OF) for _ in range(2)
         )
         self._squares = np.empty_like(self._mean(self._words))
-        self._is_fast = Splices.can_tell(pdm_rate_hz)
+        self._is_fast = Splices.can_distinguish(pdm_rate_hz)
         self._splices = Splices(n_samples, pdm_rate_hz) if splices and self._is_fast else None
 
     def check(self, words: NDArray[np.uint32]) -> str | None:

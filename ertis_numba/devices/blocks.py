@@ -64,7 +64,7 @@ class Block:
     """
 
     counter: int
-    words: NDArray[np.uint32]
+    data: NDArray[np.uint32]
     arrived: Instant
 
 
@@ -81,7 +81,7 @@ def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:
     ArgumentError
         The counter does not fit into 32 bits, or the words are no uint32.
     """
-    counter = checks.whole("counter", counter, 0, COUNTERS - 1)
+    counter = checks.integer("counter", counter, 0, COUNTERS - 1)
     if words.dtype.kind != "u" or words.dtype.itemsize != 4 or words.ndim != 1:
         raise ArgumentError(f"words are {words.dtype} of shape {words.shape}; give (sample,) uint32")
     payload = words.astype("<u4", copy=False).tobytes()

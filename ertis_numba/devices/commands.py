@@ -17,8 +17,8 @@ __all__ = [
     "DAC_RATES_HZ",
     "DAC_SAMPLES",
     "LENGTH_STEP",
-    "MOST_NUMBER",
-    "MOST_WORDS",
+    "MAX_NUMBER",
+    "MAX_WORDS",
     "PDM_RATES_HZ",
     "PINS",
     "Command",
@@ -33,7 +33,7 @@ CODES: Final = "YGFDECLIHJKBA"
 LENGTH_STEP: Final = 32_768
 """Measurements are so many words long, or a multiple."""
 
-MOST_WORDS: Final = 16_777_216
+MAX_WORDS: Final = 16_777_216
 """Of one measurement."""
 
 PDM_RATES_HZ: Final = (ERTIS_PDM_RATE_HZ, 1_125_000.0)
@@ -51,7 +51,7 @@ DAC_CODE_MAX: Final = 4_095
 PINS: Final = (1, 2)
 """SYNC inputs."""
 
-MOST_NUMBER: Final = 2**32 - 1
+MAX_NUMBER: Final = 2**32 - 1
 """Of the numbers of commands and answers."""
 
 _LINE: Final = re.compile(rb"!([A-Z]),(\d{1,10}),(\d{1,10}),(\d{1,10})\n?")
@@ -82,7 +82,7 @@ class Command:
     def __post_init__(self) -> None:
         checks.choice("command", self.code, CODES)
         for name in ("first", "second", "third"):
-            checks.whole(f"{name} number of command {self.code}", getattr(self, name), 0, MOST_NUMBER)
+            checks.integer(f"{name} number of command {self.code}", getattr(self, name), 0, MAX_NUMBER)
 
     def encode(self) -> bytes:
         """Return the line with its end."""
@@ -99,10 +99,10 @@ class Command:
         """
         match = _LINE.fullmatch(line)
         numbers = [int(group) for group in match.groups()[1:]] if match else []
-        if match is None or match[1].decode() not in CODES or max(numbers) > MOST_NUMBER:
+        if match is None or match[1].decode() not in CODES or max(numbers) > MAX_NUMBER:
             raise DataError(
                 f"{line[:40]!r} is no command; a command is '!X,i,j,k' with X one of {CODES} and whole numbers "
-                f"from 0 to {MOST_NUMBER}"
+                f"from 0 to {MAX_NUMBER}"
             )
         return cls(match[1].decode(), *numbers)
 
@@ -144,7 +144,7 @@ def encode_answer(value: int) -> bytes:
     ArgumentError
         The number does not fit into 32 bits.
     """
-    return checks.whole("answer", value, 0, MOST_NUMBER).to_bytes(4, "little")
+    return checks.integer("answer", value, 0, MAX_NUMBER).to_bytes(4, "little")
 
 
 def decode_answer(data: bytes) -> int:

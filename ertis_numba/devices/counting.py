@@ -13,7 +13,7 @@ __all__ = ["BURST", "CounterCheck"]
 BURST: Final = 0.75
 """Of the shortest interval: what comes later than this after a block's first byte is of another trigger."""
 
-_MOST_HELD = 3  # blocks that contradict each other; memory is what they cost
+_MAX_HELD = 3  # blocks that contradict each other; memory is what they cost
 _AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
 _UNHEARD = 4  # triggers in a row of which nothing may have come, where no later block tells
 _INTERVALS = 8  # remembered; of these …
@@ -141,7 +141,7 @@ class CounterCheck:
             self._settle(held[-2:], entry)
             self._accept(entry)
         else:
-            is_full = len(held) == _MOST_HELD
+            is_full = len(held) == _MAX_HELD
             if is_full:
                 self._intervals_ns.clear()  # it may be the clock that is wrong: triggers have become others
             if any(self._is_between(last, each, entry) for each in held):

@@ -15,7 +15,7 @@ __all__ = ["Dialogue"]
 _ANSWER_BYTES = 4
 _GROUP = 16  # commands sent at once: their 250 bytes fit the smallest of buffers
 _QUIET_S = 0.1  # without a byte: then a sensor has measured and sent what it had begun
-_MOST_BYTES = 2**30
+_MAX_BYTES = 2**30
 
 _log = logging.getLogger("ertis_numba")
 
@@ -59,9 +59,9 @@ class Dialogue(SerialLine):
             There is no end to it.
         """
         count = 0
-        began = last = told = time.monotonic()
+        began = last = reported = time.monotonic()
         while True:
-            data, arrived = self.receive(_MOST_BYTES)
+            data, arrived = self.receive(_MAX_BYTES)
             now = arrived.monotonic_ns / 1e9
             if data:
                 count, last = count + len(data), now
@@ -70,9 +70,9 @@ class Dialogue(SerialLine):
                 return count
             if now - began > within_s:
                 raise sonar_error(f"{self.path} keeps sending whatever it is told; is it an eRTIS?", errno.ETIMEDOUT)
-            if repeat is not None and now - told > 2 * _QUIET_S:
+            if repeat is not None and now - reported > 2 * _QUIET_S:
                 self.send(repeat.encode())
-                told = now
+                reported = now
 
     def quieten(self, command: Command, *, within_s: float) -> None:
         """Send the command that ends a stream, and drop what still comes, its answer among that."""
@@ -147,7 +147,7 @@ class Dialogue(SerialLine):
             if n_answers < len(group):
                 raise self._no_answer(group[n_answers], data[len(data) - rest :])
 
-    def tell(self, setup: Setup, *, counter: int) -> None:
+    def notify(self, setup: Setup, *, counter: int) -> None:
         """Send the setup, the call only if the sensor holds another one, and the number of the next measurement.
 
         Raises

@@ -12,7 +12,7 @@ from contextlib import suppress
 import serial
 
 from ertis_numba.devices.blocks import Instant
-from ertis_numba.errors import SonarError, SonarGoneError
+from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 try:
     import termios
@@ -182,8 +182,8 @@ class SerialLine:
         if self.stop() or not self._port.is_open:
             raise closed_error(self.path)
 
-    def _gone(self) -> SonarGoneError:
-        return SonarGoneError(f"{self.path} was unplugged; plug it in again")
+    def _gone(self) -> SonarDisconnectedError:
+        return SonarDisconnectedError(f"{self.path} was unplugged; plug it in again")
 
 
 def sonar_error(text: str, code: int) -> SonarError:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from ertis_numba.devices.blocks import COUNTERS, FOOTER, FRAME_BYTES, HEADER, Block, Instant
 from ertis_numba.devices.counting import BURST, CounterCheck
 
-__all__ = ["Block", "BlockParser", "Instant", "Receiver"]
+__all__ = ["Block", "BlockParser", "BlockReceiver", "Instant"]
 
 _HEADER: Final = HEADER.to_bytes(4, "little")
 _FOOTER: Final = FOOTER.to_bytes(4, "little")
-_MOST_SKIPPED = 256  # numbers by which a block that cut another one short is ahead of it
+_MAX_SKIPPED = 256  # numbers by which a block that cut another one short is ahead of it
 
 
 class BlockParser:
@@ -73,7 +73,7 @@ class BlockParser:
     def expire(self) -> None:
         """Give up the block that has begun, since its deadline has passed; what came after may have begun another."""
         if len(self._data) >= len(_HEADER):
-            self._give_up("cut short")
+            self._abandon("cut short")
         else:
             self._drop(len(self._data), self._reason)
 
@@ -93,7 +93,7 @@ class BlockParser:
             reason = self._fault()
             if reason is None:
                 return self._accept()
-            self._give_up(reason)
+            self._abandon(reason)
 
     def _fault(self) -> str | None:
         """Return why what lies there is no block, None if it is one."""
@@ -104,7 +104,7 @@ class BlockParser:
             return None
         place = self._data.find(_HEADER, len(_HEADER), footer)
         while place >= 0:
-            if self._is_apart(place) and (self._counter(place) - self._counter(0)) % COUNTERS <= _MOST_SKIPPED:
+            if self._is_apart(place) and (self._counter(place) - self._counter(0)) % COUNTERS <= _MAX_SKIPPED:
                 return "cut short"
             place = self._data.find(_HEADER, place + 1, footer)
         return None
@@ -127,7 +127,7 @@ class BlockParser:
         self._drop(self.n_bytes)
         return block
 
-    def _give_up(self, reason: str) -> None:
+    def _abandon(self, reason: str) -> None:
         """Reject the block that has begun and search behind its header."""
         self.rejected_blocks[reason] += 1
         self._reason = reason
@@ -152,7 +152,7 @@ class BlockParser:
             self._pieces.popleft()
 
 
-class Receiver:
+class BlockReceiver:
     """What can be trusted of a stream: framing, then the counter, then the bits.
 
     A block whose number does not follow for certain is held until others decide (see `CounterCheck`), so that `feed`
@@ -264,7 +264,7 @@ class Receiver:
         """Return those that are good in every respect, and count the others."""
         good = []
         for block, follows in decided:
-            reason = (self._bits(block.words) if self._bits else None) if follows else "counter"
+            reason = (self._bits(block.data) if self._bits else None) if follows else "counter"
             if reason is None:
                 good.append(block)
             else:

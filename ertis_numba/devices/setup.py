@@ -13,8 +13,8 @@ from ertis_numba.devices.commands import (
     DAC_RATES_HZ,
     DAC_SAMPLES,
     LENGTH_STEP,
-    MOST_NUMBER,
-    MOST_WORDS,
+    MAX_NUMBER,
+    MAX_WORDS,
     PDM_RATES_HZ,
     PINS,
     Command,
@@ -84,8 +84,8 @@ class Setup:
             )
         object.__setattr__(self, "dac_rate_hz", _dac_rate_hz(self.dac_rate_hz))
         _check_codes(self.codes, self.dac_rate_hz)
-        checks.whole("emissions", self.emissions, 1, MOST_NUMBER)
-        checks.whole("pin", self.pin, *PINS)
+        checks.integer("emissions", self.emissions, 1, MAX_NUMBER)
+        checks.integer("pin", self.pin, *PINS)
         if self.active and not self.amplifier:
             raise ArgumentError(
                 "active is True with the amplifier off, which emits nothing; switch it on, or give active=False"
@@ -143,12 +143,12 @@ class Setup:
 
 
 def _check_length(n_samples: int) -> None:
-    checks.whole("recording.n_samples", n_samples, 1)
-    if n_samples % LENGTH_STEP or n_samples > MOST_WORDS:
-        near = min(max(round(n_samples / LENGTH_STEP), 1) * LENGTH_STEP, MOST_WORDS)
+    checks.integer("recording.n_samples", n_samples, 1)
+    if n_samples % LENGTH_STEP or n_samples > MAX_WORDS:
+        near = min(max(round(n_samples / LENGTH_STEP), 1) * LENGTH_STEP, MAX_WORDS)
         raise ArgumentError(
             f"recording.n_samples is {n_samples}; a sensor measures multiples of {LENGTH_STEP} up to "
-            f"{MOST_WORDS}: give {near}"
+            f"{MAX_WORDS}: give {near}"
         )
 
 
@@ -175,11 +175,11 @@ def _dac_rate_hz(rate_hz: float) -> int:
 def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
     if codes.dtype != np.uint16 or codes.ndim != 1:
         raise ArgumentError(f"codes are {codes.dtype} of shape {codes.shape}; give (sample,) uint16")
-    fewest, most = DAC_SAMPLES
-    if not fewest <= len(codes) <= most:
+    fewest, largest = DAC_SAMPLES
+    if not fewest <= len(codes) <= largest:
         raise ArgumentError(
-            f"call has {len(codes)} samples; a sensor plays {fewest} to {most}: give a call.duration_s from "
-            f"{(fewest - 1) / rate_hz:.3g} to {(most - 1) / rate_hz:.3g}"
+            f"call has {len(codes)} samples; a sensor plays {fewest} to {largest}: give a call.duration_s from "
+            f"{(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
         )
     if codes.max() > DAC_CODE_MAX:
         raise ArgumentError(f"codes reach {codes.max()}; a sensor's converter takes 0 to {DAC_CODE_MAX}")

@@ -16,11 +16,11 @@ from ertis_numba.devices.commands import Command, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
-from ertis_numba.devices.protocol import Block, Receiver
+from ertis_numba.devices.protocol import Block, BlockReceiver
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, SonarError, SonarGoneError
+from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 
-__all__ = ["Sonar"]
+__all__ = ["SonarDriver"]
 
 _TRANSFER_BYTES_PER_S = 5e6  # at least
 _MARGIN_S = 0.5
@@ -29,8 +29,8 @@ _RETRY_S = 0.05
 _log = logging.getLogger("ertis_numba")
 
 
-class Sonar:
-    """A sensor; make it by `Sonar.open`, and use it in a ``with`` statement or `close` it.
+class SonarDriver:
+    """A sensor; make it by `SonarDriver.open`, and use it in a ``with`` statement or `close` it.
 
     Only `close` may be called from another thread than the rest.
 
@@ -49,7 +49,7 @@ class Sonar:
         self._timeout_s = timeout_s
         self._passive = passive
         self._closing = threading.Event()
-        self._configured: tuple[Setup, Receiver] | None = None
+        self._configured: tuple[Setup, BlockReceiver] | None = None
         self._next = 0  # number of the measurement that comes next
         self._is_armed = False
         self._is_late = False  # a measurement was given up and may still come
@@ -107,7 +107,7 @@ class Sonar:
         return self._passive
 
     @property
-    def receiver(self) -> Receiver:
+    def receiver(self) -> BlockReceiver:
         """What was received, lost and rejected since `configure`."""
         return self._state()[1]
 
@@ -156,7 +156,7 @@ class Sonar:
         SonarError
             The sensor does not answer, holds another call than it was sent, or ``stop`` returned True.
         """
-        receiver = Receiver(
+        receiver = BlockReceiver(
             setup.n_samples,
             expected=None if self._passive else counter,
             shortest_s=setup.n_samples / setup.pdm_rate_hz,
@@ -168,7 +168,7 @@ class Sonar:
             return
         self._line.stop = lambda: self._closing.is_set() or stop()
         try:
-            self._line.tell(setup, counter=counter)
+            self._line.notify(setup, counter=counter)
         finally:
             self._line.stop = self._closing.is_set
 
@@ -276,7 +276,7 @@ class Sonar:
                     latest_ns, read = time.monotonic_ns(), 0
                 elif now_ns - latest_ns > 1e9 * timeout_s:
                     raise self._nothing_whole(read, setup, timeout_s)
-        except SonarGoneError:
+        except SonarDisconnectedError:
             yield from map(self._counted, receiver.finish())
             raise
         except SonarError:
@@ -308,16 +308,16 @@ class Sonar:
         began = time.monotonic()
         last: SonarError | None = None
 
-        def given_up() -> bool:
+        def abandoned() -> bool:
             return self._closing.is_set() or stop()
 
         self._hang_up()
-        while not given_up():
+        while not abandoned():
             if time.monotonic() - began > within_s:
-                raise SonarGoneError(f"{self.port} did not come back within {within_s:g} s: {last}")
+                raise SonarDisconnectedError(f"{self.port} did not come back within {within_s:g} s: {last}")
             try:
                 port = find_again(self._port)
-                self._line, self._port = self._opened(port, given_up), port
+                self._line, self._port = self._opened(port, abandoned), port
                 self._go_on()
             except SonarError as error:
                 last = error
@@ -329,7 +329,7 @@ class Sonar:
                 break
         if self._closing.is_set():
             self._hang_up()  # what close() has not seen
-        return not given_up()
+        return not abandoned()
 
     def close(self) -> None:
         """Switch the trigger off if it is on, and close the port; a `listen` in another thread ends."""
@@ -362,7 +362,7 @@ class Sonar:
         setup, receiver = self._configured
         receiver.expire()
         if not self._passive:
-            self._line.tell(setup, counter=self._next)
+            self._line.notify(setup, counter=self._next)
             self._is_late = False
         if self._is_armed:
             self.arm()
@@ -377,7 +377,7 @@ class Sonar:
         if not (self._is_armed or self._passive):
             raise SonarError(f"{self.port} is not armed; call arm() first")
 
-    def _state(self) -> tuple[Setup, Receiver]:
+    def _state(self) -> tuple[Setup, BlockReceiver]:
         if self._configured is None:
             raise SonarError(f"{self.port} is not configured; call configure() first")
         return self._configured

@@ -27,7 +27,7 @@ Floats = NDArray[np.floating[Any]]
 MEAN_OF = 31
 """Samples over which means of bits are taken."""
 
-_LEAST_RATE_HZ = 4e6  # at the slower clock modulators are quiet below 40 kHz only, where sound is
+_MIN_RATE_HZ = 4e6  # at the slower clock modulators are quiet below 40 kHz only, where sound is
 _BAND_HZ, _TAPS = (90e3, 130e3), 207  # above all calls, below the noise that modulators push upwards
 _HIGH_BAND_HZ, _HIGH_TAPS = (125e3, 180e3), 151
 _KAISER = 4.0
@@ -36,21 +36,21 @@ _EVERY = 16  # samples of the band of which the noise is a median
 _SPAN = 4  # samples of the band, in which all of an impulse lies
 _LEVEL_SPAN = 32  # the same, over which the level is a median
 _APART = 6  # the same, between stretches that are looked at one by one
-_MOST = 8  # stretches, those that stand out most first
+_MAX = 8  # stretches, those that stand out most first
 _RISE = 2.0  # of the power over the level, to be looked at; that of noise reaches 1.6
 _FINE_STEP, _REACH = 5, 40  # samples of the words: of the band about an impulse, and how far off its sample may be
-_LANES, _LEAST_LANES, _LEAST_CHANNELS = 4, 3, 4  # bytes of a word, how many of them, and channels in each
+_LANES, _MIN_LANES, _MIN_CHANNELS = 4, 3, 4  # bytes of a word, how many of them, and channels in each
 
 # What makes an impulse a splice, and where 98 % of those of the real measurement lie. Of 28,000 impulses in clicks as
 # microphones hear them, below 100 kHz, none was taken for one; a hundred would have been but for one of these bounds.
 _NOISE = (0.03, 0.35)  # of a size: lower, and there is no microphone; higher, and there is no telling. 0.09
-_LEAST_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # 0.75 to 1.7; a few bytes too many make 4
+_MIN_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # 0.75 to 1.7; a few bytes too many make 4
 _LANE_POWER, _LANE_OVER_NOISE = 0.2, 5.0  # mean square in the third of the lanes: 0.4 to 1.7; in altered words 0.04
 _ALONE = (0.85, 1.25)  # share of the power about it that it explains: 0.99 to 1.03
-_LEAST_AT_ONCE = 0.62  # share of its power that is in phase: 0.88 to 0.99; in sounds from aside 0.5 to 0.6
-_MOST_ALIKE = 0.4  # share of its power that is the same in all channels: 0 to 0.16; in sounds from ahead 1
+_MIN_AT_ONCE = 0.62  # share of its power that is in phase: 0.88 to 0.99; in sounds from aside 0.5 to 0.6
+_MAX_ALIKE = 0.4  # share of its power that is the same in all channels: 0 to 0.16; in sounds from ahead 1
 _SPECTRUM = (0.8, 1.35)  # its size in the higher band by that in the lower: 0.97 to 1.12; in sounds 0.2 to 0.7
-_MOST_OVER_LEVEL = 8.0  # of the level there, over that of the whole block
+_MAX_OVER_LEVEL = 8.0  # of the level there, over that of the whole block
 _LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # full scale 1, in most channels: overload breaks the shaping of noise, too
 
 
@@ -105,7 +105,7 @@ class Splices:
         self._bank = _by_lag(band.real, at - bits[:, None]).astype(np.float32)
         shapes = [_by_lag(part, at[:, None] - places) for part in (band.real, band.imag)]
         self._fits = [(shape / np.sum(shape**2, axis=0)).astype(np.float32) for shape in shapes]
-        self._energy = float(np.mean(np.sum(shapes[0] ** 2, axis=0)))
+        self._amplitude = float(np.mean(np.sum(shapes[0] ** 2, axis=0)))
         self._high = _analytic(_HIGH_BAND_HZ, pdm_rate_hz, _HIGH_TAPS).real.astype(np.float32)
         # Variance of a size that is fitted to noise of which the band's samples have a variance of 1.
         alike = np.correlate(band.real, band.real, "full") / np.sum(band.real**2)
@@ -113,9 +113,9 @@ class Splices:
         self._noise_gain = float(fit @ _by_lag(alike, at[:, None] - at) @ fit)
 
     @staticmethod
-    def can_tell(pdm_rate_hz: float) -> bool:
+    def can_distinguish(pdm_rate_hz: float) -> bool:
         """Return whether there is such a band at this clock."""
-        return pdm_rate_hz >= _LEAST_RATE_HZ
+        return pdm_rate_hz >= _MIN_RATE_HZ
 
     def found(self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_]) -> bool:
         """Return whether there is a splice.
@@ -135,21 +135,21 @@ class Splices:
         noise = np.partition(some, some.shape[1] // 2, axis=1)[:, some.shape[1] // 2] / 0.6745  # if it is Gaussian
         moving = moving & (noise > 0)
         counts = moving.reshape(_LANES, -1).sum(axis=1)
-        lanes = np.flatnonzero(counts >= _LEAST_CHANNELS)
-        if len(lanes) < _LEAST_LANES:
+        lanes = np.flatnonzero(counts >= _MIN_CHANNELS)
+        if len(lanes) < _MIN_LANES:
             return False
         band *= np.where(moving, 1 / np.where(moving, noise, 1), 0).astype(np.float32)[:, None]
         band = band.reshape(_LANES, -1, band.shape[1])[lanes]
         each = np.einsum("lmn,lmn->ln", band, band) / (_SPAN * counts[lanes, None]).astype(np.float32)
         power = sum((each[:, n : n - _SPAN] for n in range(1, _SPAN)), each[:, :-_SPAN])
         level = _level(power)
-        above = np.sum(power > _RISE * level, axis=0) >= _LEAST_LANES
+        above = np.sum(power > _RISE * level, axis=0) >= _MIN_LANES
         above[: self._edge] = above[-self._edge :] = False
         variance = float(np.mean(noise[moving] ** 2)) * self._noise_gain
         for top in _tops(np.flatnonzero(above), power, level):
             around = float(np.median(level[:, top]))
             at = round((top + (_SPAN - 1) / 2) * _STEP)
-            if around < _MOST_OVER_LEVEL and self._is_splice(words, mean, moving, at, variance * around):
+            if around < _MAX_OVER_LEVEL and self._is_splice(words, mean, moving, at, variance * around):
                 return True
         return False
 
@@ -176,18 +176,18 @@ class Splices:
 
         count, total = len(sizes), float(sizes @ sizes)
         power = total - count * variance
-        if not max(_SIZE[0], _LEAST_OVER_NOISE * math.sqrt(variance)) ** 2 < power / count < _SIZE[1] ** 2:
+        if not max(_SIZE[0], _MIN_OVER_NOISE * math.sqrt(variance)) ** 2 < power / count < _SIZE[1] ** 2:
             return False
         lanes = np.bincount(np.flatnonzero(moving) * _LANES // CHANNELS, weights=sizes**2, minlength=_LANES)
-        third = np.sort(lanes / np.maximum(moving.reshape(_LANES, -1).sum(axis=1), 1))[-_LEAST_LANES] - variance
+        third = np.sort(lanes / np.maximum(moving.reshape(_LANES, -1).sum(axis=1), 1))[-_MIN_LANES] - variance
         if third < max(_LANE_POWER, _LANE_OVER_NOISE * variance):
             return False
         both = power + max(float(others @ others) - count * variance, 0.0)
         around = float(np.sum(band**2)) - count * band.shape[1] * variance / self._noise_gain
         return (
-            _ALONE[0] * around < both * self._energy < _ALONE[1] * around
-            and power > _LEAST_AT_ONCE * both
-            and float(np.sum(sizes)) ** 2 < _MOST_ALIKE * count * total
+            _ALONE[0] * around < both * self._amplitude < _ALONE[1] * around
+            and power > _MIN_AT_ONCE * both
+            and float(np.sum(sizes)) ** 2 < _MAX_ALIKE * count * total
             and _SPECTRUM[0] * power < float(sizes @ high) < _SPECTRUM[1] * power
         )
 
@@ -228,7 +228,7 @@ def _tops(above: NDArray[np.int64], power: Floats, level: Floats) -> list[int]:
     """Return where the third of the lanes rises most in each stretch of what is above, the highest first."""
     if not len(above):
         return []
-    rise = np.sort(power[:, above] / level[:, above], axis=0)[-_LEAST_LANES]
+    rise = np.sort(power[:, above] / level[:, above], axis=0)[-_MIN_LANES]
     begins = np.concatenate([[0], np.flatnonzero(np.diff(above) > _APART) + 1, [len(above)]])
     tops = [first + int(np.argmax(rise[first:stop])) for first, stop in itertools.pairwise(begins.tolist())]
-    return [int(above[top]) for top in sorted(tops, key=lambda top: -float(rise[top]))[:_MOST]]
+    return [int(above[top]) for top in sorted(tops, key=lambda top: -float(rise[top]))[:_MAX]]

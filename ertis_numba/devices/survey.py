@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ertis_numba.devices.ports import Port
-from ertis_numba.devices.sonar import Sonar
+from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import SonarError
 
 __all__ = ["Answer", "State", "survey"]
@@ -53,7 +53,7 @@ def survey(ports: Iterable[Port], *, timeout_s: float = 0.3) -> list[Answer]:
 
     def ask(port: Port) -> Answer:
         try:
-            with Sonar(port, timeout_s=timeout_s) as sonar:
+            with SonarDriver(port, timeout_s=timeout_s) as sonar:
                 return Answer(port=port, state="ready", firmware=sonar.firmware, call_hash=sonar.call_hash())
         except SonarError as error:
             return Answer(port=port, state=_STATES.get(error.errno, "no answer"), error=error)

@@ -18,13 +18,13 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _array, _curve, _echoes, _front, _sector, _signals, _slices, _sphere
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
-from ertis_numba.figures._style import Look, style_of
+from ertis_numba.figures._style import StyleOptions, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
 from ertis_numba.settings import Array, Settings
 
 __all__ = [
-    "Look",
     "Rated",
+    "StyleOptions",
     "array",
     "front",
     "matched_filter",
@@ -45,7 +45,7 @@ def plot(
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
     side_lobes: bool = False,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw an energyscape.
 
@@ -62,10 +62,10 @@ def plot(
         Reflectors to mark and list, as `find_peaks` returns them.
     side_lobes : bool
         Show the side lobes of an image with elevations, too. By default, what lies
-        `ertis_numba.stages.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a maximum
+        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a maximum
         over directions would otherwise show an arc at the range of each echo.
     **look
-        ``theme``, ``columns`` and ``font``: see `Look`.
+        ``theme``, ``columns`` and ``font``: see `StyleOptions`.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def polar(
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
     side_lobes: bool = False,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw an energyscape as a sector in metres, of several elevations the strongest; arguments are those of `plot`."""
     return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
@@ -103,7 +103,7 @@ def projection(
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
     side_lobes: bool = False,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
     return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
@@ -116,7 +116,7 @@ def slices(
     left_m: float | None = None,
     dynamic_range_db: float = 40.0,
     peaks: Sequence[Peak] | None = None,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw cuts through an energyscape in metres: a level plane, and an upright one that runs forward.
 
@@ -148,7 +148,7 @@ def signals(
     *,
     microphone: int | None = None,
     dynamic_range_db: float = 40.0,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw the signals of the microphones over time, and their spectrogram.
 
@@ -177,7 +177,7 @@ def matched_filter(
     *,
     microphone: int | None = None,
     dynamic_range_db: float = 40.0,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw what the matched filter leaves of each microphone, over range.
 
@@ -194,7 +194,7 @@ def array(
     azimuth_deg: float = 0.0,
     elevation_deg: float = 0.0,
     dynamic_range_db: float = 40.0,
-    **look: Unpack[Look],
+    **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw the layout of an array, and its beam pattern along azimuth and along elevation.
 
@@ -228,7 +228,7 @@ def array(
     )
 
 
-def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[Look]) -> Figure:
+def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[StyleOptions]) -> Figure:
     """Draw error and time of plans; those that no other one beats are joined by a line.
 
     Parameters
@@ -280,12 +280,12 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
         figure.savefig(target, format=kind, metadata=undated)
 
 
-def _canvas_of(image: Energyscape, dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None) -> Canvas:
+def _canvas_of(image: Energyscape, dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None) -> Canvas:
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     return _canvas(dynamic_range_db, look, peaks)
 
 
-def _canvas(dynamic_range_db: float, look: Look, peaks: Sequence[Peak] | None = None) -> Canvas:
+def _canvas(dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None = None) -> Canvas:
     checks.positive("dynamic_range_db", dynamic_range_db)
     marked = tuple(checks.items("peaks", peaks or (), Peak, "find_peaks returns"))
     return Canvas(style_of(**look), dynamic_range_db, marked, is_searched=peaks is not None)

@@ -24,9 +24,9 @@ __all__ = ["Cut", "draw", "pattern_db", "width_deg"]
 
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 5.0, 1.4, 4.0, 1.8
 _SHADES = (0.6, 0.8, 0.45, 0.95)  # places in the map of colours, of the second line on
-_MOST_LINES = 5
+_MAX_LINES = 5
 _LEGEND_LINES = 1.4  # height of its lines, by the size of their letters
-_MOST_NAMES = 64
+_MAX_NAMES = 64
 _BAND_WAVES = 17
 _STEP_DEG = 0.2
 _FINE_DEG = np.geomspace(1e-3, 4.0, 170)  # to either side, 5 % apart: lobes from 0.01° on fall off over many of them
@@ -73,10 +73,12 @@ def draw(
     ]
     page.caption(inner[0], "microphones, seen from behind", above_pt=_ROOF_EMS * em_pt)
     _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
-    told = [f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))]
+    reported = [
+        f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
+    ]
     for box, axis, at_deg, other in (
-        (inner[1], "azimuth", azimuth_deg, told[1]),
-        (inner[2], "elevation", elevation_deg, told[0]),
+        (inner[1], "azimuth", azimuth_deg, reported[1]),
+        (inner[2], "elevation", elevation_deg, reported[0]),
     ):
         sweep_deg = _sweep(at_deg)
         across_deg, up_deg = (
@@ -164,8 +166,8 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
         return [*ends, Cut(f"{band}, mean power", waves_hz)]
     if isinstance(frequencies_hz, int | float | str):
         raise ArgumentError(f"frequencies_hz is {frequencies_hz!r}; give a list, of one as [40e3]")
-    if not 1 <= len(frequencies_hz) <= _MOST_LINES:
-        raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MOST_LINES}")
+    if not 1 <= len(frequencies_hz) <= _MAX_LINES:
+        raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MAX_LINES}")
     return [
         Cut(f"{_words.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
         for frequency_hz in frequencies_hz
@@ -188,9 +190,9 @@ def _draw_layout(style: Style, axes: Axes, layout: Layout) -> None:
     axes.set_ylim(middle[1] - scale * box.height / 2, middle[1] + scale * box.height / 2)
     axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
     axes.locator_params(nbins=6)
-    size_pt = 5.0 * style.line_pt if len(seen_mm) <= _MOST_NAMES else 2.0 * style.line_pt
+    size_pt = 5.0 * style.line_pt if len(seen_mm) <= _MAX_NAMES else 2.0 * style.line_pt
     axes.plot(*seen_mm.T, "o", color=style.mark, markersize=size_pt, markeredgewidth=0)
-    if len(seen_mm) <= _MOST_NAMES:
+    if len(seen_mm) <= _MAX_NAMES:
         names = [str(channel) for channel in np.flatnonzero(on)]
         points = [(float(y), float(z)) for y, z in seen_mm]
         name_points(axes, style, points, names, ring_pt=0.7 * size_pt, colour=style.faint)

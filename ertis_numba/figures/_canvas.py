@@ -11,19 +11,19 @@ from matplotlib.image import AxesImage
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.figures._marks import name_points
-from ertis_numba.figures._page import Box, Page, lay_out
+from ertis_numba.figures._page import FigurePage, PageBox, lay_out
 from ertis_numba.figures._style import MONOSPACE, Style, text_width_pt
 from ertis_numba.figures._words import Heading, minus
 from ertis_numba.frames import Peak
-from ertis_numba.stages.levels import below_strongest_db
 
 __all__ = ["Canvas"]
 
 _RING_PT = 5.0
 _ROW = 1.6  # height of a row of the list, by the size of its letters
-_MOST_ROWS = 24  # below a picture
-_LEAST_ROWS = 12  # beside one, whatever its height
+_MAX_ROWS = 24  # below a picture
+_MIN_ROWS = 12  # beside one, whatever its height
 _LABEL_EMS = 13.0  # length of what is written along the scale
 _SHARE_ALONE = 0.8  # of its box that a scale takes which no list is under
 _LEVEL_EMS = 5.8  # what a scale that lies takes, with its ticks and its label
@@ -40,14 +40,14 @@ class Canvas:
 
     def lay_out(
         self, heading: Heading, panels: Sequence[Callable[[float], float]], *, width_pt: float
-    ) -> tuple[Page, list[Box], Box]:
+    ) -> tuple[FigurePage, list[PageBox], PageBox]:
         """Return a page with boxes for pictures, and the box of their scale and of the list of reflectors.
 
         However low the pictures are, the scale and some reflectors find room.
         """
         style, rows = self.style, self._rows()
         list_pt = _ROW * style.list_pt
-        lying_pt = (_LEVEL_EMS + 0.5) * style.em_pt + list_pt * min(len(rows), _LEAST_ROWS)
+        lying_pt = (_LEVEL_EMS + 0.5) * style.em_pt + list_pt * min(len(rows), _MIN_ROWS)
         widest_pt = max((text_width_pt(row, style.list_pt, MONOSPACE) for row in rows), default=0.0)
         return lay_out(
             style,
@@ -56,12 +56,12 @@ class Canvas:
             width_pt=width_pt,
             side_pt=max(widest_pt + 3 * style.em_pt, 7 * style.em_pt),
             side_tall_pt=lying_pt if rows else _LABEL_EMS / _SHARE_ALONE * style.em_pt + 1.0,
-            below_pt=6 * style.em_pt + list_pt * min(len(rows), _MOST_ROWS),
+            below_pt=6 * style.em_pt + list_pt * min(len(rows), _MAX_ROWS),
         )
 
-    def level_db(self, energy: NDArray[np.float32]) -> NDArray[np.float32]:
+    def level_db(self, amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the level below the strongest, cut at the dynamic range."""
-        return below_strongest_db(energy, self.dynamic_range_db)
+        return below_strongest_db(amplitude, self.dynamic_range_db)
 
     def show(
         self, axes: Axes, level_db: NDArray[np.floating], *, extent: tuple[float, float, float, float]
@@ -111,16 +111,16 @@ class Canvas:
             bold=True,
         )
 
-    def side(self, page: Page, box: Box, shown: AxesImage, *, label: str = "dB re strongest") -> Figure:
+    def side(self, page: FigurePage, box: PageBox, shown: AxesImage, *, label: str = "dB re strongest") -> Figure:
         """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
         style, em_pt = self.style, self.style.em_pt
         height_pt = min(16 * em_pt, (0.45 if self._rows() else _SHARE_ALONE) * box.height)
         upright = height_pt >= _LABEL_EMS * em_pt and box.width < 30 * em_pt
         if upright:
-            bar = Box(box.left + em_pt, box.bottom + box.height - height_pt - 2 * em_pt, 1.3 * em_pt, height_pt)
+            bar = PageBox(box.left + em_pt, box.bottom + box.height - height_pt - 2 * em_pt, 1.3 * em_pt, height_pt)
             axes = page.axes(bar, y=label)
         else:
-            bar = Box(box.left + 0.1 * box.width, box.bottom + box.height - 2.2 * em_pt, 0.8 * box.width, em_pt)
+            bar = PageBox(box.left + 0.1 * box.width, box.bottom + box.height - 2.2 * em_pt, 0.8 * box.width, em_pt)
             axes = page.axes(bar, x=label)
         names = axes.get_xlabel(), axes.get_ylabel()
         page.figure.colorbar(shown, cax=axes, orientation="vertical" if upright else "horizontal")

@@ -28,7 +28,7 @@ def draw(canvas: Canvas, image: Energyscape) -> Figure:
         left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
     )
     axes = page.axes(inner, x="range (m)", y="dB re strongest")
-    axes.plot(image.range_m, canvas.level_db(image.energy)[0], color=style.mark, linewidth=style.line_pt)
+    axes.plot(image.range_m, canvas.level_db(image.amplitude)[0], color=style.mark, linewidth=style.line_pt)
     axes.margins(x=0.01)
     axes.set_ylim(-canvas.dynamic_range_db, 3.0)
     canvas.grid(axes)

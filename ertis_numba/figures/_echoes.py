@@ -7,8 +7,8 @@ from matplotlib.image import AxesImage
 
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._hearing import Heard, echoes
-from ertis_numba.figures._page import Box, lay_out
+from ertis_numba.figures._hearing import MicrophoneTraces, echoes
+from ertis_numba.figures._page import PageBox, lay_out
 from ertis_numba.figures._sampling import join_ranges
 from ertis_numba.figures._signals import chosen, row_ticks
 from ertis_numba.frames import Measurement
@@ -18,7 +18,7 @@ __all__ = ["draw"]
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
 _LEVEL = "dB re strongest"
 _CURVE_EMS = 14.0
-_MOST_PLACES = 1000
+_MAX_PLACES = 1000
 
 
 def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) -> Figure:
@@ -55,24 +55,24 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
     upper = page.axes(inner.inset(bottom=rows_pt + em_pt), y=_LEVEL)
     _curve(canvas, upper, heard)
     upper.tick_params(labelbottom=False)
-    lower = page.axes(Box(inner.left, inner.bottom, inner.width, rows_pt), x="range (m)", y="microphone (channel)")
+    lower = page.axes(PageBox(inner.left, inner.bottom, inner.width, rows_pt), x="range (m)", y="microphone (channel)")
     shown = _rows(canvas, lower, heard)
     row_ticks(lower, heard.channels, height_pt=rows_pt, em_pt=em_pt)
     lower.set_xlim(upper.get_xlim())
     return canvas.side(page, side, shown)
 
 
-def _axis_in_words(heard: Heard) -> tuple[str, ...]:
+def _axis_in_words(heard: MicrophoneTraces) -> tuple[str, ...]:
     range_m = heard.axis
     every = f" every {_words.number(1e3 * (range_m[1] - range_m[0]), 2)} mm" if len(range_m) > 1 else ""
     return (f"{_words.span(range_m)} m{every}",)
 
 
-def _within(box: Box, em_pt: float) -> Box:
+def _within(box: PageBox, em_pt: float) -> PageBox:
     return box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
 
 
-def _curve(canvas: Canvas, axes: Axes, heard: Heard) -> None:
+def _curve(canvas: Canvas, axes: Axes, heard: MicrophoneTraces) -> None:
     """Draw the mean power over range, below the strongest of all microphones."""
     mean = np.sqrt(np.mean(np.square(heard.values, dtype=np.float64), axis=0))
     strongest = float(heard.values.max(initial=0.0)) or 1.0
@@ -85,9 +85,9 @@ def _curve(canvas: Canvas, axes: Axes, heard: Heard) -> None:
     canvas.grid(axes)
 
 
-def _rows(canvas: Canvas, axes: Axes, heard: Heard) -> AxesImage:
+def _rows(canvas: Canvas, axes: Axes, heard: MicrophoneTraces) -> AxesImage:
     """Draw a row for each microphone, the first on top."""
-    range_m, level_db = join_ranges(heard.axis, canvas.level_db(heard.values), most=_MOST_PLACES)
+    range_m, level_db = join_ranges(heard.axis, canvas.level_db(heard.values), largest=_MAX_PLACES)
     half_m = float(range_m[-1] - range_m[0]) / max(1, 2 * (len(range_m) - 1)) or 0.05
     rows = len(level_db)
     extent = (float(range_m[0]) - half_m, float(range_m[-1]) + half_m, rows - 0.5, -0.5)

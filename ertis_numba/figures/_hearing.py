@@ -14,13 +14,13 @@ from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.signals import signals_of
 from ertis_numba.stages.window import time_window
 
-__all__ = ["Heard", "echoes", "signals"]
+__all__ = ["MicrophoneTraces", "echoes", "signals"]
 
-_MOST_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can show
+_MAX_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can show
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class MicrophoneTraces:
     """Something over time or range, of each microphone.
 
     Attributes
@@ -38,14 +38,14 @@ class Heard:
     channels: NDArray[np.int64]
 
 
-def signals(measurement: Measurement) -> Heard:
+def signals(measurement: Measurement) -> MicrophoneTraces:
     """Return the signals of the first 524,288 samples at most."""
     settings = measurement.settings
-    values = signals_of(measurement, most_samples=_MOST_SAMPLES)
-    return Heard(values, np.arange(values.shape[1]) / settings.signal_rate_hz, _channels(settings))
+    values = signals_of(measurement, max_samples=_MAX_SAMPLES)
+    return MicrophoneTraces(values, np.arange(values.shape[1]) / settings.signal_rate_hz, _channels(settings))
 
 
-def echoes(measurement: Measurement) -> Heard:
+def echoes(measurement: Measurement) -> MicrophoneTraces:
     """Return the envelope of each microphone's echoes at all samples of the range window.
 
     1 is a full-scale echo of the whole call. Calibrated gains and delays are taken out.
@@ -75,7 +75,7 @@ def echoes(measurement: Measurement) -> Heard:
     analytic = memory.zeros(matched.shape, np.complex64)
     matched(fft.plan(plain.transforms, heard, analytic, zeros=memory.zeros, stream=None), analytic, threads=1)
     envelope = np.abs(analytic[:, 0, window.lead : window.lead + len(window.range_m)])
-    return Heard(envelope, window.range_m, _channels(settings))
+    return MicrophoneTraces(envelope, window.range_m, _channels(settings))
 
 
 def _channels(settings: Settings) -> NDArray[np.int64]:

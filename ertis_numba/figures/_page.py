@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ertis_numba.figures._style import Style, text_width_pt
 from ertis_numba.figures._words import Heading
 
-__all__ = ["Box", "Page", "lay_out"]
+__all__ = ["FigurePage", "PageBox", "lay_out"]
 
 _TITLE_LINE, _LINE = 1.35, 1.55  # heights of lines, by the size of their letters
 _DOT = " · "
@@ -19,7 +19,7 @@ _GAP_EMS = 2.0  # between pictures
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class PageBox:
     """A rectangle on a page, in points."""
 
     left: float
@@ -27,18 +27,18 @@ class Box:
     width: float
     height: float
 
-    def inset(self, *, left: float = 0.0, right: float = 0.0, bottom: float = 0.0, top: float = 0.0) -> "Box":
+    def inset(self, *, left: float = 0.0, right: float = 0.0, bottom: float = 0.0, top: float = 0.0) -> "PageBox":
         """Return what is left of it within margins."""
-        return Box(self.left + left, self.bottom + bottom, self.width - left - right, self.height - bottom - top)
+        return PageBox(self.left + left, self.bottom + bottom, self.width - left - right, self.height - bottom - top)
 
-    def fitted(self, ratio: float) -> "Box":
+    def fitted(self, ratio: float) -> "PageBox":
         """Return the largest box in it whose height is ``ratio`` of its width, in the middle at the top."""
         width = min(self.width, self.height / ratio)
         height = width * ratio
-        return Box(self.left + (self.width - width) / 2, self.bottom + self.height - height, width, height)
+        return PageBox(self.left + (self.width - width) / 2, self.bottom + self.height - height, width, height)
 
 
-class Page:
+class FigurePage:
     """A figure with its heading.
 
     Parameters
@@ -102,13 +102,13 @@ class Page:
             parse_math=False,  # a file's name may hold a dollar sign
         )
 
-    def caption(self, box: Box, text: str, *, above_pt: float = 0.0) -> None:
+    def caption(self, box: PageBox, text: str, *, above_pt: float = 0.0) -> None:
         """Write a line at the top of a box, or so far above it, in its middle."""
         if text:
             left_pt, top_pt = box.left + box.width / 2, box.bottom + (box.height + above_pt)
             self.text(text, left_pt, top_pt, self.style.label_pt, colour=self.style.faint, align="center")
 
-    def axes(self, box: Box, *, title: str = "", x: str = "", y: str = "") -> Axes:
+    def axes(self, box: PageBox, *, title: str = "", x: str = "", y: str = "") -> Axes:
         """Return new axes in the colours and letters of the style."""
         width_pt, height_pt = self._size_pt
         style = self.style
@@ -148,7 +148,7 @@ def lay_out(
     side_pt: float,
     below_pt: float,
     side_tall_pt: float = 0.0,
-) -> tuple[Page, list[Box], Box]:
+) -> tuple[FigurePage, list[PageBox], PageBox]:
     """Return a page, the boxes of its pictures and that of what goes with them.
 
     On a wide page the pictures stand beside each other and the rest to their right, on a narrow one all stands below
@@ -175,7 +175,7 @@ def lay_out(
         side_pt = max(side_pt, style.side_pt) if side_pt else 0.0
         each_pt = (width_pt - side_pt - 2 * margin_pt - gap_pt * (len(panels) - 1)) / len(panels)
         tall_pt = max(side_tall_pt, *(panel(each_pt) for panel in panels))
-        page = Page(
+        page = FigurePage(
             style,
             heading,
             width_pt=width_pt,
@@ -183,18 +183,19 @@ def lay_out(
             heading_pt=width_pt - side_pt - style.margin_pt - margin_pt,
         )
         boxes = [
-            Box(margin_pt + number * (each_pt + gap_pt), margin_pt, each_pt, tall_pt) for number in range(len(panels))
+            PageBox(margin_pt + number * (each_pt + gap_pt), margin_pt, each_pt, tall_pt)
+            for number in range(len(panels))
         ]
-        return page, boxes, Box(width_pt - side_pt, margin_pt, side_pt - margin_pt, tall_pt)
+        return page, boxes, PageBox(width_pt - side_pt, margin_pt, side_pt - margin_pt, tall_pt)
     each_pt = width_pt - 2 * margin_pt
     heights = [panel(each_pt) for panel in panels]
     body_pt = sum(heights) + gap_pt * (len(panels) - 1) + below_pt + margin_pt
-    page = Page(style, heading, width_pt=width_pt, body_pt=body_pt, heading_pt=width_pt - 2 * style.margin_pt)
+    page = FigurePage(style, heading, width_pt=width_pt, body_pt=body_pt, heading_pt=width_pt - 2 * style.margin_pt)
     boxes, top_pt = [], body_pt
     for height_pt in heights:
-        boxes.append(Box(margin_pt, top_pt - height_pt, each_pt, height_pt))
+        boxes.append(PageBox(margin_pt, top_pt - height_pt, each_pt, height_pt))
         top_pt -= height_pt + gap_pt
-    return page, boxes, Box(margin_pt, margin_pt, each_pt, below_pt)
+    return page, boxes, PageBox(margin_pt, margin_pt, each_pt, below_pt)
 
 
 def _wrapped(parts: Sequence[str], size_pt: float, font: str, width_pt: float, *, bold: bool = False) -> list[str]:

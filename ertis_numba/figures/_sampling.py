@@ -34,10 +34,10 @@ def centres(first: float, last: float, step: float) -> NDArray[np.float64]:
 
 
 def join_ranges(
-    range_m: NDArray[np.float64], level_db: NDArray[np.float32], *, most: int = _RADIAL_BINS
+    range_m: NDArray[np.float64], level_db: NDArray[np.float32], *, largest: int = _RADIAL_BINS
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Join ranges finer than a pixel to their maximum, so that no reflector falls between pixels."""
-    step = -(-len(range_m) // most)
+    step = -(-len(range_m) // largest)
     if step == 1:
         return range_m, level_db
     starts = np.arange(0, len(range_m), step)

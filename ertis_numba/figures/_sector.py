@@ -11,26 +11,26 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._page import FigurePage, PageBox
 from ertis_numba.figures._sampling import PIXELS, centres, flattened, join_ranges, polar_raster, thickened
 from ertis_numba.figures._style import text_width_pt
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import ALONE_RAD
-from ertis_numba.stages.side_lobes import without_side_lobes
 
 __all__ = ["draw", "draw_into", "height_of"]
 
 _SIDE_EMS, _ROOF_EMS, _FLOOR_EMS = 3.6, 3.0, 2.0  # what names take around the sector
-_LEAST_RATIO, _MOST_RATIO = 0.3, 0.95  # of height to width
+_MIN_RATIO, _MAX_RATIO = 0.3, 0.95  # of height to width
 
 
 def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw an image; of several elevations the strongest."""
     hidden = not (image.is_planar or side_lobes)
     image = without_side_lobes(image) if hidden else image
-    azimuth_rad, level_db = flattened(image, canvas.level_db(image.energy))
+    azimuth_rad, level_db = flattened(image, canvas.level_db(image.amplitude))
     page, (box,), side = canvas.lay_out(
         _words.of_image(image), [height_of(canvas, azimuth_rad, image.range_m)], width_pt=720.0
     )
@@ -44,15 +44,15 @@ def height_of(
 ) -> Callable[[float], float]:
     """Return the function from the width of a sector to its height, both with the names around it, in points."""
     left, right, bottom, top = _extent(_ends(azimuth_rad), range_m)
-    ratio = min(_MOST_RATIO, max(_LEAST_RATIO, (top - bottom) / (right - left)))
+    ratio = min(_MAX_RATIO, max(_MIN_RATIO, (top - bottom) / (right - left)))
     em_pt = canvas.style.em_pt
     return lambda width_pt: (width_pt - 2 * _SIDE_EMS * em_pt) * ratio + (_ROOF_EMS + _FLOOR_EMS) * em_pt
 
 
 def draw_into(
     canvas: Canvas,
-    page: Page,
-    box: Box,
+    page: FigurePage,
+    box: PageBox,
     azimuth_rad: NDArray[np.float64],
     range_m: NDArray[np.float64],
     level_db: NDArray[np.float32],

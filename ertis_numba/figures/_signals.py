@@ -15,16 +15,16 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._hearing import Heard, signals
+from ertis_numba.figures._hearing import MicrophoneTraces, signals
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Settings
 
 __all__ = ["chosen", "draw", "row_ticks", "spectrogram"]
 
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
-_MOST_TRACES = 64
+_MAX_TRACES = 64
 _COLUMNS = 1200  # of a trace: the least and the greatest of each are drawn
-_MOST_SPECTRA = 600  # columns of a spectrogram: of the spectra in each the greatest is drawn
+_MAX_SPECTRA = 600  # columns of a spectrogram: of the spectra in each the greatest is drawn
 _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 _COMPRESSED = 10 ** (-40 / 20)  # of the loudest; below that, amplitudes are linear
 _LOUDEST = 0.999  # share of the samples that stay within their row
@@ -34,8 +34,8 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
     """Draw the traces of all microphones or of one, and the mean of their spectrograms."""
     settings, em_pt = measurement.settings, canvas.style.em_pt
     heard = chosen(signals(measurement), microphone)
-    step = -(-len(heard.values) // _MOST_TRACES)  # of a large array some, evenly spaced
-    heard = Heard(heard.values[::step], heard.axis, heard.channels[::step])
+    step = -(-len(heard.values) // _MAX_TRACES)  # of a large array some, evenly spaced
+    heard = MicrophoneTraces(heard.values[::step], heard.axis, heard.channels[::step])
     rows = len(heard.values)
 
     def traces_pt(width_pt: float) -> float:
@@ -73,7 +73,7 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
     return canvas.side(page, side, _spectrogram(canvas, axes, heard, settings))
 
 
-def chosen(heard: Heard, microphone: int | None) -> Heard:
+def chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
     """Return what one microphone heard, or all.
 
     Raises
@@ -83,13 +83,13 @@ def chosen(heard: Heard, microphone: int | None) -> Heard:
     """
     if microphone is None:
         return heard
-    place = np.flatnonzero(heard.channels == checks.whole("microphone", microphone, 0))
+    place = np.flatnonzero(heard.channels == checks.integer("microphone", microphone, 0))
     if not len(place):
         raise ArgumentError(
             f"microphone {microphone} is none of the {len(heard.channels)} enabled ones; "
             f"give one from {heard.channels[0]} to {heard.channels[-1]}"
         )
-    return Heard(heard.values[place], heard.axis, heard.channels[place])
+    return MicrophoneTraces(heard.values[place], heard.axis, heard.channels[place])
 
 
 def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_pt: float) -> None:
@@ -102,7 +102,7 @@ def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_p
 
 
 def spectrogram(
-    heard: Heard, settings: Settings
+    heard: MicrophoneTraces, settings: Settings
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
     """Return the power of short spectra, mean over the microphones: (frequency, time) float32, frequencies and times.
 
@@ -115,8 +115,8 @@ def spectrogram(
     count = len(heard.axis)
     size = min(count, max(16, round(2 * math.sqrt(call.duration_s / swept_hz) * rate_hz)))
     n_fft = scipy.fft.next_fast_len(4 * size)
-    joined = max(1, math.ceil((count - size) / (size / 2) / _MOST_SPECTRA))
-    n_spectra = min(joined * _MOST_SPECTRA, count - size + 1)
+    joined = max(1, math.ceil((count - size) / (size / 2) / _MAX_SPECTRA))
+    n_spectra = min(joined * _MAX_SPECTRA, count - size + 1)
     starts = np.rint(np.linspace(0, count - size, n_spectra)).astype(np.intp)
     columns = starts.reshape(-1, joined)
     window = np.hanning(size + 2)[1:-1].astype(np.float32)
@@ -134,7 +134,7 @@ def spectrogram(
     return power.T / np.float32(len(heard.values)), frequency_hz, times_s
 
 
-def _traces(canvas: Canvas, axes: Axes, heard: Heard, loudest: float) -> None:
+def _traces(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, loudest: float) -> None:
     """Draw a row for each trace, the first on top; what is louder than its row is cut off.
 
     Amplitudes are compressed, so that echoes are seen beside the direct sound, which is 20 to 40 dB louder.
@@ -168,7 +168,7 @@ def _ends(
     return axis[starts], np.minimum.reduceat(values, starts, axis=1), np.maximum.reduceat(values, starts, axis=1)
 
 
-def _spectrogram(canvas: Canvas, axes: Axes, heard: Heard, settings: Settings) -> AxesImage:
+def _spectrogram(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, settings: Settings) -> AxesImage:
     power, frequency_hz, times_s = spectrogram(heard, settings)
     half_s = (times_s[-1] - times_s[0]) / max(1, 2 * (len(times_s) - 1)) or 0.5e-3
     extent = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._page import FigurePage, PageBox
 from ertis_numba.figures._sampling import centres, join_ranges, thickened, volume_raster
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
@@ -21,7 +21,7 @@ __all__ = ["draw"]
 _PIXELS = 500  # along the longer side
 _NEAR_M = 0.05  # of a plane, or a fiftieth of the range: reflectors that are ringed in it
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
-_MOST_RATIO = 1.1
+_MAX_RATIO = 1.1
 
 
 def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float | None) -> Figure:
@@ -37,7 +37,7 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
             f"left_m is {left_m:g}, but a planar image has no upright plane; "
             "leave it out, or give an image with elevations"
         )
-    level_db = canvas.level_db(image.energy)
+    level_db = canvas.level_db(image.amplitude)
     cuts = [_level(image, height_m)]
     if not image.is_planar:
         cuts.append(_upright(image, left_m or 0.0))
@@ -89,7 +89,7 @@ class _Cut:
         points_m = np.full((len(up_m), len(across_m), 3), self.at_m)
         points_m[..., self.across] = across_m
         points_m[..., self.up] = up_m[:, None]
-        range_m, joined_db = thickened(*join_ranges(image.range_m, level_db, most=_PIXELS))
+        range_m, joined_db = thickened(*join_ranges(image.range_m, level_db, largest=_PIXELS))
         directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         raster = volume_raster(joined_db, directions, range_m, points_m=points_m)
         if np.isnan(raster).all():
@@ -100,7 +100,7 @@ class _Cut:
 
     def height_at(self, canvas: Canvas) -> Callable[[float], float]:
         """Return the function from the width of the picture to its height, both with what is around it, in points."""
-        em_pt, ratio = canvas.style.em_pt, min(_MOST_RATIO, self._ratio)
+        em_pt, ratio = canvas.style.em_pt, min(_MAX_RATIO, self._ratio)
         return lambda width_pt: (width_pt - (_LEFT_EMS + _RIGHT_EMS) * em_pt) * ratio + (_FLOOR_EMS + _ROOF_EMS) * em_pt
 
     @property
@@ -108,7 +108,7 @@ class _Cut:
         left, right, bottom, top = self.extent_m
         return (top - bottom) / abs(right - left)
 
-    def draw_into(self, canvas: Canvas, page: Page, box: Box, raster: NDArray[np.float32]) -> AxesImage:
+    def draw_into(self, canvas: Canvas, page: FigurePage, box: PageBox, raster: NDArray[np.float32]) -> AxesImage:
         """Draw the plane and the reflectors in it."""
         em_pt = canvas.style.em_pt
         inner = box.inset(
@@ -149,10 +149,10 @@ def _upright(image: Energyscape, left_m: float) -> _Cut:
 def _spans(image: Energyscape) -> list[tuple[float, float]]:
     """Return how far the image and the sensor reach along x, y and z."""
     points_m = unit_vectors(image.azimuth_rad, image.elevation_rad) * image.range_m[-1]
-    least_m = 0.1 * float(image.range_m[-1])  # what is thinner could not be seen
+    min_m = 0.1 * float(image.range_m[-1])  # what is thinner could not be seen
     spans = []
     for low, high in zip(points_m.min(axis=0), points_m.max(axis=0), strict=True):
         first, last = min(0.0, float(low)), max(0.0, float(high))
-        spare = max(0.0, least_m - (last - first)) / 2
+        spare = max(0.0, min_m - (last - first)) / 2
         spans.append((first - spare, last + spare))
     return spans

@@ -9,24 +9,24 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.figures import _sector, _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._page import Box, Page
+from ertis_numba.figures._page import FigurePage, PageBox
 from ertis_numba.figures._sampling import PIXELS, flattened, sphere_raster
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import spacing_rad, unit_vectors, unrolled_rad
-from ertis_numba.stages.side_lobes import without_side_lobes
 
 __all__ = ["draw", "draw_map"]
 
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8  # what ticks and names take around the map
-_LEAST_RATIO, _MOST_RATIO = 0.1, 1.05
+_MIN_RATIO, _MAX_RATIO = 0.1, 1.05
 
 
 def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw the maximum over range as a map, and the maximum over elevation as a sector."""
     image = image if side_lobes else without_side_lobes(image)
-    level_db = canvas.level_db(image.energy)
+    level_db = canvas.level_db(image.amplitude)
     azimuth_rad, highest_db = flattened(image, level_db)
     panels = [_Map(canvas, image).height, _sector.height_of(canvas, azimuth_rad, image.range_m)]
     page, boxes, side = canvas.lay_out(_words.of_image(image), panels, width_pt=1008.0)
@@ -45,7 +45,7 @@ def draw_map(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     projection = _Map(canvas, image)
     page, (box,), side = canvas.lay_out(_words.of_image(image), [projection.height], width_pt=720.0)
     title = _words.highest_over("range", hidden=hidden)
-    shown = projection.draw_into(page, box, canvas.level_db(image.energy).max(axis=1), title)
+    shown = projection.draw_into(page, box, canvas.level_db(image.amplitude).max(axis=1), title)
     return canvas.side(page, side, shown)
 
 
@@ -64,20 +64,20 @@ class _Map:
         self._low = max(-90.0, float(elevation_deg.min() - half_deg))
         self._high = min(90.0, float(elevation_deg.max() + half_deg))
         ratio = (self._high - self._low) / (self._west - self._east)
-        self._ratio = min(_MOST_RATIO, max(_LEAST_RATIO, ratio))
+        self._ratio = min(_MAX_RATIO, max(_MIN_RATIO, ratio))
 
     def height(self, width_pt: float) -> float:
         """Return the height that suits a width, both with what is around the map, in points."""
         across_pt = width_pt - (_LEFT_EMS + _RIGHT_EMS) * self._em_pt
         return across_pt * self._ratio + (_FLOOR_EMS + _ROOF_EMS) * self._em_pt
 
-    def draw_into(self, page: Page, box: Box, level_db: NDArray[np.float32], title: str) -> AxesImage:
+    def draw_into(self, page: FigurePage, box: PageBox, level_db: NDArray[np.float32], title: str) -> AxesImage:
         """Draw the level of each direction."""
         em_pt, canvas = self._em_pt, self._canvas
         inner = box.inset(
             left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
         )
-        page.caption(Box(inner.left, box.bottom, inner.width, box.height), title)
+        page.caption(PageBox(inner.left, box.bottom, inner.width, box.height), title)
         axes = page.axes(inner.fitted(self._ratio), x="azimuth (°)", y="elevation (°)")
         west, east, low, high = self._west, self._east, self._low, self._high
         step_deg = max(west - east, high - low) / (PIXELS / 2)

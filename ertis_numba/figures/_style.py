@@ -9,7 +9,7 @@ from matplotlib.textpath import text_to_path
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["COLUMNS_MM", "FONTS", "LINES", "MONOSPACE", "THEMES", "Look", "Style", "style_of", "text_width_pt"]
+__all__ = ["COLUMNS_MM", "FONTS", "LINES", "MONOSPACE", "THEMES", "Style", "StyleOptions", "style_of", "text_width_pt"]
 
 COLUMNS_MM = {1: 85.0, 2: 170.0}
 """Width of a picture for print over so many columns of a page."""
@@ -22,7 +22,7 @@ _SLACK = 1.03  # letters are set to whole pixels on a screen
 _WIDE_EMS = 55.0
 
 
-class Look(TypedDict, total=False):
+class StyleOptions(TypedDict, total=False):
     """What all functions of this package take besides what is drawn.
 
     Attributes

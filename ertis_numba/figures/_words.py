@@ -48,7 +48,7 @@ def of_image(image: Energyscape) -> Heading:
     adaptive = "" if processing.beamformer == "delay_and_sum" else f", {processing.beamformer.replace('_', ' ')}"
     budget_db = settings.accuracy.max_error_db
     return Heading(
-        ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.energy)),
+        ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.amplitude)),
         (
             *_of_sensor(settings),
             directions,

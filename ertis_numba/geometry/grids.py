@@ -66,7 +66,7 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
         raise ArgumentError(
             f"directions {name[:80]!r} has a count of {len(count)} digits; give {MAX_DIRECTIONS} at most"
         )
-    return checks.whole(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
+    return checks.integer(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
 
 
 def direction_grid(processing: Processing) -> Grid:

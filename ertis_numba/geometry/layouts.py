@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.documents import Document
+from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
@@ -33,7 +33,7 @@ _SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are b
 _CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
 
 
-class LayoutFile(Document, frozen=True, kw_only=True):
+class LayoutFile(TomlDocument, frozen=True, kw_only=True):
     """Microphones of an array: the whole content of a layout file.
 
     Attributes
@@ -189,7 +189,7 @@ def _placed(source: str, file: LayoutFile) -> Array:
     positions_m[:, 3 - len(rows[0]) :] = np.asarray(rows, dtype=np.float64) / 1000
     enabled = np.ones(len(rows), dtype=np.bool_)
     for channel in file.disabled:
-        enabled[checks.whole(f"layout {source}: a disabled channel", channel, 0, len(rows) - 1)] = False
+        enabled[checks.integer(f"layout {source}: a disabled channel", channel, 0, len(rows) - 1)] = False
     checks.finite_array(f"layout {source}: positions_mm", np.where(enabled[:, None], positions_m, 0.0))
     try:
         made = Array(
@@ -247,7 +247,7 @@ def microphones(array: Array) -> Layout:
         return fitted
     enabled = fitted.enabled.copy()
     for channel in array.disabled:
-        enabled[checks.whole("array.disabled", channel, 0, len(enabled) - 1)] = False
+        enabled[checks.integer("array.disabled", channel, 0, len(enabled) - 1)] = False
     if not enabled.any():
         raise ArgumentError(
             f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels"

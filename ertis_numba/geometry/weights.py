@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.layouts import Layout, microphones
-from ertis_numba.settings import Settings, taper_of
+from ertis_numba.settings import Settings, parse_window
 
 __all__ = ["array_weights", "effective_count"]
 
@@ -73,7 +73,7 @@ def _window(layout: Layout, name: str) -> NDArray[np.float64]:
     # SciPy's windows take longer to import than the chain takes to start, and uniform weights need none.
     from scipy.signal import windows  # noqa: PLC0415
 
-    taper = taper_of(name)
+    taper = parse_window(name)
     if taper.window == "taylor":
         # Taylor's least number of nearly equal side lobes (Van Trees, section 3.4).
         equal = math.ceil(2 * (math.acosh(10 ** (taper.parameter / 20)) / math.pi) ** 2 + 0.5)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.atomic import require_room
+from ertis_numba.atomic_files import require_free_space
 from ertis_numba.errors import DamagedError, DataError, ForeignDataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
@@ -33,7 +33,7 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
     layout = microphones(measurement.settings.array)
     signals = signals_of(measurement)
     geometry.write_text(_xml(layout), encoding="utf-8")
-    require_room(path.parent, signals.nbytes)  # HDF5 on a full disk can take the process with it
+    require_free_space(path.parent, signals.nbytes)  # HDF5 on a full disk can take the process with it
     with h5py.File(path, "w") as file:
         samples = file.create_dataset("time_data", data=signals.T)
         samples.attrs["sample_freq"] = measurement.settings.signal_rate_hz
@@ -62,9 +62,9 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             stored_bytes(data, may_be_filtered=True)
             numbers = np.asarray(data[()])
             rates_hz = np.asarray(data.attrs["sample_freq"], dtype=np.float64)
-            told = None
+            reported = None
             if "metadata" in file:
-                told = child(file, "metadata", h5py.Group).attrs.get("settings")
+                reported = child(file, "metadata", h5py.Group).attrs.get("settings")
     except (DamagedError, ForeignDataError) as error:
         raise DataError(f"{path}: {error}") from error
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -80,7 +80,11 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             f"{path}: time_data is {numbers.dtype} of shape {numbers.shape}; give floating or signed numbers of shape "
             "(sample, channel)"
         )
-    return rate_hz, numbers, None if told is None else _of_signals(received_settings(str(told), str(path)), rate_hz)
+    return (
+        rate_hz,
+        numbers,
+        None if reported is None else _of_signals(received_settings(str(reported), str(path)), rate_hz),
+    )
 
 
 def _of_signals(settings: Settings, rate_hz: float) -> Settings:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.atomic import check_target, remedy, replacing
+from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.interop._mountings import Mountings, checked
@@ -50,16 +50,16 @@ FORMATS: Final = {
     "csv": Format(
         ending=".csv",
         holds=(
-            *("sensor", "epoch", "sequence", "sync_count", "timestamp_ns"),
-            *("x_m", "y_m", "z_m", "energy", "uncertainty_range_m", "uncertainty_across_m"),
+            *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns"),
+            *("x_m", "y_m", "z_m", "amplitude", "uncertainty_range_m", "uncertainty_across_m"),
         ),
         options=_FINDING,
     ),
     "npz": Format(
         ending=".npz",
         holds=(
-            *("energy", "azimuth_rad", "elevation_rad", "range_m"),
-            *("epoch", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
+            *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
+            *("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
             *("sensor", "settings"),
         ),
     ),
@@ -131,7 +131,7 @@ def export(
     topics : collection of {"points", "image", "sonar_image"}, optional
         What of each sensor goes into ``mcap``; all by default.
     top, min_level_db : optional
-        Which points: see `ertis_numba.stages.points.PointExtractor`, whose defaults hold.
+        Which points: see `ertis_numba.analysis.points.PointExtractor`, whose defaults hold.
     text : bool
         ``ply`` and ``pcd`` as text.
     overwrite : bool
@@ -162,7 +162,7 @@ def export(
         check_target(each, overwrite=overwrite)
     try:
         with ExitStack() as stack:
-            parts = [stack.enter_context(replacing(each, overwrite=overwrite)) for each in paths]
+            parts = [stack.enter_context(atomic_write(each, overwrite=overwrite)) for each in paths]
             if name == "acoular":
                 _write_signals(parts[0], parts[1], items)
             elif name == "npz":
@@ -219,9 +219,9 @@ def _write_points(
     *,
     text: bool,
 ) -> None:
+    from ertis_numba.analysis.finder import PointFinder  # noqa: PLC0415
     from ertis_numba.interop import _mcap, _point_files  # noqa: PLC0415
     from ertis_numba.interop._points import PointTable  # noqa: PLC0415
-    from ertis_numba.stages.finder import PointFinder  # noqa: PLC0415
 
     find = PointFinder(**finding)
     if name == "mcap":

@@ -14,6 +14,7 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.finder import same_directions
 from ertis_numba.errors import ArgumentError
 from ertis_numba.extras import extra
 from ertis_numba.frames import Energyscape, Stamp
@@ -22,7 +23,6 @@ from ertis_numba.interop._messages import encoder, schema
 from ertis_numba.interop._mountings import PLATFORM, Mountings
 from ertis_numba.interop._picture import Picture
 from ertis_numba.interop._points import Find, ros_time
-from ertis_numba.stages.finder import same_directions
 
 __all__ = ["TOPICS", "write_mcap"]
 
@@ -133,7 +133,7 @@ class _Bag:
 
     def _points(self, image: Energyscape) -> dict[str, Any]:
         cloud = self._find(image)
-        rows = np.column_stack([cloud.position_m, cloud.energy]).astype("<f4")
+        rows = np.column_stack([cloud.position_m, cloud.amplitude]).astype("<f4")
         fields = [
             {"name": name, "offset": 4 * number, "datatype": _FLOAT32, "count": 1}
             for number, name in enumerate(("x", "y", "z", "intensity"))
@@ -155,7 +155,7 @@ class _Bag:
         known = self._pictures.get(sensor)
         if known is None or not same_directions(known[0], image):
             known = self._pictures[sensor] = image, Picture(image)
-        pixels = known[1](image.energy)
+        pixels = known[1](image.amplitude)
         height, width = pixels.shape
         return {
             "header": _header(image.stamp),
@@ -184,7 +184,7 @@ class _Bag:
                 "is_bigendian": False,
                 "dtype": _DTYPE_FLOAT32,
                 "beam_count": len(image.azimuth_rad),
-                "data": np.ascontiguousarray(image.energy.T, dtype="<f4").tobytes(),
+                "data": np.ascontiguousarray(image.amplitude.T, dtype="<f4").tobytes(),
             },
         }
 

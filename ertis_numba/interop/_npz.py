@@ -17,7 +17,7 @@ from ertis_numba.geometry import self_contained
 
 __all__ = ["write_npz"]
 
-_STAMPS = ("epoch", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns")
+_STAMPS = ("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns")
 _AXES = ("azimuth_rad", "elevation_rad", "range_m")
 
 
@@ -36,7 +36,7 @@ def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> N
         images, count = gathered, len(gathered)
     with zipfile.ZipFile(path, "w") as archive:
         with archive.open("energy.npy", "w", force_zip64=True) as member:
-            first, stamps = _write_energy(member, images, count)
+            first, stamps = _write_amplitude(member, images, count)
         arrays: dict[str, Any] = {name: getattr(first, name) for name in _AXES}
         arrays |= {name: np.array([getattr(stamp, name) for stamp in stamps], dtype=np.int64) for name in _STAMPS}
         arrays["sensor"] = np.array(first.stamp.sensor)
@@ -46,16 +46,16 @@ def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> N
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _write_energy(file: IO[bytes], images: Iterable[Energyscape], count: int) -> tuple[Energyscape, list[Stamp]]:
+def _write_amplitude(file: IO[bytes], images: Iterable[Energyscape], count: int) -> tuple[Energyscape, list[Stamp]]:
     """Write a row for each image; return the first one and the stamps of all."""
     rest = iter(images)
     first = next(rest)
-    shape = (count, *first.energy.shape)
+    shape = (count, *first.amplitude.shape)
     np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
     stamps = []
     for image in itertools.chain([first], rest):
         _require_same(image, first)
-        file.write(np.ascontiguousarray(image.energy, dtype="<f4").data.cast("B"))
+        file.write(np.ascontiguousarray(image.amplitude, dtype="<f4").data.cast("B"))
         stamps.append(image.stamp)
     if len(stamps) != count:
         raise ArgumentError(f"{len(stamps)} energyscapes came, {count} were told of; give as many")

@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import FAR, spacing_rad, unit_vectors, unrolled_rad
-from ertis_numba.stages.levels import below_strongest_db
 
 __all__ = ["DYNAMIC_RANGE_DB", "Picture"]
 
 DYNAMIC_RANGE_DB = 40.0
 """Below the strongest, at which a pixel is black."""
-_MOST_PIXELS = 1000  # along a side of a map
+_MAX_PIXELS = 1000  # along a side of a map
 
 
 class Picture:
@@ -32,9 +32,9 @@ class Picture:
         self._columns = np.argsort(-unrolled_rad(image.azimuth_rad), kind="stable")
         self._map = None if image.is_planar else _map(image)
 
-    def __call__(self, energy: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def __call__(self, amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the picture of energies, (direction, range): (row, column) uint8, 255 the strongest."""
-        shown = energy if self._map is None else energy.max(axis=1, keepdims=True)
+        shown = amplitude if self._map is None else amplitude.max(axis=1, keepdims=True)
         level_db = below_strongest_db(shown, DYNAMIC_RANGE_DB)
         grey = np.rint(255 * (1 + level_db / DYNAMIC_RANGE_DB)).astype(np.uint8)
         if self._map is None:
@@ -50,7 +50,7 @@ def _map(image: Energyscape) -> NDArray[np.int64]:
     axes = []
     for angle_rad in (unrolled_rad(image.azimuth_rad, 1.5 * apart_rad), image.elevation_rad):
         span_rad = float(np.ptp(angle_rad))
-        count = min(_MOST_PIXELS, 1 + round(span_rad / max(apart_rad, span_rad / _MOST_PIXELS)))
+        count = min(_MAX_PIXELS, 1 + round(span_rad / max(apart_rad, span_rad / _MAX_PIXELS)))
         axes.append(np.linspace(angle_rad.max(), angle_rad.min(), count))
     looks = unit_vectors(*np.meshgrid(*axes))
     distance, nearest = tree.query(looks)

@@ -32,14 +32,14 @@ POINT_FIELDS: Final = {
 _PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
 CSV_COLUMNS: Final = {
     "sensor": "sensor",
-    "epoch": "epoch",
+    "session_id": "session_id",
     "sequence": "sequence",
     "sync_count": "sync_count",
     "timestamp_ns": "timestamp_ns",
     "x_m": "x",
     "y_m": "y",
     "z_m": "z",
-    "energy": "intensity",
+    "amplitude": "intensity",
     "uncertainty_range_m": "uncertainty_range",
     "uncertainty_across_m": "uncertainty_across",
 }

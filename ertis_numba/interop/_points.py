@@ -20,11 +20,11 @@ _POINT: Final = np.dtype(
     [
         *((name, "<f4") for name in ("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across")),
         ("sensor", "<u2"),
-        *((name, "<i8") for name in ("epoch", "sequence", "sync_count", "timestamp_ns")),
+        *((name, "<i8") for name in ("session_id", "sequence", "sync_count", "timestamp_ns")),
     ]
 )
 _NS = 1_000_000_000
-_MOST_SEC = 2**31 - 1
+_MAX_SEC = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ class PointTable:
 
     def _ros_times(self) -> dict[str, NDArray[np.int64]]:
         sec, nanosec = np.divmod(self.rows["timestamp_ns"], _NS)
-        beyond = self.rows[(sec < 0) | (sec > _MOST_SEC)]
+        beyond = self.rows[(sec < 0) | (sec > _MAX_SEC)]
         if len(beyond):
             raise _no_ros_time(beyond["sequence"][0], beyond["timestamp_ns"][0])
         return {"sec": sec, "nanosec": nanosec}
@@ -105,12 +105,12 @@ def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.vo
     else:
         position_m = cloud.position_m
     made["x"], made["y"], made["z"] = position_m.T
-    made["intensity"] = cloud.energy
+    made["intensity"] = cloud.amplitude
     unknown_m = np.full((len(cloud), 2), np.nan, dtype=np.float32)
     uncertainty_m = unknown_m if cloud.uncertainty_m is None else cloud.uncertainty_m
     made["uncertainty_range"], made["uncertainty_across"] = uncertainty_m.T
     made["sensor"] = number
-    for name in ("epoch", "sequence", "sync_count", "timestamp_ns"):
+    for name in ("session_id", "sequence", "sync_count", "timestamp_ns"):
         made[name] = getattr(stamp, name)
     return made
 
@@ -124,7 +124,7 @@ def ros_time(stamp: Stamp) -> tuple[int, int]:
         It lies before 1970 or after 2038.
     """
     sec, nanosec = divmod(stamp.timestamp_ns, _NS)
-    if not 0 <= sec <= _MOST_SEC:
+    if not 0 <= sec <= _MAX_SEC:
         raise _no_ros_time(stamp.sequence, stamp.timestamp_ns)
     return sec, nanosec
 

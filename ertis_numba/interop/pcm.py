@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop._acoular import read_acoular
-from ertis_numba.settings import Recording, Settings, suit_ranges
+from ertis_numba.settings import Recording, Settings, fit_ranges
 from ertis_numba.wav import read_wav
 
 __all__ = ["PcmReader", "open_pcm"]
@@ -26,7 +26,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, slots=True)
-class _File:
+class _PcmFile:
     """What a file says of itself."""
 
     path: Path
@@ -92,7 +92,7 @@ class PcmReader:
         self.settings = _fitted(known, recording, first)
         self._enabled = microphones(self.settings.array).enabled
         self._sensor = checks.sensor_name(sensor)
-        self._start_ns = checks.whole("start_ns", start_ns, 0, 2**63 - 1)
+        self._start_ns = checks.integer("start_ns", start_ns, 0, 2**63 - 1)
 
     def __len__(self) -> int:
         return sum(self._counts)
@@ -117,7 +117,7 @@ class PcmReader:
         """Return where a measurement begins in its file."""
         return self._skipped + round(number * self._period)
 
-    def _whole(self, file: _File) -> int:
+    def _whole(self, file: _PcmFile) -> int:
         """Return how many measurements a file holds."""
         if self._n_samples < 1:
             return 0
@@ -126,7 +126,7 @@ class PcmReader:
             count -= 1
         return count
 
-    def _require_measurements(self, first: _File) -> None:
+    def _require_measurements(self, first: _PcmFile) -> None:
         for file, count in zip(self._files, self._counts, strict=True):
             if count < 1 or self._n_samples < 1:
                 rate_hz = first.rate_hz
@@ -202,14 +202,14 @@ def open_pcm(
     )
 
 
-def _known(settings: Settings | None, first: _File) -> Settings:
+def _known(settings: Settings | None, first: _PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
         raise ArgumentError(f"{first.path} says nothing of its array and call; give settings")
     return known
 
 
-def _require_channels(first: _File, settings: Settings) -> None:
+def _require_channels(first: _PcmFile, settings: Settings) -> None:
     layout = microphones(settings.array)
     wanted = len(layout.enabled)
     if first.n_channels == wanted:
@@ -222,7 +222,7 @@ def _require_channels(first: _File, settings: Settings) -> None:
     )
 
 
-def _fitted(settings: Settings, recording: Recording, first: _File) -> Settings:
+def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settings:
     """Return settings for another recording, with ranges that suit it."""
     call = settings.call
     if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
@@ -235,10 +235,10 @@ def _fitted(settings: Settings, recording: Recording, first: _File) -> Settings:
             f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, the call alone lasts "
             f"{1e3 * call.duration_s:.4g} ms; give a longer --length, or skip less (--skip)"
         )
-    return settings.replace(recording=recording, processing=suit_ranges(settings.processing, recording, call))
+    return settings.replace(recording=recording, processing=fit_ranges(settings.processing, recording, call))
 
 
-def _look(path: Path) -> _File:
+def _look(path: Path) -> _PcmFile:
     rate_hz, numbers, settings = _read(path)
     try:
         Recording(sample_rate_hz=rate_hz)
@@ -246,7 +246,7 @@ def _look(path: Path) -> _File:
         raise DataError(f"{path}: {error}") from error
     is_short = numbers.dtype.kind in "iu" and numbers.dtype.itemsize <= 2
     n_samples, n_channels = numbers.shape
-    return _File(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings)
+    return _PcmFile(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings)
 
 
 def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
@@ -260,7 +260,7 @@ def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     return *read_wav(path), None
 
 
-def _words(file: _File, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
+def _words(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
     """Return some of the numbers as a recording holds them; in disabled channels, what is no number becomes 0."""
     numbers = numbers[samples]
     if numbers.dtype.itemsize == 1:  # of WAV they have no sign

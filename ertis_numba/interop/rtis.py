@@ -7,8 +7,8 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import PRESETS, Settings
-from ertis_numba.words import WordFormat, word_format
 
 __all__ = ["RawReader", "open_raw"]
 
@@ -42,7 +42,7 @@ class RawReader:
     ) -> None:
         self.settings = settings
         self._sensor = sensor
-        self._format = word_format(settings)
+        self._format = sample_format(settings)
         counts = [self._count(path) for path in paths]
         if not counts:
             raise ArgumentError("no raw file is given; give at least one")
@@ -68,7 +68,7 @@ class RawReader:
                     block = file.read(self._format.n_bytes)
                     if len(block) != self._format.n_bytes:
                         raise DataError(f"{path} became shorter while it was read; copy it again")
-                    words = self._format.of_bytes(block)
+                    words = self._format.from_bytes(block)
                     stamp = Stamp(sensor=self._sensor, sequence=sequence, sync_count=sequence)
                     yield Measurement(words, self.settings, stamp)
 
@@ -98,7 +98,7 @@ class RawReader:
 _OTHERWISE = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
 
 
-def _remedy(n_bytes: int, words: WordFormat) -> str:
+def _remedy(n_bytes: int, words: SampleFormat) -> str:
     """Return what to do about a file of another length: another preset, where one fits."""
     tick_bytes = words.n_bytes // words.shape[0]
     lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}

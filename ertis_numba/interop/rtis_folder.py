@@ -9,7 +9,7 @@ from typing import Any
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop.rtis import RawReader
-from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, suit_ranges
+from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, fit_ranges
 
 __all__ = ["open_rtis_folder"]
 
@@ -85,19 +85,19 @@ def open_rtis_folder(
     """
     folder = Path(folder)
     paths, first = _measurements(folder)
-    told = _settings_in(folder)
-    layout = layout or told.get("microphoneLayout")
+    reported = _settings_in(folder)
+    layout = layout or reported.get("microphoneLayout")
     if layout is None:
         raise DataError(f"{folder} does not say which array it was (microphoneLayout); give --layout")
     if not isinstance(layout, str):
         raise ArgumentError(f"{folder}: microphoneLayout is {layout!r}; give the name of an array, or --layout")
     if preset is not None:
         settings = Settings.from_preset(preset)
-    elif told.keys() & {*_RECORDING, "callCustom"}:
-        settings = _recorded(folder, told)
+    elif reported.keys() & {*_RECORDING, "callCustom"}:
+        settings = _recorded(folder, reported)
     else:
         raise DataError(f"{folder} holds no recording settings of RTIS Dev (.json); give --preset")
-    processing = _processed(folder, told, settings.processing)
+    processing = _processed(folder, reported, settings.processing)
     settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
     return RawReader(paths, settings, sensor=sensor, first=first)
 
@@ -126,7 +126,7 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
 
 def _settings_in(folder: Path) -> dict[str, Any]:
     """Return the settings in all JSON files of a folder, by the names of files of settings."""
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     sources: dict[str, Path] = {}
     for path in sorted(folder.glob("*.json")):
         try:
@@ -135,19 +135,19 @@ def _settings_in(folder: Path) -> dict[str, Any]:
             raise DataError(f"{path}: {error}; give readable JSON, or take the file away") from error
         for key in _KNOWN & content.keys() if isinstance(content, dict) else ():
             name = _DUMPED.get(key, key)
-            if name in told and told[name] != content[key]:
+            if name in reported and reported[name] != content[key]:
                 raise DataError(
-                    f"{path}: {key} is {content[key]!r}, but {told[name]!r} in {sources[name].name}; keep one of them"
+                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one of them"
                 )
-            told[name], sources[name] = content[key], path
-    return told
+            reported[name], sources[name] = content[key], path
+    return reported
 
 
-def _recorded(folder: Path, told: dict[str, Any]) -> Settings:
+def _recorded(folder: Path, reported: dict[str, Any]) -> Settings:
     """Return call and length of a measurement."""
-    _refuse(folder, told, "callCustom")
+    _refuse(folder, reported, "callCustom")
     number = {
-        name: checks.finite(f"{folder}: {name}", told.get(name, standard)) for name, standard in _RECORDING.items()
+        name: checks.finite(f"{folder}: {name}", reported.get(name, standard)) for name, standard in _RECORDING.items()
     }
     if number["callEmissions"] != 1:
         raise DataError(
@@ -160,35 +160,35 @@ def _recorded(folder: Path, told: dict[str, Any]) -> Settings:
         duration_s=round(number["callDuration"] / 1e3, 12),
         sample_rate_hz=number["callSampleFrequency"],
     )
-    n_samples = checks.whole(f"{folder}: microphoneSamples", told.get("microphoneSamples", 163_840), 1)
+    n_samples = checks.integer(f"{folder}: microphoneSamples", reported.get("microphoneSamples", 163_840), 1)
     recording = Recording(sample_rate_hz=number["microphoneSampleFrequency"], n_samples=n_samples)
-    return Settings(call=call, recording=recording, processing=suit_ranges(Processing(), recording, call))
+    return Settings(call=call, recording=recording, processing=fit_ranges(Processing(), recording, call))
 
 
-def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Processing:
+def _processed(folder: Path, reported: dict[str, Any], standard: Processing) -> Processing:
     """Return ranges and directions."""
-    _refuse(folder, told, "directionsCustom", "delayMatrixCustom", "rangesCustom")
+    _refuse(folder, reported, "directionsCustom", "delayMatrixCustom", "rangesCustom")
 
     def number(name: str, otherwise: float) -> float:
-        return checks.finite(f"{folder}: {name}", told.get(name, otherwise))
+        return checks.finite(f"{folder}: {name}", reported.get(name, otherwise))
 
     if number("elevation2DAngle", 0.0):
         raise DataError(
-            f"{folder}: elevation2DAngle is {told['elevation2DAngle']:g}, wanted 0; take it out, and give a CSV of "
+            f"{folder}: elevation2DAngle is {reported['elevation2DAngle']:g}, wanted 0; take it out, and give a CSV of "
             "--directions when processing"
         )
     range_m = (number("minRange", standard.range_m[0]), number("maxRange", standard.range_m[1]))
     processing = standard.replace(range_m=range_m)
-    if "directions" not in told:
+    if "directions" not in reported:
         return processing
-    count = checks.whole(f"{folder}: directions", told["directions"], 1)
-    is_flat = told.get("2D", True)
+    count = checks.integer(f"{folder}: directions", reported["directions"], 1)
+    is_flat = reported.get("2D", True)
     if not isinstance(is_flat, bool):
         is_flat = bool(number("2D", 1))
-    planar = not any(_angles_rad(folder, told, _ELEVATIONS)) if _ELEVATIONS in told else is_flat
+    planar = not any(_angles_rad(folder, reported, _ELEVATIONS)) if _ELEVATIONS in reported else is_flat
     azimuth_rad = [-math.pi / 2, math.pi / 2]
-    if planar and _AZIMUTHS in told:
-        azimuth_rad = _angles_rad(folder, told, _AZIMUTHS)
+    if planar and _AZIMUTHS in reported:
+        azimuth_rad = _angles_rad(folder, reported, _AZIMUTHS)
     return processing.replace(
         directions=f"{2 if planar else 3}d:{count}",
         azimuth_limits_deg=(
@@ -199,18 +199,18 @@ def _processed(folder: Path, told: dict[str, Any], standard: Processing) -> Proc
     )
 
 
-def _angles_rad(folder: Path, told: dict[str, Any], name: str) -> list[float]:
+def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float]:
     """Return the angles of all directions."""
-    angles = told[name]
+    angles = reported[name]
     if not isinstance(angles, list) or not angles:
         raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or take it out")
     return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]
 
 
-def _refuse(folder: Path, told: dict[str, Any], *names: str) -> None:
+def _refuse(folder: Path, reported: dict[str, Any], *names: str) -> None:
     """Refuse settings that lie in other files."""
     for name in names:
-        if name in told:
+        if name in reported:
             raise DataError(
-                f"{folder}: {name} is the file {told[name]!r}, which a recording cannot hold; {_NOT_HELD[name]}"
+                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot hold; {_NOT_HELD[name]}"
             )

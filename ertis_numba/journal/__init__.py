@@ -1,7 +1,7 @@
 """Where measurements become durable before anything else is done with them. The only door to sqlite3."""
 
 from ertis_numba.journal._journal import SUFFIX, Journal
-from ertis_numba.journal._records import Entry, Gap, Key, Sensor, require_same
+from ertis_numba.journal._records import Entry, JournalGap, JournalKey, JournalSensor, require_same
 from ertis_numba.journal._rescue import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY
@@ -15,11 +15,11 @@ __all__ = [
     "VERSION",
     "Column",
     "Entry",
-    "Gap",
     "Journal",
-    "Key",
+    "JournalGap",
+    "JournalKey",
+    "JournalSensor",
     "Sealed",
-    "Sensor",
     "require_same",
     "seal_apart",
 ]

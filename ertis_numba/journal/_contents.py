@@ -10,8 +10,8 @@ from typing import Final, Self
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._records import Entry, Gap, Key, Sensor, checked
-from ertis_numba.journal._tables import WHOLE_VERSION, selection
+from ertis_numba.journal._records import Entry, JournalGap, JournalKey, JournalSensor, checked
+from ertis_numba.journal._tables import COMPLETE_VERSION, selection
 
 __all__ = ["SUFFIX", "Contents"]
 
@@ -44,7 +44,7 @@ class Contents:
         self.path = path
         self._database = database
         self._turn = threading.RLock()
-        self._sensors: dict[str, Sensor] = {}
+        self._sensors: dict[str, JournalSensor] = {}
         self._ids: dict[str, int] = {}
         self._unusable: dict[int, tuple[str, str, int]] = {}  # name, reason and measurements, by number
         self._last: dict[tuple[str, int], int] = {}
@@ -60,7 +60,7 @@ class Contents:
         self._identity = rows[0][-1]
         for row in self._database.execute(selection("sensors", "ORDER BY id")):
             try:
-                self._know(row[0], Sensor.from_row(self.path, row))
+                self._register(row[0], JournalSensor.from_row(self.path, row))
             except DamagedError:
                 raise
             except (ArgumentError, DataError) as error:  # the settings of one sensor must not lock up the others
@@ -69,14 +69,14 @@ class Contents:
         counts = self._database.execute(
             "SELECT sensor, epoch, max(sequence), count(*) FROM measurements INDEXED BY key GROUP BY sensor, epoch"
         )
-        for number, epoch, last, count in counts:
+        for number, session_id, last, count in counts:
             if number in self._unusable:
                 name, reason, before = self._unusable[number]
                 self._unusable[number] = name, reason, before + count
                 continue
             if number not in names:
                 raise DamagedError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
-            self._last[names[number], epoch] = last
+            self._last[names[number], session_id] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
         n_rows, n_listed = self._count_rows(), self._n_entries + sum(count for *_, count in self._unusable.values())
@@ -88,7 +88,7 @@ class Contents:
     def _count_rows(self) -> int:
         """Count measurements in the table, as the index was: damage to one of these two trees is noticed."""
         ((version,),) = self._database.execute("PRAGMA user_version")
-        if version == WHOLE_VERSION:
+        if version == COMPLETE_VERSION:
             # Rows may be deleted from the front, so that the first number is not always 1; apart from each other, each
             # takes one look.
             rows = self._database.execute(
@@ -102,7 +102,7 @@ class Contents:
         return int(rows[0][0])
 
     @property
-    def sensors(self) -> Mapping[str, Sensor]:
+    def sensors(self) -> Mapping[str, JournalSensor]:
         """Sensors by name, in the order in which they came."""
         return MappingProxyType(self._sensors)
 
@@ -112,19 +112,19 @@ class Contents:
         return MappingProxyType({name: (reason, count) for name, reason, count in self._unusable.values()})
 
     @property
-    def gaps(self) -> tuple[Gap, ...]:
+    def gaps(self) -> tuple[JournalGap, ...]:
         """What was noted to be missing, in that order."""
         with self._turn:
             rows = self._database.execute(selection("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
         made = (checked(self.path, "a gap", row) for row in rows)
         return tuple(
-            Gap(names[number], first, last, why, epoch)
-            for number, epoch, first, last, why in made
+            JournalGap(names[number], first, last, why, session_id)
+            for number, session_id, first, last, why in made
             if number not in self._unusable
         )
 
-    def index(self, sensor: str | None = None) -> list[Key]:
+    def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
         number = None if sensor is None else self._ids[self._sensor(sensor).name]
         with self._turn:
@@ -133,18 +133,20 @@ class Contents:
                 (number,),
             )
         names = {number: name for name, number in self._ids.items()}
-        return sorted(Key(place, names[number], *rest) for place, number, *rest in rows if number not in self._unusable)
+        return sorted(
+            JournalKey(place, names[number], *rest) for place, number, *rest in rows if number not in self._unusable
+        )
 
-    def newest(self, n_most: int) -> list[tuple[str, int, int, int]]:
+    def newest(self, n_max: int) -> list[tuple[str, int, int, int]]:
         """Return sensor, epoch, number and CRC-32 of the newest measurements, without reading their words."""
         with self._turn:
             rows = self._database.execute(
-                "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_most,)
+                "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_max,)
             )
         names = {number: name for name, number in self._ids.items()}
         return [(names[number], *rest) for number, *rest in reversed(rows) if number in names]
 
-    def find(self, sensor: str, epoch: int, sequence: int) -> Key:
+    def find(self, sensor: str, session_id: int, sequence: int) -> JournalKey:
         """Return where a measurement is.
 
         Raises
@@ -155,15 +157,15 @@ class Contents:
         with self._turn:
             rows = self._database.execute(
                 "SELECT id FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence = ?",
-                (self._ids[self._sensor(sensor).name], epoch, sequence),
+                (self._ids[self._sensor(sensor).name], session_id, sequence),
             )
         if not rows:
             raise DamagedError(
                 f"{self.path} has no measurement {sequence} of sensor {sensor}; copy it again if you can"
             )
-        return Key(rows[0][0], sensor, epoch, sequence)
+        return JournalKey(rows[0][0], sensor, session_id, sequence)
 
-    def entry(self, key: Key) -> Entry:
+    def entry(self, key: JournalKey) -> Entry:
         """Return a measurement, whose words are read-only.
 
         Raises
@@ -175,7 +177,7 @@ class Contents:
         """
         with self._turn:
             rows = self._database.execute(_SELECTION, (key.place,))
-        if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.epoch, key.sequence):
+        if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.session_id, key.sequence):
             raise DamagedError(
                 f"{self.path} has lost the record of measurement {key.sequence} of sensor {key.sensor}: it is "
                 "damaged; copy it again if you can"
@@ -194,12 +196,12 @@ class Contents:
         """
         return (self.entry(key) for key in self.index(sensor))
 
-    def _sensor(self, name: str) -> Sensor:
+    def _sensor(self, name: str) -> JournalSensor:
         if name not in self._sensors:
             raise ArgumentError(f"sensor {name!r} is not in {self.path}; add it first")
         return self._sensors[name]
 
-    def _know(self, number: int, sensor: Sensor) -> None:
+    def _register(self, number: int, sensor: JournalSensor) -> None:
         self._ids[sensor.name] = number
         self._sensors[sensor.name] = sensor
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from ertis_numba.atomic import sync
-from ertis_numba.errors import DamagedError, DataError, FormatVersionError, InUseError
+from ertis_numba.atomic_files import fsync
+from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
 from ertis_numba.journal._files import beside
 from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
 
@@ -33,7 +33,7 @@ _SETUP: Final = (
     f"PRAGMA cache_size = -{_CACHE_KIB}",
 )
 
-_TOLD: Final = {
+_REPORTED: Final = {
     sqlite3.SQLITE_FULL: "has no room on its disk; free some space: what was committed before is safe",
     sqlite3.SQLITE_IOERR: "cannot be written or read ({}); check the disk: what was committed before is safe",
     sqlite3.SQLITE_READONLY: "cannot be written ({}); allow writing to the file and to its folder",
@@ -67,11 +67,11 @@ class Database:
         self._is_log_named = False  # whether the folder durably has the name of the log that is written
         self._is_folder_synced = True
         self._ends: dict[str, int] = {}  # of the tables before a commit, until it is known to be one
-        with self._told():
+        with self._reported():
             self._file = before = path.stat()
             if not before.st_size and not empty:  # to lock it would make a database of it
                 raise DataError(f"{path} is empty; give a journal that 'ertis capture' left")
-            for log, least_bytes in _least(path):  # SQLite would throw the log away, or make up the rest with zeros
+            for log, least_bytes in _smallest(path):  # SQLite would throw the log away, or make up the rest with zeros
                 if before.st_size < least_bytes:
                     raise DamagedError(
                         f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; "
@@ -81,7 +81,7 @@ class Database:
             # Who uses a journal sees to it that two threads do not use it at once.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
         try:
-            with self._told():
+            with self._reported():
                 self.is_new = self._take(before, empty=empty)
         except BaseException:
             self._connection.close()
@@ -133,7 +133,7 @@ class Database:
         if self._is_folder_synced:
             return
         try:
-            sync(self._path.parent)
+            fsync(self._path.parent)
         except OSError as error:
             raise DataError(
                 f"{self._path.parent}: {error.strerror}; check the disk: what was committed before is safe"
@@ -180,7 +180,7 @@ class Database:
         """Return True if the path still leads to the open file."""
         try:
             self._require_there(self._file)
-        except (InUseError, OSError):
+        except (JournalInUseError, OSError):
             return False
         return True
 
@@ -188,7 +188,7 @@ class Database:
         """Refuse a file that has lost its name: who had locked it may have sealed and removed it."""
         now = self._path.stat() if self._path.exists() else None
         if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
-            raise InUseError(f"{self._path} was removed or replaced by another process; look again")
+            raise JournalInUseError(f"{self._path} was removed or replaced by another process; look again")
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
@@ -202,14 +202,14 @@ class Database:
         DataError
             The disk is full, fails or may not be written, the file is closed.
         """
-        with self._told():
+        with self._reported():
             return self._connection.execute(statement, values).fetchall()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Make what happens in the block durable when it ends, all or nothing; when it raises, no row was added."""
         self._sync_folder()
-        self._take_back()
+        self._withdraw()
         with self._all_or_nothing():
             self._ends = self._find_ends()
             yield
@@ -230,7 +230,7 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
             with suppress(DataError):  # the next transaction tries it again
-                self._take_back()
+                self._withdraw()
             raise
 
     def _find_ends(self) -> dict[str, int]:
@@ -240,7 +240,7 @@ class Database:
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
         return dict(zip(tables, ends, strict=True))
 
-    def _take_back(self) -> None:
+    def _withdraw(self) -> None:
         """Delete what a commit has added that failed all the same: in its very last step, when all was written."""
         if ends := self._ends:
             self._ends = {}
@@ -267,7 +267,7 @@ class Database:
         DataError
             The disk is full or fails.
         """
-        with self._told():
+        with self._reported():
             copy = sqlite3.connect(path, isolation_level=None)
             try:
                 self._connection.backup(copy)
@@ -294,7 +294,7 @@ class Database:
         self._connection.close()
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _reported(self) -> Iterator[None]:
         """Tell errors in the words of this package, in a line that names the file."""
         try:
             yield
@@ -308,19 +308,19 @@ class Database:
                 code = sqlite3.SQLITE_CORRUPT
             code &= 0xFF  # without what SQLite adds to a code
             if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
-                raise InUseError(
+                raise JournalInUseError(
                     f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
                 ) from error
-            told = _TOLD.get(code, "cannot be used ({}); check the disk")
+            reported = _REPORTED.get(code, "cannot be used ({}); check the disk")
             kind = DamagedError if code == sqlite3.SQLITE_CORRUPT else DataError
-            raise kind(f"{self._path} {told.format(_line(error))}") from error
+            raise kind(f"{self._path} {reported.format(_line(error))}") from error
         except UnicodeError as error:  # from texts that are damaged
-            raise DamagedError(f"{self._path} {_TOLD[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
+            raise DamagedError(f"{self._path} {_REPORTED[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
 
 
-def _least(path: Path) -> Iterator[tuple[Path, int]]:
+def _smallest(path: Path) -> Iterator[tuple[Path, int]]:
     """Yield the logs beside a file, and how long the file has to be for each."""
     log = beside(path, "-wal")
     if log.exists() and log.stat().st_size:

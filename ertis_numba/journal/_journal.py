@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
-from ertis_numba.atomic import sync
+from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal._contents import SUFFIX
 from ertis_numba.journal._database import Database
@@ -134,7 +134,7 @@ class Journal(Rows):
         return opened
 
     @staticmethod
-    def give_up(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
+    def abandon(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
         """Limit a closed journal durably to its acknowledged measurements.
 
         After a failed sync, a journal may show rows that never reach the disk. Close the journal, give it up, and store
@@ -157,15 +157,17 @@ class Journal(Rows):
             note_limit(path, acked)
             return
         unlink_all(path)
-        sync(path.parent)
+        fsync(path.parent)
 
     def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
         """Delete rows above the limit."""
-        runs = {(key.sensor, key.epoch) for key in self.index()} | {(gap.sensor, gap.epoch) for gap in self.gaps}
+        runs = {(key.sensor, key.session_id) for key in self.index()} | {
+            (gap.sensor, gap.session_id) for gap in self.gaps
+        }
         with self._database.transaction():
             self._database.execute(f"PRAGMA user_version = {VERSION}")  # numbers of rows may have holes now
-            for sensor, epoch in sorted(runs):
-                above = self._ids[sensor], epoch, acked.get((sensor, epoch), -1)
+            for sensor, session_id in sorted(runs):
+                above = self._ids[sensor], session_id, acked.get((sensor, session_id), -1)
                 self._database.execute(
                     "DELETE FROM measurements WHERE sensor = ? AND epoch = ? AND sequence > ?", above
                 )
@@ -227,7 +229,7 @@ class Journal(Rows):
                 unlink_all(self.path)  # the log stays where the disk was too full to take it in, and means nothing then
             finally:
                 self.close()
-            sync(self.path.parent)
+            fsync(self.path.parent)
 
     def set_aside(self, end: str = "damaged") -> Path:
         """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that.
@@ -250,7 +252,7 @@ class Journal(Rows):
                 self.path.rename(aside)
             finally:
                 self.close()
-            sync(self.path.parent)
+            fsync(self.path.parent)
         return aside
 
     def close(self) -> None:

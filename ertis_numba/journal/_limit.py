@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic import replacing
+from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import DamagedError, DataError
 
 __all__ = ["LIMIT", "limit_of", "note_limit"]
@@ -34,9 +34,9 @@ def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     OSError, DataError
         The file cannot be written.
     """
-    runs: list[list[str | int]] = [[sensor, epoch, last] for (sensor, epoch), last in acked.items()]
+    runs: list[list[str | int]] = [[sensor, session_id, last] for (sensor, session_id), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})
-    with replacing(_beside(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
+    with atomic_write(_beside(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
         part.write_text(text, "utf-8")
 
 
@@ -54,7 +54,7 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
     try:
         content = json.loads(place.read_bytes())
         runs = content["runs"]
-        limit = {(sensor, epoch): last for sensor, epoch, last in runs}
+        limit = {(sensor, session_id): last for sensor, session_id, last in runs}
         is_sound = content["crc32"] == _check(runs)
     except FileNotFoundError:
         return None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.journal._database import PAGE_BYTES
 
-__all__ = ["Log", "read_log"]
+__all__ = ["WriteAheadLog", "read_log"]
 
 _HEADER_BYTES: Final = 32
 _FRAME: Final = struct.Struct(">6I")  # page, pages after a commit or 0, two salts, two checksums
@@ -27,7 +27,7 @@ _PAGE_BYTES: Final = range(512, 65_537)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Log:
+class WriteAheadLog:
     """A write-ahead log as stored on the disk.
 
     Attributes
@@ -69,7 +69,7 @@ class Log:
         return bytes(made)
 
 
-def read_log(path: Path) -> Log | None:
+def read_log(path: Path) -> WriteAheadLog | None:
     """Return the write-ahead log beside a journal; None if there is none, or none that SQLite could have written."""
     try:
         content = path.with_name(f"{path.name}-wal").read_bytes()
@@ -94,7 +94,7 @@ def read_log(path: Path) -> Log | None:
     commits = np.flatnonzero(same & (heads[:, 1] > 0))
     n_sound = n_frames if sound.all() else int(np.argmin(sound))
     n_read = max((int(place) + 1 for place in commits if place < n_sound and is_begun), default=0)
-    return Log(
+    return WriteAheadLog(
         content=content,
         n_read=n_read,
         n_frames=int(commits[-1]) + 1 if len(commits) else 0,
@@ -126,8 +126,8 @@ def _guess_header(content: bytes) -> bytes:
     """Return a header for the frames after a damaged header, with the salts that most of them have."""
     frame_bytes = _FRAME.size + PAGE_BYTES
     salts = Counter(content[place : place + 8] for place in range(_HEADER_BYTES + 8, len(content), frame_bytes))
-    most = max(salts, key=salts.__getitem__, default=b"").ljust(8, b"\0")
-    words = struct.pack(">4I8s", _MAGIC, _VERSION, PAGE_BYTES, 0, most)
+    largest = max(salts, key=salts.__getitem__, default=b"").ljust(8, b"\0")
+    words = struct.pack(">4I8s", _MAGIC, _VERSION, PAGE_BYTES, 0, largest)
     return words + _header_check(words, big_endian=False)
 
 

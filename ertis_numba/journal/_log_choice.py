@@ -13,10 +13,10 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic import sync
+from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import DamagedError, DataError
 from ertis_numba.journal._files import beside, keep_damaged_log
-from ertis_numba.journal._log import Log
+from ertis_numba.journal._log import WriteAheadLog
 
 try:
     import fcntl
@@ -28,7 +28,7 @@ __all__ = ["choose_log"]
 _LOCK_BYTES: Final = (0x40000000, 512)  # of SQLite, see https://sqlite.org/lockingv3.html
 
 
-def choose_log(path: Path, log: Log) -> None:
+def choose_log(path: Path, log: WriteAheadLog) -> None:
     """Replace a damaged log that would ruin its journal, and keep the damaged one beside it.
 
     The log stays if the journal is sound with the part that SQLite reads. Otherwise the log is repaired, so that all
@@ -59,7 +59,7 @@ def choose_log(path: Path, log: Log) -> None:
             raise DataError(f"{path}: {error.strerror}; make room for a copy of it, as its log is damaged") from error
 
 
-def _sound(path: Path, log: Log) -> bytes:
+def _sound(path: Path, log: WriteAheadLog) -> bytes:
     """Return the first content of the log with which a copy of the journal is sound."""
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         copy = Path(folder) / path.name
@@ -83,7 +83,7 @@ def _install(path: Path, damaged: bytes, chosen: bytes) -> None:
         os.fsync(file.fileno())
     made.replace(beside(path, "-wal"))
     beside(path, "-shm").unlink(missing_ok=True)
-    sync(path.parent)
+    fsync(path.parent)
 
 
 @contextmanager

@@ -14,14 +14,14 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsE
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import mounting, received_settings, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
-from ertis_numba.words import word_format
 
-__all__ = ["Entry", "Gap", "Key", "Sensor", "checked", "require_same"]
+__all__ = ["Entry", "JournalGap", "JournalKey", "JournalSensor", "checked", "require_same"]
 
 _INT64 = (-(2**63), 2**63 - 1)
 _UNKNOWN = 7 * (0.0,)  # stands for an unknown mounting: translation, and a rotation that no mounting has
-_MOST_BYTES = 999_000_000  # of one measurement: SQLite's limit, less the rest of the row
+_MAX_BYTES = 999_000_000  # of one measurement: SQLite's limit, less the rest of the row
 
 
 @dataclass(slots=True, eq=False)
@@ -43,32 +43,32 @@ class Entry:
     crc32: int | None = None
 
 
-class Key(NamedTuple):
+class JournalKey(NamedTuple):
     """Which measurement a row is; ``place`` counts all of a journal in order of arrival."""
 
     place: int
     sensor: str
-    epoch: int
+    session_id: int
     sequence: int
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class JournalGap:
     """Sequence numbers of a run of a sensor that are missing, ``first`` and ``last`` included, and why."""
 
     sensor: str
     first: int
     last: int
     reason: str
-    epoch: int
+    session_id: int
 
     def __post_init__(self) -> None:
-        checks.gap(self.first, self.last, self.reason)
-        checks.whole("epoch", self.epoch, 0, _INT64[1])
+        checks.sequence_gap(self.first, self.last, self.reason)
+        checks.integer("session_id", self.session_id, 0, _INT64[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sensor:
+class JournalSensor:
     """A sensor whose measurements a journal takes.
 
     Attributes
@@ -107,7 +107,7 @@ class Sensor:
     ) -> Self:
         """Return a sensor, or refuse what no recording could hold."""
         settings = storable(settings)
-        words = word_format(settings)
+        words = sample_format(settings)
         place = mounting(checks.sensor_name(name), translation_m, rotation_xyzw)
         made = cls(
             name=name,
@@ -118,10 +118,10 @@ class Sensor:
             shape=words.shape,
             dtype=words.dtype,
         )
-        if made.n_bytes > _MOST_BYTES:
+        if made.n_bytes > _MAX_BYTES:
             raise ArgumentError(
                 f"a measurement of sensor {name} has {made.n_bytes / 1e6:.0f} MB, which a journal cannot hold; give "
-                f"fewer samples, {_MOST_BYTES / 1e6:.0f} MB at most"
+                f"fewer samples, {_MAX_BYTES / 1e6:.0f} MB at most"
             )
         return made
 
@@ -150,21 +150,21 @@ class Sensor:
     def entry_row(self, entry: Entry, sensor_id: int) -> tuple[Any, ...]:
         """Return what stands in the table of measurements; refuse words that are not those of this sensor."""
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
-        words = self._words(entry.measurement.words)
+        words = self._words(entry.measurement.data)
         if entry.crc32 is None:
             entry.crc32 = zlib.crc32(words.data)
         values = (
             sensor_id,
-            checks.whole("epoch", stamp.epoch, 0, _INT64[1]),
-            checks.whole("sequence", stamp.sequence, 0, _INT64[1]),
-            checks.whole("sync_count", stamp.sync_count, *_INT64),
-            checks.whole("timestamp_ns", stamp.timestamp_ns, *_INT64),
-            checks.whole("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1),
-            checks.whole("monotonic_ns", entry.monotonic_ns, *_INT64),
+            checks.integer("session_id", stamp.session_id, 0, _INT64[1]),
+            checks.integer("sequence", stamp.sequence, 0, _INT64[1]),
+            checks.integer("sync_count", stamp.sync_count, *_INT64),
+            checks.integer("timestamp_ns", stamp.timestamp_ns, *_INT64),
+            checks.integer("timestamp_uncertainty_ns", stamp.timestamp_uncertainty_ns, 0, 2**32 - 1),
+            checks.integer("monotonic_ns", entry.monotonic_ns, *_INT64),
             float(air.temperature_c),
             float(air.humidity_percent),
             float(air.pressure_pa),
-            checks.whole("crc32", entry.crc32, 0, 2**32 - 1),
+            checks.integer("crc32", entry.crc32, 0, 2**32 - 1),
         )
         return (*values, row_crc32(values), words)
 
@@ -184,7 +184,9 @@ class Sensor:
         """
         *values, words = row
         what = f"measurement {row[3]} of sensor {self.name}"
-        _, epoch, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(path, what, values)
+        _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(
+            path, what, values
+        )
         if not isinstance(words, bytes):  # the record of their type is damaged
             words = b""
         got = zlib.crc32(words)
@@ -202,7 +204,7 @@ class Sensor:
             sync_count=sync_count,
             timestamp_ns=time_ns,
             timestamp_uncertainty_ns=uncertainty_ns,
-            epoch=epoch,
+            session_id=session_id,
         )
         array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
         return Entry(Measurement(array, settings, stamp), monotonic_ns, crc32)
@@ -220,7 +222,7 @@ def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
     return values
 
 
-def require_same(sensor: Sensor, settings: Settings) -> None:
+def require_same(sensor: JournalSensor, settings: Settings) -> None:
     """Refuse what the settings of a sensor do not describe: all but the air must be equal."""
     came = self_contained(settings)
     for name in ("array", "call", "recording"):

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._files import keep_damaged_log
-from ertis_numba.journal._log import Log
-from ertis_numba.journal._records import Entry, Gap, Sensor, checked
+from ertis_numba.journal._log import WriteAheadLog
+from ertis_numba.journal._records import Entry, JournalGap, JournalSensor, checked
 from ertis_numba.journal._tables import selection
 
 if TYPE_CHECKING:
@@ -36,15 +36,15 @@ class _Found:
     """
 
     header: list[Any] = field(default_factory=list)
-    sensors: list[Sensor] = field(default_factory=list)
+    sensors: list[JournalSensor] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)
-    gaps: list[Gap] = field(default_factory=list)
-    lost: list[Gap] = field(default_factory=list)
+    gaps: list[JournalGap] = field(default_factory=list)
+    lost: list[JournalGap] = field(default_factory=list)
     n_unreadable: int = 0
     is_complete: bool = False
 
 
-def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
+def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) -> str:
     """Recover rows of a damaged log that SQLite does not read, and note lost numbers as gaps.
 
     Parameters
@@ -74,38 +74,40 @@ def rescue(journal: "Journal", database: Database, log: Log | None) -> str:
             kept = keep_damaged_log(journal.path, log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
-    untold = [] if found is None else _add(journal, found)
+    unrecorded = [] if found is None else _add(journal, found)
     if n_commits and found is None and not missing:
-        untold.append(f"{n_commits} commits of unknown content")
+        unrecorded.append(f"{n_commits} commits of unknown content")
     if found is not None:
-        untold += _note(journal, found.lost)
+        unrecorded += _note(journal, found.lost)
     is_complete = found is not None and found.is_complete
-    untold += _note(journal, _missing(journal) if is_complete else missing)  # or what the sensor skipped would be lost
-    if kept and not (untold or missing or found is None or found.entries or found.gaps or found.lost):
+    unrecorded += _note(
+        journal, _missing(journal) if is_complete else missing
+    )  # or what the sensor skipped would be lost
+    if kept and not (unrecorded or missing or found is None or found.entries or found.gaps or found.lost):
         kept.unlink(missing_ok=True)  # only rows that were deleted meanwhile
-    return "; ".join(untold)
+    return "; ".join(unrecorded)
 
 
-def _note(journal: "Journal", gaps: Iterable[Gap]) -> list[str]:
+def _note(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
     """Note lost numbers as gaps, and return the losses of sensors that the journal does not have."""
-    untold = []
+    unrecorded = []
     for gap in list(gaps):
         if gap.sensor in journal.sensors:
             journal.note_gaps(list(_holes(journal, gap)))
         else:
-            untold.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
-    return untold
+            unrecorded.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
+    return unrecorded
 
 
 def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
     """Yield the numbers that a journal holds or lists as gaps: run, first and last number."""
     for key in journal.index():
-        yield (key.sensor, key.epoch), key.sequence, key.sequence
+        yield (key.sensor, key.session_id), key.sequence, key.sequence
     for gap in journal.gaps:
-        yield (gap.sensor, gap.epoch), gap.first, gap.last
+        yield (gap.sensor, gap.session_id), gap.first, gap.last
 
 
-def _missing(journal: "Journal") -> Iterator[Gap]:
+def _missing(journal: "Journal") -> Iterator[JournalGap]:
     """Yield the numbers that the tally lists and the journal lacks."""
     if not journal.tally.marks:
         return
@@ -115,20 +117,20 @@ def _missing(journal: "Journal") -> Iterator[Gap]:
     for run, mark in journal.tally.marks.items():
         before = max(highest.get(run, -1), mark.first - 1, mark.discarded)
         if mark.last > before:
-            yield Gap(mark.sensor, before + 1, mark.last, LOST, mark.epoch)
+            yield JournalGap(mark.sensor, before + 1, mark.last, LOST, mark.session_id)
 
 
-def _holes(journal: "Journal", gap: Gap) -> Iterator[Gap]:
+def _holes(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
     """Yield the parts of a gap without any number that the journal holds."""
     begin = gap.first
-    held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.epoch))
+    held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.session_id))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
         if begin < first <= gap.last + 1:
-            yield Gap(gap.sensor, begin, first - 1, gap.reason, gap.epoch)
+            yield JournalGap(gap.sensor, begin, first - 1, gap.reason, gap.session_id)
         begin = max(begin, last + 1)
 
 
-def _read_copy(journal: "Journal", database: Database, log: Log) -> _Found:
+def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _Found:
     """Read the rows that the journal lacks from a copy of it with the repaired log.
 
     Each row has a checksum of its own, so a wrong repair does not yield wrong rows.
@@ -157,7 +159,7 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
     with suppress(DamagedError, ValueError):
         (row,) = repaired.execute(selection("journal"))
         found.header = checked(journal.path, "the journal", row)
-    sensors = {row[0]: Sensor.from_row(journal.path, row) for row in repaired.execute(selection("sensors"))}
+    sensors = {row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(selection("sensors"))}
     found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
     ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
     rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", ends[:1])
@@ -169,14 +171,14 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
             found.entries.append(sensors[record[0]].entry(journal.path, row))
         except (DamagedError, KeyError, ValueError):
             if record and record[0] in sensors:
-                found.lost.append(Gap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
+                found.lost.append(JournalGap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
             else:
                 found.n_unreadable += 1
     gaps = repaired.execute(selection("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
     for row in gaps:
         with suppress(DamagedError, KeyError):
-            number, epoch, first, last, reason = checked(journal.path, "a gap", row)
-            found.gaps.append(Gap(sensors[number].name, first, last, reason, epoch))
+            number, session_id, first, last, reason = checked(journal.path, "a gap", row)
+            found.gaps.append(JournalGap(sensors[number].name, first, last, reason, session_id))
     found.is_complete = (
         not found.n_unreadable
         and len(found.gaps) == len(gaps)

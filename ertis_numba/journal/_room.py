@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic import SPARE_BYTES
-from ertis_numba.errors import DataError, NoRoomError
+from ertis_numba.atomic_files import RESERVED_BYTES
+from ertis_numba.errors import DataError, DiskFullError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
 __all__ = ["left", "recording_bytes", "require"]
 
-_SPARE_BYTES: Final = SPARE_BYTES + 1_000_000  # what sealing wants to keep free while it writes, and a little more
+_SPARE_BYTES: Final = RESERVED_BYTES + 1_000_000  # what sealing wants to keep free while it writes, and a little more
 _SENSOR_BYTES: Final = 150_000  # a recording's tables: 90 kB were measured, and the settings may be longer
 _ROW_BYTES: Final = 150  # in these tables
 _KEPT_PAGES: Final = 6  # that a commit changes, beside one for each of its measurements
@@ -52,7 +52,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
     for folder, wanted_bytes in _wanted(path, target, journal_bytes, seals_bytes).items():
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
-            raise NoRoomError(
+            raise DiskFullError(
                 f"{folder} has {free_bytes / 1e6:.1f} MB free, wanted {wanted_bytes / 1e6:.1f} MB so that {path.name} "
                 "can be sealed with more in it; what it holds is safe: end the capture, or free some space"
             )

@@ -10,7 +10,7 @@ from ertis_numba.journal import _room
 from ertis_numba.journal._contents import Contents
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._files import disk_errors
-from ertis_numba.journal._records import Entry, Gap, Sensor, require_same
+from ertis_numba.journal._records import Entry, JournalGap, JournalSensor, require_same
 from ertis_numba.journal._tables import VERSION, insertion, row_crc32
 from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings
@@ -63,13 +63,15 @@ class Rows(Contents):
         DataError
             The journal cannot be written.
         """
-        made = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
+        made = JournalSensor.of(
+            name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
+        )
         with self._turn:
             if name in self._sensors:
                 raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor a name of its own")
             with self._database.transaction():
                 self._insert("sensors", made.row())
-            self._know(len(self._ids) + len(self._unusable) + 1, made)
+            self._register(len(self._ids) + len(self._unusable) + 1, made)
 
     def append(self, entries: Sequence[Entry]) -> None:
         """Make measurements durable: when this returns they are, all of them; when it raises, none is there.
@@ -109,7 +111,7 @@ class Rows(Contents):
             self._held_bytes += sum(sizes_bytes)
             first: dict[tuple[str, int], int] = {}
             for stamp in (entry.measurement.stamp for entry in entries):
-                first.setdefault((stamp.sensor, stamp.epoch), stamp.sequence)
+                first.setdefault((stamp.sensor, stamp.session_id), stamp.sequence)
             for run, number in first.items():
                 self.tally.grow(*run, number, last[run])
 
@@ -121,7 +123,7 @@ class Rows(Contents):
             require_same(sensor, settings)
             self._accepted[sensor.name] = settings
         row = sensor.entry_row(entry, self._ids[sensor.name])
-        key = (sensor.name, stamp.epoch)
+        key = (sensor.name, stamp.session_id)
         if stamp.sequence <= last.get(key, -1):
             raise ArgumentError(
                 f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in order, or "
@@ -130,7 +132,7 @@ class Rows(Contents):
         last[key] = stamp.sequence
         return row
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Say durably why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
 
         Raises
@@ -141,9 +143,9 @@ class Rows(Contents):
         DataError
             The journal cannot be written.
         """
-        self.note_gaps([Gap(sensor, first, last, reason, epoch)])
+        self.note_gaps([JournalGap(sensor, first, last, reason, session_id)])
 
-    def note_gaps(self, gaps: Sequence[Gap]) -> None:
+    def note_gaps(self, gaps: Sequence[JournalGap]) -> None:
         """Say durably what is missing, all of it or nothing.
 
         Raises
@@ -155,15 +157,16 @@ class Rows(Contents):
         """
         with self._turn:
             rows = [
-                (self._ids[self._sensor(gap.sensor).name], gap.epoch, gap.first, gap.last, gap.reason) for gap in gaps
+                (self._ids[self._sensor(gap.sensor).name], gap.session_id, gap.first, gap.last, gap.reason)
+                for gap in gaps
             ]
             with self._database.transaction():
                 for row in rows:
                     self._insert("gaps", row)
             for gap in gaps:
-                self.tally.grow(gap.sensor, gap.epoch, gap.first, gap.last)
+                self.tally.grow(gap.sensor, gap.session_id, gap.first, gap.last)
 
-    def discard(self, sensor: str, epoch: int, up_to: int) -> int:
+    def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
 
         From the first time on, the numbers of rows have holes, as those of several sensors lie between each other; so
@@ -172,7 +175,7 @@ class Rows(Contents):
         Parameters
         ----------
         sensor : str
-        epoch : int
+        session_id : int
         up_to : int
             The last sequence number to be deleted. Of a gap that goes on beyond it, everything stays.
 
@@ -189,13 +192,13 @@ class Rows(Contents):
             The journal cannot be written.
         """
         known = self._sensor(sensor)
-        which = self._ids[known.name], epoch, up_to
+        which = self._ids[known.name], session_id, up_to
         with self._turn:
             # Deleted measurements are not secret. Some builds of SQLite overwrite them, which takes as long as storing.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
             with disk_errors(self.tally.path):
-                self.tally.discard(sensor, epoch, up_to)
+                self.tally.discard(sensor, session_id, up_to)
             with self._database.transaction():
                 if self._database.execute("PRAGMA user_version") != [(VERSION,)]:
                     self._database.execute(f"PRAGMA user_version = {VERSION}")

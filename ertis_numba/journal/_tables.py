@@ -10,7 +10,7 @@ __all__ = [
     "APPLICATION_ID",
     "TABLES",
     "VERSION",
-    "WHOLE_VERSION",
+    "COMPLETE_VERSION",
     "Column",
     "insertion",
     "layout",
@@ -24,7 +24,7 @@ APPLICATION_ID: Final = 0x6552544A
 VERSION: Final = 2
 """The highest of a journal: 1 until measurements are discarded from it, 2 from then on."""
 
-WHOLE_VERSION: Final = 1
+COMPLETE_VERSION: Final = 1
 """Of a journal whose rows have no holes in their numbers, but for what is missing from the front."""
 
 
@@ -51,7 +51,7 @@ class Column:
 _ID = Column("id", "INTEGER", "order of arrival, from 1")
 _CHECK = Column("row_crc32", "INTEGER", "CRC-32 over the columns before it without id")
 _SENSOR = Column("sensor", "INTEGER", "id of the sensor")
-_EPOCH = Column("epoch", "INTEGER", "run of the sensor, chosen at random whenever sequence numbers start again")
+_SESSION_ID = Column("epoch", "INTEGER", "run of the sensor, chosen at random whenever sequence numbers start again")
 
 TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "journal": (
@@ -82,7 +82,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "measurements": (
         _ID,
         _SENSOR,
-        _EPOCH,
+        _SESSION_ID,
         Column("sequence", "INTEGER", "number given at capture; it rises within an epoch of a sensor"),
         Column("sync_count", "INTEGER", "pulse of the SYNC chain, equal for sensors that emitted together"),
         Column("timestamp_ns", "INTEGER", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
@@ -98,7 +98,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "gaps": (
         _ID,
         _SENSOR,
-        _EPOCH,
+        _SESSION_ID,
         Column("first", "INTEGER", "first missing sequence number"),
         Column("last", "INTEGER", "last missing sequence number"),
         Column("reason", "TEXT", "why they are missing"),
@@ -116,7 +116,7 @@ def layout() -> Iterable[str]:
         yield f"CREATE TABLE {table} ({kinds})"
     yield "CREATE UNIQUE INDEX key ON measurements (sensor, epoch, sequence)"
     yield f"PRAGMA application_id = {APPLICATION_ID}"
-    yield f"PRAGMA user_version = {WHOLE_VERSION}"
+    yield f"PRAGMA user_version = {COMPLETE_VERSION}"
 
 
 def insertion(table: str) -> str:

@@ -28,7 +28,7 @@ class Mark:
     Attributes
     ----------
     sensor : str
-    epoch : int
+    session_id : int
     first, last : int
         First and last number of the stored measurements and gaps.
     discarded : int
@@ -36,7 +36,7 @@ class Mark:
     """
 
     sensor: str
-    epoch: int
+    session_id: int
     first: int
     last: int
     discarded: int = -1
@@ -89,12 +89,12 @@ class Tally:
         self.damage = blocks.pop(0, {}).get("damage", "")
         for place, block in blocks.items():
             mark = Mark(**block)
-            self._places[mark.sensor, mark.epoch] = place
-            self.marks[mark.sensor, mark.epoch] = mark
+            self._places[mark.sensor, mark.session_id] = place
+            self.marks[mark.sensor, mark.session_id] = mark
 
-    def grow(self, sensor: str, epoch: int, first: int, last: int) -> None:
+    def grow(self, sensor: str, session_id: int, first: int, last: int) -> None:
         """Note that numbers are stored; if the disk is full, this is skipped, and their loss would go unnoticed."""
-        mark = self.marks.setdefault((sensor, epoch), Mark(sensor, epoch, first, last))
+        mark = self.marks.setdefault((sensor, session_id), Mark(sensor, session_id, first, last))
         mark.last = max(mark.last, last)
         with suppress(OSError):
             self._put(mark)
@@ -105,7 +105,7 @@ class Tally:
         with suppress(OSError):
             self._begin()
 
-    def discard(self, sensor: str, epoch: int, up_to: int) -> None:
+    def discard(self, sensor: str, session_id: int, up_to: int) -> None:
         """Note durably that numbers may be deleted.
 
         Raises
@@ -113,7 +113,7 @@ class Tally:
         OSError
             The file cannot be written.
         """
-        mark = self.marks.get((sensor, epoch))
+        mark = self.marks.get((sensor, session_id))
         if mark is not None and up_to > mark.discarded:
             mark.discarded = up_to
             self._put(mark)
@@ -139,7 +139,7 @@ class Tally:
                 self._put(mark)
 
     def _put(self, mark: Mark) -> None:
-        place = self._places.setdefault((mark.sensor, mark.epoch), max(self._places.values(), default=0) + 1)
+        place = self._places.setdefault((mark.sensor, mark.session_id), max(self._places.values(), default=0) + 1)
         if self._descriptor < 0:
             self._begin()
         self._write(place, {name: getattr(mark, name) for name in _FIELDS})

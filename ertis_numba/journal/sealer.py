@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Thread
 from typing import IO, Any
 
-from ertis_numba.errors import DataError, InUseError
+from ertis_numba.errors import DataError, JournalInUseError
 
 __all__ = ["Sealed", "seal_apart"]
 
@@ -60,17 +60,19 @@ class Sealed:
         """What is not as its user would expect, in a line; empty where all is well."""
         if self.recording is None and not self.refused:
             return f"{self.journal}: no measurement was captured"
-        told = []
+        reported = []
         if self.lost or self.damage:
-            told.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
+            reported.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
         if self.damage:
-            told.append(f"also lost: {self.damage}")
+            reported.append(f"also lost: {self.damage}")
         if self.damaged:
-            told.append("1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged")
-        told += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
+            reported.append(
+                "1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged"
+            )
+        reported += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
         if self.set_aside is not None:
-            told.append(f"the journal is kept as {self.set_aside}")
-        return "; ".join(told)
+            reported.append(f"the journal is kept as {self.set_aside}")
+        return "; ".join(reported)
 
 
 def seal_apart(
@@ -107,22 +109,22 @@ def seal_apart(
         The process was ended; the text of this error says where the measurements are.
     """
     # -P: a file in the current folder that is named like one of Python's must not be taken for it.
-    command = [sys.executable, "-P", "-m", "ertis_numba.storage._sealing_process", "--json"]
-    told: dict[str, Any] = {}
+    command = [sys.executable, "-P", "-m", "ertis_numba.storage.sealing_process", "--json"]
+    reported: dict[str, Any] = {}
     try:
         chosen = [*(["--force"] if overwrite else []), *([] if rests is None else [f"--rests={rests}"])]
-        reason = _run([*command, *chosen, "--", str(journal)], told, progress)
+        reason = _run([*command, *chosen, "--", str(journal)], reported, progress)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(_where(journal, told)) from error
-    if "recording" in told:
-        return _sealed(told)
-    if told.get("in_use"):
-        raise InUseError(told["error"])
-    raise DataError(told.get("error") or f"{journal}: the process that seals it {reason}; seal it again")
+        raise KeyboardInterrupt(_where(journal, reported)) from error
+    if "recording" in reported:
+        return _sealed(reported)
+    if reported.get("in_use"):
+        raise JournalInUseError(reported["error"])
+    raise DataError(reported.get("error") or f"{journal}: the process that seals it {reason}; seal it again")
 
 
-def _run(command: list[str], told: dict[str, Any], progress: Progress) -> str:
-    """Run a process, put the result that it tells into ``told``, and return how it ended."""
+def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> str:
+    """Run a process, put the result that it tells into ``reported``, and return how it ended."""
     with subprocess.Popen(  # noqa: S603  this very package
         command,
         stdin=subprocess.DEVNULL,
@@ -133,26 +135,26 @@ def _run(command: list[str], told: dict[str, Any], progress: Progress) -> str:
         start_new_session=True,
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
     ) as process:
-        said: deque[str] = deque(maxlen=1)
-        listener = Thread(target=_listen, args=(process.stderr, said), daemon=True)
+        stated: deque[str] = deque(maxlen=1)
+        listener = Thread(target=_listen, args=(process.stderr, stated), daemon=True)
         listener.start()
         try:
-            _take(process.stdout, told, progress)
+            _take(process.stdout, reported, progress)
         except BaseException:
             _end(process)
-            _take(process.stdout, told, lambda _done, _of: None)
+            _take(process.stdout, reported, lambda _done, _of: None)
             raise
         process.wait()
         listener.join()
-    return f"ended with {process.returncode}, " + (f"saying {said[0]!r}" if said else "saying nothing")
+    return f"ended with {process.returncode}, " + (f"saying {stated[0]!r}" if stated else "saying nothing")
 
 
-def _listen(stream: IO[str] | None, said: deque[str]) -> None:
+def _listen(stream: IO[str] | None, stated: deque[str]) -> None:
     """Keep the last line: of a traceback, that is the error."""
-    said.extend(line.strip() for line in stream or () if line.strip())
+    stated.extend(line.strip() for line in stream or () if line.strip())
 
 
-def _take(stream: IO[str] | None, told: dict[str, Any], progress: Progress) -> None:
+def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) -> None:
     """Pass progress on until the process has no more to tell."""
     for line in stream or ():
         try:
@@ -162,7 +164,7 @@ def _take(stream: IO[str] | None, told: dict[str, Any], progress: Progress) -> N
         if "of" in report:
             progress(report["done"], report["of"])
         else:
-            told.update(report)
+            reported.update(report)
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
@@ -173,14 +175,14 @@ def _end(process: "subprocess.Popen[str]") -> None:
         process.terminate()
 
 
-def _sealed(told: dict[str, Any]) -> Sealed:
-    paths = {name: Path(told[name]) for name in ("journal", "recording", "set_aside") if told[name] is not None}
-    return Sealed(**told | paths)
+def _sealed(reported: dict[str, Any]) -> Sealed:
+    paths = {name: Path(reported[name]) for name in ("journal", "recording", "set_aside") if reported[name] is not None}
+    return Sealed(**reported | paths)
 
 
-def _where(journal: Path, told: dict[str, Any]) -> str:
+def _where(journal: Path, reported: dict[str, Any]) -> str:
     """Say where the measurements are after an interrupt, which may have come too late to matter."""
-    if "recording" not in told:
+    if "recording" not in reported:
         return f"the measurements are safe in {journal}; seal them by 'ertis recover {journal}'"
-    sealed = _sealed(told)
+    sealed = _sealed(reported)
     return sealed.remark or f"the measurements are in {sealed.recording}"

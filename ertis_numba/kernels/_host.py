@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.kernels._images import Images
+from ertis_numba.kernels._images import ImagePool
 from ertis_numba.kernels._memory import Array
 
 __all__ = ["HostMemory"]
@@ -53,7 +53,7 @@ class HostMemory:
     def __init__(self, *, graphs: bool = False) -> None:
         if graphs:
             raise ArgumentError("graphs is True, and only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
-        self._images = Images(lambda shape: np.empty(shape, np.float32))
+        self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """See `Memory.table`."""

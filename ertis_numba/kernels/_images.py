@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Images"]
+__all__ = ["ImagePool"]
 
-_MOST_BYTES = 2**28  # of all arrays that are kept: who holds on to more images gets arrays of their own
+_MAX_BYTES = 2**28  # of all arrays that are kept: who holds on to more images gets arrays of their own
 
 
 class _Lease:
@@ -23,7 +23,7 @@ class _Lease:
         self.__array_interface__ = array.__array_interface__
 
 
-class Images:
+class ImagePool:
     """The images of one pipeline.
 
     Parameters
@@ -45,12 +45,12 @@ class Images:
             array = self._spare.pop() if self._spare else None
             if array is None:
                 n_bytes = 4 * shape[0] * shape[1]
-                if self._closed or (self._count + 1) * n_bytes > _MOST_BYTES:
+                if self._closed or (self._count + 1) * n_bytes > _MAX_BYTES:
                     return np.empty(shape, np.float32)
                 array = self._make(shape)
                 self._count += 1
         lease = _Lease(array)
-        weakref.finalize(lease, self._give_back, array).atexit = False
+        weakref.finalize(lease, self._release, array).atexit = False
         return np.asarray(lease)
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class Images:
             self._closed = True
             self._spare.clear()
 
-    def _give_back(self, array: NDArray[np.float32]) -> None:
+    def _release(self, array: NDArray[np.float32]) -> None:
         with self._lock:
             if not self._closed:
                 self._spare.append(array)

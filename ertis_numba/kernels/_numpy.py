@@ -24,7 +24,7 @@ _NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / rms of a sum of four numbe
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
     """See `Threads`."""
-    checks.whole("threads", count, 1, 1)
+    checks.integer("threads", count, 1, 1)
     yield
 
 

@@ -30,7 +30,7 @@ from ertis_numba.network.messages import (
     encode,
 )
 from ertis_numba.network.products import Arrival, Header, ProductReader
-from ertis_numba.network.waker import Waker
+from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["SubscriberCounts", "Subscription"]
 
@@ -39,7 +39,7 @@ _BEAT_S: Final = 1.0
 _DEAD_S: Final = 3.0
 _UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, of which word may come before anybody listens
 _AGAIN_S: Final = 0.5
-_MOST_AGAIN_S: Final = 5.0
+_MAX_AGAIN_S: Final = 5.0
 _REFUSALS: Final = 3  # before the first answer, after which it is no use to go on
 _AT_ONCE: Final = 64
 
@@ -123,7 +123,7 @@ class Subscription:
         self._wait_until_s = 0.0
         self._refusals: list[str] = []
         self._was_connected = False
-        self._told = ""
+        self._reported = ""
         self._dropped_before = self._missed_before = 0
 
     @property
@@ -145,7 +145,7 @@ class Subscription:
         finally:
             self._close()
 
-    def turn(self, woken: Waker, now_s: float) -> None:
+    def turn(self, woken: WakeupSocket, now_s: float) -> None:
         """Do what there is to do, or wait until there is; not for longer than a tenth of a second.
 
         Raises
@@ -173,7 +173,7 @@ class Subscription:
         elif since_s is None and self._socket is not None and now_s - connection.begun_s > _UNMADE_S:
             self._again("", now_s)
 
-    def _poll(self, woken: Waker) -> list[object]:
+    def _poll(self, woken: WakeupSocket) -> list[object]:
         poller = zmq.Poller()
         poller.register(woken, zmq.POLLIN)
         for socket in (self._socket, self._monitor.socket if self._monitor else None):
@@ -199,7 +199,7 @@ class Subscription:
         """Begin a connection anew, whose numbers count from 0."""
         if self.connected:
             self._counts.reconnects += 1
-        self._tell(text)
+        self._emit_event(text)
         self._count_anew()
         self._close(now_s)
         self._wait_until_s = now_s + wait_s
@@ -222,12 +222,12 @@ class Subscription:
         self._refusals.append(text)
         if not self._was_connected and len(self._refusals) >= _REFUSALS:
             raise RefusedError(f"{self._address}: {text}")
-        self._again(text, now_s, wait_s=min(_MOST_AGAIN_S, _AGAIN_S * len(self._refusals)))
+        self._again(text, now_s, wait_s=min(_MAX_AGAIN_S, _AGAIN_S * len(self._refusals)))
 
-    def _tell(self, text: str) -> None:
+    def _emit_event(self, text: str) -> None:
         """Call back, once for the same text until the publisher answers again."""
-        if text and text != self._told:
-            self._told = text
+        if text and text != self._reported:
+            self._reported = text
             self._note(text)
 
     def _subscribe(self, now_s: float) -> None:
@@ -285,8 +285,8 @@ class Subscription:
             return
         if not self.connected:
             self._was_connected, self._refusals = True, []
-            self._tell("connected")
-            self._told = ""
+            self._emit_event("connected")
+            self._reported = ""
         connection.heard_s = time.monotonic()
         if isinstance(message, Description):
             if message.number in connection.reader:
@@ -313,7 +313,7 @@ class Subscription:
         self._deliver(arrival)
 
 
-def _wait(woken: Waker, timeout_s: float) -> None:
+def _wait(woken: WakeupSocket, timeout_s: float) -> None:
     poller = zmq.Poller()
     poller.register(woken, zmq.POLLIN)
     poller.poll(max(1, round(1000 * timeout_s)))

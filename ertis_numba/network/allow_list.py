@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias, get_args
 import msgspec
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.checked import Checked
 from ertis_numba.network.keys import require_key, require_name
@@ -22,7 +22,7 @@ ALLOW_LIST: Final = "allow.toml"
 """Name of the list of permissions in a folder of keys."""
 
 
-class Permission(Table, frozen=True, kw_only=True):
+class Permission(TomlTable, frozen=True, kw_only=True):
     """What the owner of a key may do.
 
     Attributes

@@ -5,13 +5,13 @@ from typing import Any, Self
 
 import msgspec
 
-from ertis_numba.documents import Document
+from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import SettingsError
 
 __all__ = ["Checked"]
 
 
-class Checked(Document, frozen=True, kw_only=True):
+class Checked(TomlDocument, frozen=True, kw_only=True):
     """A document with an optional CRC-32 of its content.
 
     Attributes

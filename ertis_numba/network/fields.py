@@ -8,7 +8,8 @@ from msgspec import Meta
 from ertis_numba.frames import Stamp
 
 __all__ = [
-    "MOST_SEQUENCE",
+    "MAX_SEQUENCE",
+    "AckedThrough",
     "Count",
     "Int64",
     "Line",
@@ -19,7 +20,6 @@ __all__ = [
     "Position",
     "Quaternion",
     "Reason",
-    "Settled",
     "State",
     "Uint32",
     "as_line",
@@ -30,9 +30,9 @@ MAX_LINE_LENGTH: Final = 512
 Line = Annotated[str, Meta(max_length=MAX_LINE_LENGTH)]
 Reason = Annotated[str, Meta(min_length=1, max_length=64)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-MOST_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
-Number = Annotated[int, Meta(ge=0, le=MOST_SEQUENCE)]
-Settled = Annotated[int, Meta(ge=-1, le=MOST_SEQUENCE)]
+MAX_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
+Number = Annotated[int, Meta(ge=0, le=MAX_SEQUENCE)]
+AckedThrough = Annotated[int, Meta(ge=-1, le=MAX_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]
@@ -54,7 +54,7 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    sensor, epoch, sequence, sync_count
+    sensor, session_id, sequence, sync_count
         As in `ertis_numba.frames.Stamp`.
     timestamp_ns, uncertainty_ns : int
         When the emission began, since 1970-01-01 UTC by the sensor node's clock.
@@ -63,7 +63,7 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
     """
 
     sensor: Name
-    epoch: Count
+    session_id: Count
     sequence: Number
     sync_count: Int64
     timestamp_ns: Int64
@@ -79,5 +79,5 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
             sync_count=self.sync_count,
             timestamp_ns=self.timestamp_ns,
             timestamp_uncertainty_ns=self.uncertainty_ns,
-            epoch=self.epoch,
+            session_id=self.session_id,
         )

@@ -7,7 +7,7 @@ import sys
 from datetime import UTC, datetime
 from typing import Any, Final, Protocol
 
-__all__ = ["Log", "Logfmt", "NDJson", "Writable", "logger", "show"]
+__all__ = ["EventLog", "Logfmt", "NDJson", "Writable", "logger", "show"]
 
 _ROOT: Final = "ertis.network"
 _FIELDS: Final = "ertis_fields"
@@ -24,7 +24,7 @@ class Writable(Protocol):
         """Bring out what was taken."""
 
 
-class Log:
+class EventLog:
     """Logs events of a part of a node.
 
     ::
@@ -60,9 +60,9 @@ class Log:
         self._logger.log(level, "%s", event, extra={_FIELDS: fields})
 
 
-def logger(name: str) -> Log:
+def logger(name: str) -> EventLog:
     """Return what logs events of a part of a node, such as ``"publisher"``."""
-    return Log(name)
+    return EventLog(name)
 
 
 def show(*, as_json: bool = False, level: str = "INFO", stream: Writable | None = None) -> None:

@@ -13,7 +13,8 @@ from msgspec import Meta
 
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network.fields import (
-    MOST_SEQUENCE,
+    MAX_SEQUENCE,
+    AckedThrough,
     Count,
     Line,
     Message,
@@ -23,7 +24,6 @@ from ertis_numba.network.fields import (
     Position,
     Quaternion,
     Reason,
-    Settled,
     State,
     Uint32,
 )
@@ -43,7 +43,7 @@ from ertis_numba.settings import Air
 __all__ = [
     "HEADER_BYTES",
     "MAGIC",
-    "MOST_SEQUENCE",
+    "MAX_SEQUENCE",
     "PRODUCTS",
     "VERSION",
     "Ack",
@@ -80,7 +80,7 @@ class Hello(Message, frozen=True, kw_only=True):
     Attributes
     ----------
     sensor : str
-    epoch : int
+    session_id : int
         Run of the sensor: with its sequence numbers, the identity of a measurement.
     next_sequence : int
         The oldest number that the node still has, or the next that it will have.
@@ -92,7 +92,7 @@ class Hello(Message, frozen=True, kw_only=True):
     """
 
     sensor: Name
-    epoch: Count
+    session_id: Count
     next_sequence: Number
     settings_crc32: Uint32
     firmware: Annotated[str, Meta(max_length=64)] = ""
@@ -105,22 +105,22 @@ class Welcome(Message, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    sensor, epoch
+    sensor, session_id
     state : {"storage", "processing", "fault", "closing"}
     acks : {"stored", "accepted"}
         What an `Ack` will mean: on the disk, or in memory.
     window : int
         Measurements that may be under way without an ack.
-    settled : int
+    acked_through : int
         The highest number up to which every one is stored, or known to be missing; -1 if there is none.
     """
 
     sensor: Name
-    epoch: Count
+    session_id: Count
     state: State
     acks: Literal["stored", "accepted"]
     window: Annotated[int, Meta(ge=1, le=1024)]
-    settled: Settled
+    acked_through: AckedThrough
 
 
 class Data(OfMeasurement, frozen=True, kw_only=True):
@@ -151,7 +151,7 @@ class Gap(Message, frozen=True, kw_only=True):
     """Sequence numbers that no measurement has, ``first`` and ``last`` included, and why."""
 
     sensor: Name
-    epoch: Count
+    session_id: Count
     first: Number
     last: Number
     reason: Reason
@@ -162,8 +162,8 @@ class Ack(Message, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    sensor, epoch
-    settled : int
+    sensor, session_id
+    acked_through : int
         As in `Welcome`.
     status : {"stored", "accepted"}
         What is settled is on the disk, or in memory.
@@ -172,8 +172,8 @@ class Ack(Message, frozen=True, kw_only=True):
     """
 
     sensor: Name
-    epoch: Count
-    settled: Settled
+    session_id: Count
+    acked_through: AckedThrough
     status: Literal["stored", "accepted"]
     dropped: Annotated[tuple[tuple[Number, Reason], ...], Meta(max_length=32)] = ()
 
@@ -204,13 +204,13 @@ class Refused(Message, frozen=True, kw_only=True):
         A line for people: what came, what was wanted, the remedy.
     sensor : str
         Which it is about, if one.
-    epoch : int
+    session_id : int
     """
 
     code: Literal["version", "message", "role", "serial", "hello", "settings", "size"]
     reason: Line
     sensor: Annotated[str, Meta(max_length=64)] = ""
-    epoch: Count = 0
+    session_id: Count = 0
 
 
 class AskStatus(Message, frozen=True, kw_only=True):

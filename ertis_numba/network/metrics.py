@@ -32,7 +32,7 @@ _NOW_OF_SENSOR: Final = {
     "rate_hz": "Measurements a second",
     "in_flight": "Measurements being processed",
     "queue": "Measurements that wait",
-    "settled": "Highest sequence number up to which all is known",
+    "acked_through": "Highest sequence number up to which all is known",
 }
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic import replacing
+from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
 
 if sys.platform == "win32":
@@ -129,7 +129,7 @@ def locked(path: Path) -> Iterator[None]:
 
 def write(path: Path, text: str, *, mode: int, overwrite: bool = False) -> None:
     """Write a file that was never open to more than it is to be open to."""
-    with replacing(path, overwrite=overwrite) as part:
+    with atomic_write(path, overwrite=overwrite) as part:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(text)

@@ -13,8 +13,8 @@ from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Points, Raw, Report
 from ertis_numba.network.status import Status
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
-from ertis_numba.words import word_format
 
 __all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader"]
 
@@ -25,7 +25,7 @@ Header: TypeAlias = Image | Points | Raw | Group | Report
 Payload: TypeAlias = Sequence[bytes | memoryview]
 
 _AXES = 3
-_MOST_OF_SENSOR = 64  # descriptions
+_MAX_OF_SENSOR = 64  # descriptions
 _COLUMNS = 4  # of a point: x, y, z and energy
 
 
@@ -118,7 +118,7 @@ class ProductReader:
         """
         # Each change of settings brings one: a connection that lasts for months must not keep them all.
         of_sensor = [number for number, kept in self._described.items() if kept.header.sensor == header.sensor]
-        stale = of_sensor[: max(0, len(of_sensor) - _MOST_OF_SENSOR)]
+        stale = of_sensor[: max(0, len(of_sensor) - _MAX_OF_SENSOR)]
         for number in stale:
             del self._described[number]
         self._described[header.number] = _Described.of(header, payload)
@@ -157,8 +157,8 @@ def _image(header: Image, payload: Payload, described: _Described, stamp: Stamp)
     wanted = (len(azimuth_rad), len(range_m))
     if header.shape != wanted or len(elevation_rad) != len(azimuth_rad):
         raise DataError(f"an image has shape {header.shape}, its axes {wanted}; send the same")
-    energy = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
-    return Energyscape(energy, azimuth_rad, elevation_rad, range_m, described.settings, stamp)
+    amplitude = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
+    return Energyscape(amplitude, azimuth_rad, elevation_rad, range_m, described.settings, stamp)
 
 
 def _points(header: Points, payload: Payload, described: _Described, stamp: Stamp) -> PointCloud:
@@ -175,7 +175,7 @@ def _points(header: Points, payload: Payload, described: _Described, stamp: Stam
 
 def _measurement(header: Raw, payload: Payload, described: _Described, stamp: Stamp) -> Measurement:
     settings = described.settings
-    wanted = word_format(settings)
+    wanted = sample_format(settings)
     words = _array(payload, wanted.shape, wanted.dtype.name)
     if zlib.crc32(words.data) != header.crc32:
         raise DataError(f"measurement {header.sequence} of sensor {header.sensor} has another CRC-32 than its header")

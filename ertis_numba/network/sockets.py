@@ -15,9 +15,9 @@ from ertis_numba.errors import NetworkError
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys, ServerKeys
 
-__all__ = ["DOMAIN", "MOST_BYTES", "Monitor", "Strangers", "bound", "client", "server", "was_chosen"]
+__all__ = ["DOMAIN", "MAX_BYTES", "HandshakeMonitor", "Monitor", "bound", "client", "server", "was_chosen"]
 
-MOST_BYTES: Final = 16 * 2**20
+MAX_BYTES: Final = 16 * 2**20
 DOMAIN: Final = b"ertis"
 """What connections are let into, as ZAP (ZeroMQ RFC 27) names it."""
 
@@ -26,7 +26,7 @@ _SPARE_BYTES = 256  # what CURVE adds to a frame, and more
 _HANDSHAKE_MS = 3000
 _LONGEST_HANDSHAKE_S = 1e-3 * _HANDSHAKE_MS + 1.0  # and the time until its end is reported
 _SEND_TIMEOUT_MS = 30_000  # without it, TCP repeats what nobody confirms for a quarter of an hour
-_RECONNECT_MS, _RECONNECT_MOST_MS = 100, 1000
+_RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000
 _BACKLOG = 512
 _DESCRIPTORS = 8192
 _NO_ACCESS = 400  # of ZAP
@@ -55,10 +55,10 @@ def server(
     endpoint: str,
     *,
     keys: ServerKeys | None,
-    most_bytes: int = MOST_BYTES,
+    max_bytes: int = MAX_BYTES,
     option: str = "--listen",
 ) -> "zmq.Socket[bytes]":
-    """Return a ROUTER that listens; with keys, its context needs a `ertis_numba.network.gate.Gate` made before.
+    """Return a ROUTER that listens; with keys, its context needs a `ertis_numba.network.zap_authenticator.Gate` made before.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def server(
     endpoint : str
     keys : ServerKeys or None
         None on loopback only.
-    most_bytes : int
+    max_bytes : int
         Longest frame. It also bounds what a stranger can have this node keep, so give what is needed.
     option : str
         By which users give the address.
@@ -83,7 +83,7 @@ def server(
     _allow_descriptors()
     made = context.socket(zmq.ROUTER)
     try:
-        _set(made, endpoint, most_bytes)
+        _set(made, endpoint, max_bytes)
         made.setsockopt(zmq.ROUTER_MANDATORY, 1)
         made.setsockopt(zmq.BACKLOG, _BACKLOG)
         if keys is not None:
@@ -113,7 +113,7 @@ def bound(socket: "zmq.Socket[bytes]") -> str:
 
 
 def client(
-    context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, most_bytes: int = MOST_BYTES
+    context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, max_bytes: int = MAX_BYTES
 ) -> "zmq.Socket[bytes]":
     """Return a DEALER that connects, and connects again after a connection was lost; a `Monitor` of it knows why.
 
@@ -125,7 +125,7 @@ def client(
     endpoint : str
     keys : ClientKeys or None
         None on loopback only.
-    most_bytes : int
+    max_bytes : int
         Longest frame.
 
     Raises
@@ -139,10 +139,10 @@ def client(
     addresses.require_keys(endpoint, keys=keys)
     made = context.socket(zmq.DEALER)
     try:
-        _set(made, endpoint, most_bytes)
+        _set(made, endpoint, max_bytes)
         made.setsockopt(zmq.IMMEDIATE, 1)
         made.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        made.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MOST_MS)
+        made.setsockopt(zmq.RECONNECT_IVL_MAX, _MAX_RECONNECT_MS)
         if keys is not None:
             made.setsockopt(zmq.CURVE_SERVERKEY, keys.server.encode())
             made.setsockopt(zmq.CURVE_PUBLICKEY, keys.pair.public.encode())
@@ -206,9 +206,9 @@ class Monitor(_Events):
 
     def read(self) -> list[str]:
         """Return what went wrong since, each once, as lines."""
-        return list(dict.fromkeys(self._told(event, value) for event, value in self._events()))
+        return list(dict.fromkeys(self._reported(event, value) for event, value in self._events()))
 
-    def _told(self, event: int, value: int) -> str:
+    def _reported(self, event: int, value: int) -> str:
         with_keys = self._watched.getsockopt(zmq.MECHANISM) == zmq.CURVE
         if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             self.final = True
@@ -223,7 +223,7 @@ class Monitor(_Events):
         return "what answers does not speak this protocol; give the address of a central node"
 
 
-class Strangers(_Events):
+class HandshakeMonitor(_Events):
     """Counter of connections to a server that closed before the peer had presented a key.
 
     libzmq does not report which connection a finished handshake belongs to. A connection therefore counts only once the
@@ -267,12 +267,12 @@ def _server_monitor(server: "zmq.Socket[bytes]") -> "zmq.Socket[bytes]":
     return made
 
 
-def _set(socket: "zmq.Socket[bytes]", endpoint: str, most_bytes: int) -> None:
+def _set(socket: "zmq.Socket[bytes]", endpoint: str, max_bytes: int) -> None:
     """Set what clients and servers have in common."""
     options = {
         zmq.SNDHWM: _HIGH_WATER,
         zmq.RCVHWM: _HIGH_WATER,
-        zmq.MAXMSGSIZE: most_bytes + _SPARE_BYTES,
+        zmq.MAXMSGSIZE: max_bytes + _SPARE_BYTES,
         zmq.LINGER: 0,
         zmq.HANDSHAKE_IVL: _HANDSHAKE_MS,
         # libzmq 4.3.5 aborts the process when a heartbeat is due on a connection that was closed while its messages

@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-_MOST: Final = 2**63 - 1
+_MAX: Final = 2**63 - 1
 
 
 class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,8 +66,8 @@ class SensorStatus(msgspec.Struct, kw_only=True):
     """
 
     connected: bool = False
-    epoch: int = 0
-    settled: int = -1
+    session_id: int = 0
+    acked_through: int = -1
     rate_hz: float = 0.0
     received: int = 0
     received_bytes: int = 0
@@ -186,8 +186,10 @@ class Status(msgspec.Struct, kw_only=True):
         try:
             return msgspec.msgpack.decode(data, type=cls)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            told = " ".join(str(error).split())
-            raise DataError(f"a status cannot be read ({told}); use the same release of ertis-numba on both") from error
+            reported = " ".join(str(error).split())
+            raise DataError(
+                f"a status cannot be read ({reported}); use the same release of ertis-numba on both"
+            ) from error
 
 
 def _encodable(value: Any) -> Any:
@@ -197,4 +199,4 @@ def _encodable(value: Any) -> Any:
         return [_encodable(item) for item in value]
     if isinstance(value, str):
         return value.encode(errors="replace").decode()
-    return min(value, _MOST) if isinstance(value, int) else value
+    return min(value, _MAX) if isinstance(value, int) else value

@@ -16,7 +16,7 @@ from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
 from ertis_numba.network.products import Arrival
-from ertis_numba.network.waker import Waker
+from ertis_numba.network.wakeup_socket import WakeupSocket
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement, PointCloud
@@ -27,7 +27,7 @@ __all__ = ["Arrival", "Subscriber", "SubscriberCounts"]
 
 Kind_co = TypeVar("Kind_co", covariant=True)
 
-_MOST_SENSORS: Final = 32
+_MAX_SENSORS: Final = 32
 _STOP_S: Final = 5.0
 
 
@@ -146,17 +146,17 @@ class Subscriber(Generic[Kind_co]):
         if not given:
             raise ArgumentError(f"products are none; give some of {', '.join(PRODUCTS)}")
         named = None if sensors is None else tuple([sensors] if isinstance(sensors, str) else dict.fromkeys(sensors))
-        if named is not None and not 0 < len(named) <= _MOST_SENSORS:
-            raise ArgumentError(f"sensors are {len(named)}; give 1 to {_MOST_SENSORS}, or None for all")
+        if named is not None and not 0 < len(named) <= _MAX_SENSORS:
+            raise ArgumentError(f"sensors are {len(named)}; give 1 to {_MAX_SENSORS}, or None for all")
         for sensor in named or ():
             checks.sensor_name(sensor)
-        checks.whole("credit", credit, 1, 64)
+        checks.integer("credit", credit, 1, 64)
         self.latest: Arrival | None = None
         self.counts = SubscriberCounts()
         # A queue of this kind may be put to by a signal's handler that has come over a thread which is taking.
         self._waiting: queue.SimpleQueue[Arrival | Exception | None] = queue.SimpleQueue()
         self._closed = False
-        self._waker = Waker()
+        self._wakeup_socket = WakeupSocket()
         self._subscription = Subscription(
             address,
             sensors=named,
@@ -216,7 +216,7 @@ class Subscriber(Generic[Kind_co]):
         self.latest = arrival
         self.counts.received += 1
         self._subscription.taken(arrival)
-        self._waker.wake()
+        self._wakeup_socket.wake()
         return cast("Kind_co", arrival.item)
 
     def close(self) -> None:
@@ -226,7 +226,7 @@ class Subscriber(Generic[Kind_co]):
             while True:
                 self._waiting.get_nowait()
         self._waiting.put(None)
-        self._waker.wake()
+        self._wakeup_socket.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(_STOP_S)
 
@@ -236,10 +236,10 @@ class Subscriber(Generic[Kind_co]):
         try:
             with self._subscription.within(context):
                 while not self._closed:
-                    self._subscription.turn(self._waker, time.monotonic())
-                    self._waker.clear()
+                    self._subscription.turn(self._wakeup_socket, time.monotonic())
+                    self._wakeup_socket.clear()
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
             self._waiting.put(error)
         finally:
             context.destroy(linger=0)
-            self._waker.close()
+            self._wakeup_socket.close()

@@ -3,10 +3,10 @@
 from typing import Literal
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MAX_ZONES", "Accuracy"]
+__all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MAX_FOCAL_ZONES", "Accuracy"]
 
 INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubic": 4}
 """Ways of making a delayed sample, and how many samples each takes; None where that is a choice."""
@@ -14,11 +14,11 @@ INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubi
 ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
 """Error budgets by name."""
 
-MAX_ZONES = 1_000_000
+MAX_FOCAL_ZONES = 1_000_000
 """More steps of curvature than an image has ranges, even near the array."""
 
 
-class Accuracy(Table, frozen=True, kw_only=True):
+class Accuracy(TomlTable, frozen=True, kw_only=True):
     """How exact the image is: an error that it may have, and what shall not be left to the planner.
 
     Whatever is open (``auto`` or None), the planner chooses, such that the image takes the least time on
@@ -45,7 +45,7 @@ class Accuracy(Table, frozen=True, kw_only=True):
         along each axis of the array, 2, 4 or 6; 0 sums every direction's own beam.
     beam_density : float, optional
         Nodes by what the aperture resolves at the call's highest frequency, 1.1 to 8.
-    stop_band_db : float, optional
+    stopband_attenuation_db : float, optional
         Damping of what the decimation would alias into the call's band, 40 to 140.
     zones : int, optional
         Steps of their curvature, from 1 on, where wavefronts are spherical: ranges within one share their delays.
@@ -58,22 +58,22 @@ class Accuracy(Table, frozen=True, kw_only=True):
     delay_taps: int | None = None
     beam_taps: int | None = None
     beam_density: float | None = None
-    stop_band_db: float | None = None
-    zones: int | None = None
+    stopband_attenuation_db: float | None = None
+    focal_zones: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
         checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("zones", 1, MAX_ZONES)):
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("focal_zones", 1, MAX_FOCAL_ZONES)):
             if getattr(self, name) is not None:
-                checks.whole(f"accuracy.{name}", getattr(self, name), low, high)
+                checks.integer(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:
             checks.choice("accuracy.beam_taps", self.beam_taps, (0, 2, 4, 6))
-        for name, least, most in (("beam_density", 1.1, 8.0), ("stop_band_db", 40.0, 140.0)):
+        for name, smallest, largest in (("beam_density", 1.1, 8.0), ("stopband_attenuation_db", 40.0, 140.0)):
             if getattr(self, name) is not None:
-                checks.between(f"accuracy.{name}", getattr(self, name), least, most)
+                checks.between(f"accuracy.{name}", getattr(self, name), smallest, largest)
         implied = INTERPOLATIONS[self.interpolation]
         if implied is not None and self.delay_taps not in {None, implied}:
             raise ArgumentError(

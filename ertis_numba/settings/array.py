@@ -4,15 +4,15 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 
 __all__ = ["Array"]
 
-_FARTHEST_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
+_MAX_COORDINATE_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
 
 
-class Array(Table, frozen=True, kw_only=True):
+class Array(TomlTable, frozen=True, kw_only=True):
     """Where the microphones are and how their bits lie in a word.
 
     Attributes
@@ -46,27 +46,27 @@ class Array(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
-        checks.choice("array.word_bits", checks.whole("array.word_bits", self.word_bits, 1), WORD_BITS)
+        checks.choice("array.word_bits", checks.integer("array.word_bits", self.word_bits, 1), WORD_BITS)
         for channel in self.disabled or ():
-            checks.whole("array.disabled", channel, 0, MAX_MICROPHONES - 1)
+            checks.integer("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:
             for name in ("enabled", "gain", "delay_s"):
                 if getattr(self, name) is not None:
                     raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
             return
-        n_channels = checks.whole("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
+        n_channels = checks.integer("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
         checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
         for channel, position in enumerate(self.positions_m):
             for coordinate_m in position:
-                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_FARTHEST_M, _FARTHEST_M)
+                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
         if self.enabled is not None:
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
                 raise ArgumentError("array.enabled is false for every channel; enable at least one")
-        self._check_each("gain", 1e-3, 1e3)
-        self._check_each("delay_s", -1e-3, 1e-3)
+        self._check_per_channel("gain", 1e-3, 1e3)
+        self._check_per_channel("delay_s", -1e-3, 1e-3)
 
-    def _check_each(self, name: str, low: float, high: float) -> None:
+    def _check_per_channel(self, name: str, low: float, high: float) -> None:
         """Refuse a list that has not one number in ``[low, high]`` for each channel."""
         values = getattr(self, name)
         if values is not None:

@@ -6,18 +6,18 @@ from typing import Any, Literal, Self
 import msgspec
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError, SettingsError
-from ertis_numba.settings.waveform import band_hz, normalised, read_waveform
+from ertis_numba.settings.waveform import band_hz, normalise, read_waveform
 
 __all__ = ["MAX_CALL_SAMPLES", "Call"]
 
 MAX_CALL_SAMPLES = 2**20
 """Limit on the samples of a call, about one second at 1 MHz: files store them, and filters make several copies."""
-_BAND_MISS_HZ = 200.0  # tolerance of the band, which may differ between processors
+_BAND_TOLERANCE_HZ = 200.0  # tolerance of the band, which may differ between processors
 
 
-class Call(Table, frozen=True, kw_only=True):
+class Call(TomlTable, frozen=True, kw_only=True):
     """The emitted call: a sweep with a Hann ramp at both ends, or an own waveform.
 
     Attributes
@@ -54,7 +54,7 @@ class Call(Table, frozen=True, kw_only=True):
         if isinstance(self.waveform, str):
             return  # the file is checked when it is read
         if self.waveform is not None:
-            self._adopt(self.waveform)
+            self._derive_from_waveform(self.waveform)
         for name in ("start_frequency_hz", "stop_frequency_hz"):
             frequency_hz = checks.positive(f"call.{name}", getattr(self, name))
             if frequency_hz >= self.sample_rate_hz / 2:
@@ -81,13 +81,13 @@ class Call(Table, frozen=True, kw_only=True):
         checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
         checks.choice("call.modulation", self.modulation, ("hyperbolic", "linear"))
 
-    def _adopt(self, waveform: tuple[float, ...]) -> None:
+    def _derive_from_waveform(self, waveform: tuple[float, ...]) -> None:
         """Derive the other fields from samples, and refuse values that contradict them."""
-        samples = normalised(waveform, self.sample_rate_hz)
+        samples = normalise(waveform, self.sample_rate_hz)
         start_hz, stop_hz = band_hz(samples, self.sample_rate_hz)
         derived = {
-            "start_frequency_hz": (start_hz, _BAND_MISS_HZ),
-            "stop_frequency_hz": (stop_hz, _BAND_MISS_HZ),
+            "start_frequency_hz": (start_hz, _BAND_TOLERANCE_HZ),
+            "stop_frequency_hz": (stop_hz, _BAND_TOLERANCE_HZ),
             "duration_s": ((len(samples) - 1) / self.sample_rate_hz, 1e-9),
             "ramp_fraction": (0.0, 0.0),
         }
@@ -122,9 +122,9 @@ class Call(Table, frozen=True, kw_only=True):
             The file cannot be read, or its samples cannot be used.
         """
         given: dict[str, Any] = {} if sample_rate_hz is None else {"sample_rate_hz": sample_rate_hz}
-        return cls(waveform=str(path), **given).beside(Path())
+        return cls(waveform=str(path), **given).resolve_paths(Path())
 
-    def beside(self, folder: Path) -> Self:
+    def resolve_paths(self, folder: Path) -> Self:
         """Return the call with the samples of the file that it names, relative to a folder.
 
         Raises

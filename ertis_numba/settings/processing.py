@@ -4,9 +4,9 @@ from typing import Final, Literal
 
 from ertis_numba import checks
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings.tapers import taper_of
+from ertis_numba.settings.windows import parse_window
 
 __all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
 
@@ -14,7 +14,7 @@ MAX_LISTED_DIRECTIONS: Final = 1000
 """Limit on the directions in the settings themselves, which recordings and messages hold as text."""
 
 
-class Processing(Table, frozen=True, kw_only=True):
+class Processing(TomlTable, frozen=True, kw_only=True):
     """How a measurement becomes an energyscape.
 
     Attributes
@@ -70,7 +70,7 @@ class Processing(Table, frozen=True, kw_only=True):
     beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
     dmas_order: int = 2
     snapshots: int = 5
-    loading: float = 1.0
+    diagonal_loading: float = 1.0
     array_weights: str | tuple[float, ...] = "uniform"
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Processing(Table, frozen=True, kw_only=True):
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
-        checks.whole("processing.range_decimation", self.range_decimation, 1, 10_000)
+        checks.integer("processing.range_decimation", self.range_decimation, 1, 10_000)
         if self.band_edges_hz is not None:
             checks.interval("processing.band_edges_hz", self.band_edges_hz, 0.0, 1e9)
             if self.method == "paper":
@@ -94,7 +94,7 @@ class Processing(Table, frozen=True, kw_only=True):
                     "'fast'"
                 )
         if self.decimation is not None:
-            checks.whole("processing.decimation", self.decimation, 1, 1000)
+            checks.integer("processing.decimation", self.decimation, 1, 1000)
             if self.range_decimation % self.decimation:
                 raise ArgumentError(
                     f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
@@ -126,7 +126,7 @@ class Processing(Table, frozen=True, kw_only=True):
         """Refuse weights that are negative, and any but uniform ones for adaptive beamformers."""
         given = self.array_weights
         if isinstance(given, str):
-            taper_of(given)
+            parse_window(given)
         elif not 1 <= len(given) <= MAX_MICROPHONES:
             raise ArgumentError(f"processing.array_weights has {len(given)} numbers; give one for each channel")
         else:
@@ -141,9 +141,9 @@ class Processing(Table, frozen=True, kw_only=True):
     def _check_beamformer(self) -> None:
         """Refuse what no beamformer can do, and what delay-and-sum alone can."""
         checks.choice("processing.beamformer", self.beamformer, ("delay_and_sum", "coherence_factor", "dmas", "capon"))
-        checks.whole("processing.dmas_order", self.dmas_order, 2, 8)
-        checks.whole("processing.snapshots", self.snapshots, 1, 32)
-        checks.between("processing.loading", self.loading, 1e-6, 1e6)
+        checks.integer("processing.dmas_order", self.dmas_order, 2, 8)
+        checks.integer("processing.snapshots", self.snapshots, 1, 32)
+        checks.between("processing.diagonal_loading", self.diagonal_loading, 1e-6, 1e6)
         if self.beamformer == "delay_and_sum":
             return
         for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):

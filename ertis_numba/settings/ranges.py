@@ -8,17 +8,17 @@ from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.recording import Recording
 
-__all__ = ["largest_decimation", "suit_ranges"]
+__all__ = ["fit_ranges", "max_decimation"]
 
-_SLOWEST_AIR_M_S = 300.0  # a little under sound at -40 °C
-_RATE_BY_BAND = 1.8  # ranges per second by the call's bandwidth
-_LEAST_RATE = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
-_RATE_BY_EDGE = 2.5  # signal rate relative to the upper edge of the matched filter's band
-_MOST_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
-_MOST_STEP = 10_000
+_MIN_SOUND_SPEED_M_S = 300.0  # a little under sound at -40 °C
+_MIN_RATE_PER_BANDWIDTH = 1.8  # ranges per second by the call's bandwidth
+_MIN_RATE_PER_HIGHEST_FREQUENCY = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+_MIN_RATE_PER_BAND_EDGE = 2.5  # signal rate relative to the upper edge of the matched filter's band
+_MAX_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
+_MAX_RANGE_DECIMATION = 10_000
 
 
-def suit_ranges(processing: Processing, recording: Recording, call: Call) -> Processing:
+def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Processing:
     """Return processing with ranges that suit a record and its call.
 
     The default window ends where the whole echo still fits into the record in any air. A ``range_decimation`` that
@@ -38,26 +38,26 @@ def suit_ranges(processing: Processing, recording: Recording, call: Call) -> Pro
     changes: dict[str, Any] = {}
     first_m, last_m = Processing().range_m
     if processing.range_m == (first_m, last_m):
-        echo_m = (recording.duration_s - call.duration_s) * _SLOWEST_AIR_M_S / 2
+        echo_m = (recording.duration_s - call.duration_s) * _MIN_SOUND_SPEED_M_S / 2
         last_m = min(last_m, math.floor(10 * echo_m) / 10 or math.floor(1000 * echo_m) / 1000)
         changes["range_m"] = (first_m if first_m < last_m else 0.0, last_m)
-    least_hz = _RATE_BY_BAND * (call.high_frequency_hz - call.low_frequency_hz)
-    if recording.sample_rate_hz / processing.range_decimation < least_hz * (1 - 1e-9):
-        suits = largest_decimation(recording.sample_rate_hz, call, processing)
-        changes |= {"range_decimation": _step(recording.sample_rate_hz / least_hz, suits), "decimation": None}
+    min_hz = _MIN_RATE_PER_BANDWIDTH * (call.high_frequency_hz - call.low_frequency_hz)
+    if recording.sample_rate_hz / processing.range_decimation < min_hz * (1 - 1e-9):
+        suits = max_decimation(recording.sample_rate_hz, call, processing)
+        changes |= {"range_decimation": _range_decimation(recording.sample_rate_hz / min_hz, suits), "decimation": None}
     return processing.replace(**changes)
 
 
-def largest_decimation(sample_rate_hz: float, call: Call, processing: Processing) -> int:
+def max_decimation(sample_rate_hz: float, call: Call, processing: Processing) -> int:
     """Return the largest decimation whose low pass needs few taps."""
-    least_hz = _LEAST_RATE[processing.method] * call.high_frequency_hz
+    min_hz = _MIN_RATE_PER_HIGHEST_FREQUENCY[processing.method] * call.high_frequency_hz
     if processing.band_edges_hz is not None:
-        least_hz = max(least_hz, _RATE_BY_EDGE * processing.band_edges_hz[1])
-    return min(max(1, math.floor(sample_rate_hz / least_hz)), _MOST_DECIMATION)
+        min_hz = max(min_hz, _MIN_RATE_PER_BAND_EDGE * processing.band_edges_hz[1])
+    return min(max(1, math.floor(sample_rate_hz / min_hz)), _MAX_DECIMATION)
 
 
-def _step(most: float, suits: int) -> int:
+def _range_decimation(largest: float, suits: int) -> int:
     """Return how many samples apart ranges may be: where there is, a multiple of the decimation that suits the call."""
-    step = min(max(1, math.floor(most)), _MOST_STEP)
+    step = min(max(1, math.floor(largest)), _MAX_RANGE_DECIMATION)
     suits -= suits % 10 if suits > 10 else 0  # round numbers, as RTIS has them
     return step - step % suits if step > suits else step

@@ -9,11 +9,11 @@ from ertis_numba.constants import (
     STANDARD_PRESSURE_PA,
     STANDARD_TEMPERATURE_C,
 )
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 
 __all__ = ["DEFAULT_SAMPLES", "ENCODINGS", "Air", "Recording"]
 
-_MOST_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
+_MAX_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
 DEFAULT_SAMPLES = 163_840
 """Of one measurement, as RTIS has it."""
 
@@ -21,7 +21,7 @@ ENCODINGS = ("pdm", "int16", "float32")
 """Forms of what microphones give: bits, or numbers of PCM."""
 
 
-class Recording(Table, frozen=True, kw_only=True):
+class Recording(TomlTable, frozen=True, kw_only=True):
     """What is recorded of one measurement: how fast, how much, and in which form.
 
     Attributes
@@ -43,7 +43,7 @@ class Recording(Table, frozen=True, kw_only=True):
         super().__post_init__()
         checks.choice("recording.encoding", self.encoding, ENCODINGS)
         checks.between("recording.sample_rate_hz", self.sample_rate_hz, 1e3, 1e9)
-        checks.whole("recording.n_samples", self.n_samples, 1, _MOST_SAMPLES)
+        checks.integer("recording.n_samples", self.n_samples, 1, _MAX_SAMPLES)
 
     @property
     def duration_s(self) -> float:
@@ -61,7 +61,7 @@ class Recording(Table, frozen=True, kw_only=True):
         return self.encoding == "pdm"
 
 
-class Air(Table, frozen=True, kw_only=True):
+class Air(TomlTable, frozen=True, kw_only=True):
     """The medium, which sets the speed of sound.
 
     Attributes

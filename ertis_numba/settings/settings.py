@@ -4,28 +4,28 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from ertis_numba import checks
-from ertis_numba.documents import Document
+from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import INTERPOLATIONS, Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
-from ertis_numba.settings.ranges import largest_decimation, suit_ranges
+from ertis_numba.settings.ranges import fit_ranges, max_decimation
 from ertis_numba.settings.recording import DEFAULT_SAMPLES, Air, Recording
 
 __all__ = ["PRESETS", "Settings"]
 
-_WORDS = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
+_PRESET_SAMPLES = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
-_WASTE = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
-_MAX_EDGE = 4  # of the call's highest frequency
-_NARROWEST_HZ = 100.0  # a narrower band pass would ring for seconds
+_MAX_OVERSAMPLING = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
+_MAX_BAND_EDGE_RATIO = 4  # of the call's highest frequency
+_MIN_BANDWIDTH_HZ = 100.0  # a narrower band pass would ring for seconds
 
-PRESETS = tuple(f"{length}_{band}" for length in _WORDS for band in _BANDS_HZ)
+PRESETS = tuple(f"{length}_{band}" for length in _PRESET_SAMPLES for band in _BANDS_HZ)
 """Names of the RTIS recording presets: length of the record and band of the call."""
 
 
-class Settings(Document, frozen=True, kw_only=True):
+class Settings(TomlDocument, frozen=True, kw_only=True):
     """All settings of one sensor: the whole content of a settings file."""
 
     array: Array = Array()
@@ -37,7 +37,12 @@ class Settings(Document, frozen=True, kw_only=True):
 
     max_bytes: ClassVar[int] = 262_144  # an array of 1024 microphones takes 170,000 …
     max_items: ClassVar[int] = 30_000  # … and 16,500
-    former_keys: ClassVar[dict[str, str]] = {"pdm_rate_hz": "sample_rate_hz"}
+    former_keys: ClassVar[dict[str, str]] = {
+        "pdm_rate_hz": "sample_rate_hz",
+        "stop_band_db": "stopband_attenuation_db",
+        "zones": "focal_zones",
+        "loading": "diagonal_loading",
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,19 +55,19 @@ class Settings(Document, frozen=True, kw_only=True):
                 f"{self.call.high_frequency_hz:g} Hz"
             )
         swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
-        if self.processing.method == "paper" and swept_hz < _NARROWEST_HZ:
+        if self.processing.method == "paper" and swept_hz < _MIN_BANDWIDTH_HZ:
             raise ArgumentError(
                 f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
-                f"give {_NARROWEST_HZ:g} Hz or more, or method 'fast'"
+                f"give {_MIN_BANDWIDTH_HZ:g} Hz or more, or method 'fast'"
             )
         self._check_band()
         self._check_adaptive()
         step = self.processing.range_decimation
-        if self.processing.decimation is None and self.decimation * _WASTE < min(step, self._largest_decimation):
+        if self.processing.decimation is None and self.decimation * _MAX_OVERSAMPLING < min(step, self._max_decimation):
             raise ArgumentError(
                 f"processing.range_decimation {step} has no divisor near "
-                f"{self._largest_decimation}, the decimation that suits the call; give one that has, such as a "
-                f"multiple of {self._largest_decimation}, or give processing.decimation"
+                f"{self._max_decimation}, the decimation that suits the call; give one that has, such as a "
+                f"multiple of {self._max_decimation}, or give processing.decimation"
             )
 
     def _check_band(self) -> None:
@@ -70,14 +75,14 @@ class Settings(Document, frozen=True, kw_only=True):
         given = self.processing.band_edges_hz
         if given is None:
             return
-        most_hz = _MAX_EDGE * self.call.high_frequency_hz
-        if given[1] > most_hz:
+        max_hz = _MAX_BAND_EDGE_RATIO * self.call.high_frequency_hz
+        if given[1] > max_hz:
             raise ArgumentError(
-                f"processing.band_edges_hz ends at {given[1]:g} Hz; the limit is {most_hz:g} Hz, four times the call's "
+                f"processing.band_edges_hz ends at {given[1]:g} Hz; the limit is {max_hz:g} Hz, four times the call's "
                 "highest frequency, as noise beyond it is not predicted"
             )
-        highest_hz = self.call.low_frequency_hz - _NARROWEST_HZ
-        lowest_hz, nyquist_hz = self.call.high_frequency_hz + _NARROWEST_HZ, self.signal_rate_hz / 2
+        highest_hz = self.call.low_frequency_hz - _MIN_BANDWIDTH_HZ
+        lowest_hz, nyquist_hz = self.call.high_frequency_hz + _MIN_BANDWIDTH_HZ, self.signal_rate_hz / 2
         if given[0] > highest_hz or given[1] < lowest_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz is {given[0]:g} to {given[1]:g} Hz, but the call sweeps over "
@@ -116,9 +121,9 @@ class Settings(Document, frozen=True, kw_only=True):
         SettingsError
             The file cannot be read or used.
         """
-        return super().load(path).beside(Path(path).parent)
+        return super().load(path).resolve_paths(Path(path).parent)
 
-    def changed_by(self, path: str | Path) -> Self:
+    def updated_from_file(self, path: str | Path) -> Self:
         """Return settings changed by the keys of a file.
 
         An array is replaced as a whole if the file names a layout or positions, and a call if either has an own
@@ -132,7 +137,7 @@ class Settings(Document, frozen=True, kw_only=True):
             The file cannot be read or used, by itself or with the rest of these settings.
         """
         held, tables = self._load(Path(path))
-        held = held.beside(Path(path).parent)
+        held = held.resolve_paths(Path(path).parent)
         try:
             changes: dict[str, Any] = {}
             if not tables.get("array", {}).keys().isdisjoint({"layout", "positions_m"}):
@@ -148,7 +153,7 @@ class Settings(Document, frozen=True, kw_only=True):
         except ArgumentError as error:
             raise SettingsError(f"{path}: {error}") from error
 
-    def beside(self, folder: Path) -> Self:
+    def resolve_paths(self, folder: Path) -> Self:
         """Return settings whose files are relative to a folder: of a layout, of directions, and of a call.
 
         The waveform of a call is read, because other settings depend on its band.
@@ -159,14 +164,14 @@ class Settings(Document, frozen=True, kw_only=True):
         directions = processing.directions
         if isinstance(directions, str) and Path(directions).suffix.lower() == ".csv":
             processing = processing.replace(directions=str(folder / directions))
-        return self.replace(array=array, processing=processing, call=self.call.beside(folder))
+        return self.replace(array=array, processing=processing, call=self.call.resolve_paths(folder))
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:
         """Return the settings of a recording preset, such as ``default_25_50``.
 
         ``sections`` replace whole sections. If ``processing`` is not among them, its ranges suit record and call,
-        see `suit_ranges`.
+        see `fit_ranges`.
 
         Raises
         ------
@@ -177,8 +182,8 @@ class Settings(Document, frozen=True, kw_only=True):
         length, _, band = name.partition("_")
         low_hz, high_hz = _BANDS_HZ[band]
         call = Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz)
-        recording = Recording(n_samples=_WORDS[length])
-        processing = suit_ranges(Processing(), recording, call)
+        recording = Recording(n_samples=_PRESET_SAMPLES[length])
+        processing = fit_ranges(Processing(), recording, call)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 
     @property
@@ -193,11 +198,11 @@ class Settings(Document, frozen=True, kw_only=True):
         if given is not None:
             return given
         step = self.processing.range_decimation
-        return max(divisor for divisor in range(1, min(self._largest_decimation, step) + 1) if step % divisor == 0)
+        return max(divisor for divisor in range(1, min(self._max_decimation, step) + 1) if step % divisor == 0)
 
     @property
-    def _largest_decimation(self) -> int:
-        return largest_decimation(self.recording.sample_rate_hz, self.call, self.processing)
+    def _max_decimation(self) -> int:
+        return max_decimation(self.recording.sample_rate_hz, self.call, self.processing)
 
     @property
     def output_decimation(self) -> int:

@@ -12,16 +12,16 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.wav import read_wav
 
-__all__ = ["MAX_WAVEFORM_SAMPLES", "WAVEFORM_FILES", "band_hz", "normalised", "read_waveform"]
+__all__ = ["MAX_WAVEFORM_SAMPLES", "WAVEFORM_FILES", "band_hz", "normalise", "read_waveform"]
 
 MAX_WAVEFORM_SAMPLES = 4096
 """Limit on the samples of an own waveform, 9 ms at 450 kHz: settings that hold them and 1024 microphones stay within
 `Settings.max_bytes`."""
 WAVEFORM_FILES = {".wav", ".csv", ".npy"}
 _MAX_FILE_BYTES = 2**22
-_DIGITS = 7  # decimals of a sample; their rounding error is 20 dB below that of a 20-bit converter
-_IN_BAND = 0.1  # relative to the maximum of the spectrum
-_STEP_HZ = 100.0  # step of the edges, so that they do not depend on rounding in the transform
+_DECIMALS = 7  # decimals of a sample; their rounding error is 20 dB below that of a 20-bit converter
+_BAND_THRESHOLD = 0.1  # relative to the maximum of the spectrum
+_BAND_STEP_HZ = 100.0  # step of the edges, so that they do not depend on rounding in the transform
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
@@ -46,7 +46,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
         n_bytes = path.stat().st_size
         if n_bytes > _MAX_FILE_BYTES:
             raise SettingsError(f"call.waveform {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
-        rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _numbers(path, suffix))
+        rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
     except (OSError, ValueError, DataError) as error:
         if isinstance(error, SettingsError):
             raise
@@ -64,14 +64,14 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
     return tuple((values.astype(np.float64) - middle).tolist()), rate_hz
 
 
-def _numbers(path: Path, suffix: str) -> NDArray[Any]:
+def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
     if suffix == ".npy":
         return np.asarray(np.load(path, allow_pickle=False))
     lines = (line.split("#", 1)[0].strip() for line in path.read_text("utf-8-sig").splitlines())
     return np.array([[float(cell) for cell in line.split(",")] for line in lines if line], dtype=np.float64)
 
 
-def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
+def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     """Return samples scaled to a peak of 1, with seven decimals.
 
     Raises
@@ -79,10 +79,10 @@ def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     ArgumentError
         The samples are too few or too many, one is not finite, or all are 0.
     """
-    least = 17  # the duration of a call is at least 16 samples
-    if not least <= len(samples) <= MAX_WAVEFORM_SAMPLES:
+    smallest = 17  # the duration of a call is at least 16 samples
+    if not smallest <= len(samples) <= MAX_WAVEFORM_SAMPLES:
         raise ArgumentError(
-            f"call.waveform has {len(samples)} samples; give {least} to {MAX_WAVEFORM_SAMPLES}, at "
+            f"call.waveform has {len(samples)} samples; give {smallest} to {MAX_WAVEFORM_SAMPLES}, at "
             f"{rate_hz:g} Hz {1e3 * (MAX_WAVEFORM_SAMPLES - 1) / rate_hz:.3g} ms at most"
         )
     values = np.array(samples, dtype=np.float64)
@@ -90,7 +90,7 @@ def normalised(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     peak = float(np.abs(values).max())
     if not peak:
         raise ArgumentError("call.waveform is silent; give samples other than 0")
-    return tuple(np.round(values / peak, _DIGITS).tolist())
+    return tuple(np.round(values / peak, _DECIMALS).tolist())
 
 
 @functools.lru_cache(maxsize=16)
@@ -106,9 +106,9 @@ def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
     """
     n_fft = 2 ** math.ceil(math.log2(16 * len(samples)))
     spectrum = np.abs(np.fft.rfft(samples, n_fft))
-    strong = np.flatnonzero(spectrum >= _IN_BAND * spectrum.max()) * (rate_hz / n_fft)
-    low_hz = math.floor(strong[0] / _STEP_HZ) * _STEP_HZ
-    high_hz = math.ceil(strong[-1] / _STEP_HZ) * _STEP_HZ
+    strong = np.flatnonzero(spectrum >= _BAND_THRESHOLD * spectrum.max()) * (rate_hz / n_fft)
+    low_hz = math.floor(strong[0] / _BAND_STEP_HZ) * _BAND_STEP_HZ
+    high_hz = math.ceil(strong[-1] / _BAND_STEP_HZ) * _BAND_STEP_HZ
     if low_hz <= 0:
         raise ArgumentError(
             "call.waveform has a band that reaches 0 Hz; subtract its mean, and remove sound below the call"

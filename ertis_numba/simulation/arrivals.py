@@ -13,10 +13,10 @@ from ertis_numba.simulation.bounds import require_few_amplitudes, require_few_pa
 from ertis_numba.simulation.mirrors import images
 from ertis_numba.simulation.paths import Paths, by_targets, without_target
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.snapshot import Mouth, Snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
+from ertis_numba.simulation.stopwatch import CostStopwatch
 
-__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "mouth_of", "responses"]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "transmitter_of", "responses"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -53,7 +53,7 @@ def effect(name: str, function: str | None = None) -> Any:
     return getattr(importlib.import_module(f"ertis_numba.simulation.effects.{name}"), function or name)
 
 
-def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: Stopwatch) -> list[Arrivals]:
+def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: CostStopwatch) -> list[Arrivals]:
     """Return all that arrives of calls.
 
     Delays are whole picoseconds: far finer than what can be measured, but coarse enough that the last digits of
@@ -87,7 +87,7 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
     direct_db = shot.sensor.emitter.direct_sound_db
     if "direct_sound" in active and direct_db is not None and not shot.sensor.emitter.silent:
         with clock("direct_sound"):
-            paths = effect("direct_sound")(shot, mouth_of(shot, active, shot.number))
+            paths = effect("direct_sound")(shot, transmitter_of(shot, active, shot.number))
             amplitude = (_linear(direct_db) * gain * effect("spreading")(paths))[..., None]
             delay_s = effect("propagation")(paths, shot.speed_m_s)
             found.append(_arrivals(shot, active, shot.number, delay_s, amplitude, late_s))
@@ -97,15 +97,15 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
     return found
 
 
-def mouth_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Mouth:
+def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> TransmitterPose:
     """Return the emitter of a sensor, at the sensor's origin or beside it."""
     if "emitter_offset" in active:
-        return cast("Mouth", effect("emitter_offset")(shot, number))
+        return cast("TransmitterPose", effect("emitter_offset")(shot, number))
     return shot.mouths[number]
 
 
 def echoes(
-    shot: Snapshot, active: AbstractSet[str], number: int, clock: Stopwatch, *, n_frequencies: int = 1
+    shot: Snapshot, active: AbstractSet[str], number: int, clock: CostStopwatch, *, n_frequencies: int = 1
 ) -> list[Paths]:
     """Return the paths of an emitter's call over targets and walls, and the direct path from another sensor's.
 
@@ -116,15 +116,15 @@ def echoes(
     ArgumentError
         There are too many paths, or amplitudes.
     """
-    mouth = mouth_of(shot, active, number)
+    transmitter = transmitter_of(shot, active, number)
     if "walls" in active:
         key = "walls", number, "emitter_offset" in active
         with clock("walls"):
-            firsts, seconds, specular = shot.once(key, lambda: effect("walls")(shot, mouth))
+            firsts, seconds, specular = shot.once(key, lambda: effect("walls")(shot, transmitter))
     else:
-        firsts = tuple(images(mouth, shot.targets.positions_m, (), 0))
-        seconds = tuple(images(shot.ear, shot.targets.positions_m, (), 0))
-        specular = tuple(images(mouth, shot.ear.centre_m[None], (), 0))
+        firsts = tuple(images(transmitter, shot.targets.positions_m, (), 0))
+        seconds = tuple(images(shot.receiver, shot.targets.positions_m, (), 0))
+        specular = tuple(images(transmitter, shot.receiver.centre_m[None], (), 0))
     if "occlusion" in active:
         with clock("occlusion"):
             hide = effect("occlusion")
@@ -143,7 +143,7 @@ def echoes(
                 found.append(over(first, second, shot.targets, chosen))
     here = np.arange(1)
     return found + [
-        without_target(seen.end, shot.ear, shot.targets, seen.to_corners_m(here))
+        without_target(seen.end, shot.receiver, shot.targets, seen.to_corners_m(here))
         for seen in specular
         if seen.exists[0] and (seen.mirrors or number != shot.number)
     ]
@@ -155,7 +155,7 @@ def responses(
     paths: Paths,
     emitter: Emitter,
     frequency_hz: Floats,
-    clock: Stopwatch,
+    clock: CostStopwatch,
 ) -> Floats | Complexes:
     """Return the gain of a call by distance, air, walls, targets and directivity: (path, mic, node).
 
@@ -191,7 +191,7 @@ def emitted(active: AbstractSet[str], emitter: Emitter, frequency_hz: Floats) ->
     return np.ones(len(frequency_hz))
 
 
-def gains(shot: Snapshot, active: AbstractSet[str], clock: Stopwatch) -> tuple[Floats, Floats]:
+def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch) -> tuple[Floats, Floats]:
     """Return sensitivity and lateness of the microphones: both (mic,) float64.
 
     Both hold the calibration of the settings, which processing takes out, and the spread, which it does

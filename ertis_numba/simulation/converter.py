@@ -46,5 +46,5 @@ class Converter:
                 heard = heard + self._noise_rms * noise.standard_normal(len(out))
             if self._rounded:
                 heard = np.rint(heard * self._full_scale)
-            most = self._full_scale - self._rounded  # +32768 is no number of 16 bits
-            out[:, mic] = np.clip(heard, -self._full_scale, most)
+            largest = self._full_scale - self._rounded  # +32768 is no number of 16 bits
+            out[:, mic] = np.clip(heard, -self._full_scale, largest)

@@ -10,6 +10,7 @@ from ertis_numba import checks, kernels
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
+from ertis_numba.sample_format import sample_format
 from ertis_numba.simulation import synthesis
 from ertis_numba.simulation.arrivals import arrivals, effect, gains
 from ertis_numba.simulation.converter import Converter
@@ -18,9 +19,8 @@ from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.simulation.truth import reflectors
-from ertis_numba.words import word_format
 
 __all__ = ["Engine"]
 
@@ -57,7 +57,7 @@ class Engine:
         self.scene = scene
         self.sensor = sensor
         self.active = active
-        self.clock = Stopwatch()
+        self.clock = CostStopwatch()
         self.loudest = 0.0
         sensor.require_microphones()
         self._layout = microphones(self.sensor.array)
@@ -73,8 +73,8 @@ class Engine:
         Channels without a microphone hold zeros.
         """
         shot = self._shot(index)
-        form = word_format(self._settings)
-        words = np.zeros(form.rows, form.dtype)
+        form = sample_format(self._settings)
+        words = np.zeros(form.shape_2d, form.dtype)
         if not self.sensor.recording.is_pdm:
             self._convert(shot, index, words)
             return Measurement(words, self._settings, self._stamp(shot, index))
@@ -98,7 +98,7 @@ class Engine:
         return reflectors(self._shot(index), self.active)
 
     def _shot(self, index: int) -> Snapshot:
-        checks.whole("index", index, 0)
+        checks.integer("index", index, 0)
         shot = snapshot(self.scene, self.sensor, index / self.scene.rate_hz)
         require_clear(shot)
         return shot
@@ -113,8 +113,8 @@ class Engine:
         draw : int
             Decides the dither of modulators.
         """
-        form = word_format(self._settings)
-        words = np.zeros(form.rows, form.dtype)
+        form = sample_format(self._settings)
+        words = np.zeros(form.shape_2d, form.dtype)
         keys = np.arange(len(signals), dtype=np.uint64) + np.uint64(draw * len(signals))
         if self.sensor.recording.is_pdm:
             self._modulator(self._layout, keys, 0.0).process(signals, out=words)

@@ -23,7 +23,7 @@ def notes(shot: Snapshot) -> list[str]:
 def _near_targets(shot: Snapshot) -> list[str]:
     """Return a note for each target or source so close to an emitter or a microphone that its amplitude is limited."""
     scene, sensor = shot.scene, shot.sensor
-    ends_m = np.concatenate([shot.ear.positions_m, _emitter_m(shot, shot.number)[None]])
+    ends_m = np.concatenate([shot.receiver.positions_m, _emitter_m(shot, shot.number)[None]])
     targets = shot.targets
     things = list(zip(targets.names, targets.positions_m, strict=True))
     for kind in ("tones", "noises", "sonars"):
@@ -47,12 +47,12 @@ def _near_discs(shot: Snapshot) -> list[str]:
     """
     targets = shot.targets
     wave = 2 * math.pi * shot.sensor.call.high_frequency_hz / shot.speed_m_s
-    apart_m = np.linalg.norm(targets.positions_m - shot.ear.centre_m, axis=1)
-    least_m = np.cbrt(wave * (targets.diameter_m / 2) ** 4 / math.pi)
+    apart_m = np.linalg.norm(targets.positions_m - shot.receiver.centre_m, axis=1)
+    min_m = np.cbrt(wave * (targets.diameter_m / 2) ** 4 / math.pi)
     return [
         f"{targets.names[k]} is a disc of {targets.diameter_m[k]:g} m at {apart_m[k]:.2g} m from {shot.sensor.name}; "
-        f"its echo is accurate from {least_m[k]:.2g} m on. Make it smaller, move it away, or use a wall with size_m"
-        for k in np.flatnonzero((targets.diameter_m > 0) & (apart_m < least_m))
+        f"its echo is accurate from {min_m[k]:.2g} m on. Make it smaller, move it away, or use a wall with size_m"
+        for k in np.flatnonzero((targets.diameter_m > 0) & (apart_m < min_m))
     ]
 
 
@@ -70,7 +70,7 @@ def require_clear(shot: Snapshot) -> None:
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}
     places |= {
         f"microphone {channel} of {shot.sensor.name}": place
-        for channel, place in zip(shot.channels, shot.ear.positions_m, strict=True)
+        for channel, place in zip(shot.channels, shot.receiver.positions_m, strict=True)
     }
     apart_m = np.linalg.norm(targets.positions_m[:, None] - np.array([*places.values()]), axis=2)
     blocked = np.argwhere((apart_m < targets.radius_m[:, None] + _MIN_DISTANCE_M) & (targets.radius_m[:, None] > 0))

@@ -9,7 +9,7 @@ from ertis_numba.simulation.arrivals import Arrivals, arrivals, effect
 from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.sources import Noise, Tone
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 
 __all__ = ["LOUD", "may_be_loud", "peak_bound"]
 
@@ -44,7 +44,7 @@ def _calls(shot: Snapshot, active: frozenset[str]) -> float:
     """Return the highest sum of the amplitudes of calls that overlap."""
     call = shot.sensor.call
     frequency_hz = np.linspace(call.low_frequency_hz, call.high_frequency_hz, _NODES)
-    found = [_changes(entry) for entry in arrivals(shot, active, frequency_hz, Stopwatch())]
+    found = [_changes(entry) for entry in arrivals(shot, active, frequency_hz, CostStopwatch())]
     if not found:
         return 0.0
     time_s, change = np.concatenate(found, axis=1)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.bounds import require_few_mirrors
-from ertis_numba.simulation.snapshot import Ear, Mirror, Mouth
+from ertis_numba.simulation.snapshot import Mirror, ReceiverPose, TransmitterPose
 
 __all__ = ["Seen", "blocked", "images", "reflected"]
 
 Floats = NDArray[np.float64]
-End = TypeVar("End", Mouth, Ear)
+End = TypeVar("End", TransmitterPose, ReceiverPose)
 _SKIN = 1e-9  # of a leg's length: what touches a wall does not cross it
 # A sensor that hears itself over two walls hears through their very edge; a little aside, one order of the
 # two walls is right in a corner of a room, and none at the corner of a box.
@@ -50,8 +50,8 @@ class Seen(Generic[End]):
         return np.asarray(np.cumsum(legs_m, axis=0)[:-1])
 
 
-def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> list[Seen[End]]:
-    """Return an end and its images of up to ``most`` reflections that some place sees.
+def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) -> list[Seen[End]]:
+    """Return an end and its images of up to ``largest`` reflections that some place sees.
 
     The image of an image: ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for
     efficiently simulating small-room acoustics, JASA 65, 1979), kept where every mirror point lies within its
@@ -62,7 +62,7 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
     end : Mouth or Ear
     places_m : (place, axis) float64
     mirrors : sequence of Mirror
-    most : int
+    largest : int
 
     Raises
     ------
@@ -70,11 +70,11 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], most: int) -> 
         There are too many chains of walls.
     """
     n_places = len(places_m)
-    require_few_mirrors(len(mirrors), most, n_places)
+    require_few_mirrors(len(mirrors), largest, n_places)
     straight = np.stack([np.broadcast_to(_position(end), places_m.shape), places_m])
     found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
     chains: list[_Chain] = [((), (end,))]
-    for _ in range(most):
+    for _ in range(largest):
         chains = _longer(chains, mirrors)
         for walls, ends in chains:
             exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m + _NUDGE_M)
@@ -91,7 +91,7 @@ def reflected(end: End, mirror: Mirror) -> End:
     sways_m_s = (*(_turned(earlier, normal) for earlier in end.sways_m_s), sway_m_s)
     reflection = end.reflection * mirror.reflection
     # The sound meets the walls in the order of the images from an emitter, and against it to a microphone.
-    if isinstance(end, Mouth):
+    if isinstance(end, TransmitterPose):
         return replace(
             end,
             position_m=_image(end.position_m, mirror),
@@ -169,8 +169,8 @@ def _crossed(share: Floats, point_m: Floats, mirror: Mirror) -> NDArray[np.bool_
     return np.asarray(inside & (share > _SKIN) & (share < 1 - _SKIN))
 
 
-def _position(end: Mouth | Ear) -> Floats:
-    return end.position_m if isinstance(end, Mouth) else end.centre_m
+def _position(end: TransmitterPose | ReceiverPose) -> Floats:
+    return end.position_m if isinstance(end, TransmitterPose) else end.centre_m
 
 
 def _image(points_m: Floats, mirror: Mirror) -> Floats:

@@ -97,7 +97,7 @@ def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArra
     makes the noise in it least (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters,
     IEEE Press 2005, chapter 4).
     """
-    checks.whole("order", order, 1, _MAX_ORDER)
+    checks.integer("order", order, 1, _MAX_ORDER)
     checks.between("band", band, 0.0, 0.25)
     angle = math.pi * (2 * np.arange(order) + order + 1) / (2 * order)
     low, high = 0.0, 2.0

@@ -62,8 +62,8 @@ def clock_drift(sight: Sight) -> Estimate | None:
         reach = np.maximum(sight.reach(seen.delay_s), sight.reach(moved.delay_s))
         change = change_db(sight.envelope_change(seen, moved) * reach, sight.beside(seen.delay_s))
         if change >= worst.change_db:
-            most = shift_s[np.argmax(np.abs(shift_s))]
-            reason = f"clock drift shifts the call of {sensors[number].name} by up to {1e9 * most:+.3g} ns"
+            largest = shift_s[np.argmax(np.abs(shift_s))]
+            reason = f"clock drift shifts the call of {sensors[number].name} by up to {1e9 * largest:+.3g} ns"
             worst = Estimate(change_db=change, reason=reason, sure=200.0)
     return worst
 
@@ -191,12 +191,12 @@ def doppler(sight: Sight) -> Estimate | None:
     return Estimate(
         change_db=change_db(change, sight.beside(own.delay_s)),
         sure=200.0,
-        reason=f"{own.names[worst]}, {_told_m_s(float(stretch[worst]), shot.speed_m_s)}, shifts by "
+        reason=f"{own.names[worst]}, {_reported_m_s(float(stretch[worst]), shot.speed_m_s)}, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
     )
 
 
-def _told_m_s(stretch: float, speed_m_s: float) -> str:
+def _reported_m_s(stretch: float, speed_m_s: float) -> str:
     """Return the velocity of a reflector that stretches a call so."""
     away_m_s = speed_m_s * (stretch - 1) / (stretch + 1)
     return f"{'going' if away_m_s > 0 else 'coming'} at {abs(away_m_s):.3g} m/s"
@@ -207,6 +207,6 @@ def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
     if not len(paths.targets):
         return np.zeros(len(paths))
     way = paths.arriving[:, 0]
-    across_m_s = paths.targets.velocities_m_s - paths.ear.velocity_m_s
+    across_m_s = paths.targets.velocities_m_s - paths.receiver.velocity_m_s
     across_m_s = across_m_s - np.sum(across_m_s * way, axis=-1, keepdims=True) * way
     return np.asarray(np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s / paths.second_m[:, 0])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.mirrors import Seen
-from ertis_numba.simulation.snapshot import Ear, Mouth, Targets
+from ertis_numba.simulation.snapshot import ReceiverPose, Targets, TransmitterPose
 
 __all__ = ["Paths", "by_targets", "turning", "unit", "without_target"]
 
@@ -19,29 +19,29 @@ class Paths:
 
     Attributes
     ----------
-    mouth : Mouth
-    ear : Ear
+    transmitter : Mouth
+    receiver : Ear
     targets : Targets
         One per path. Without any there is one path, all of it the second leg.
     first_m, second_m : (path, mic) float64
         Lengths of the legs before and after the target.
     leaving, arriving : (path, mic, axis) float64
         Unit vectors along the first and the last leg, as the sound goes, among the images.
-    mouth_corners_m, ear_corners_m : (wall, path) float64
+    transmitter_corners_m, receiver_corners_m : (wall, path) float64
         How far the mirror points are from either end, along the way.
     surface : bool
         Legs end on the surface of spheres, rather than in their centres.
     """
 
-    mouth: Mouth
-    ear: Ear
+    transmitter: TransmitterPose
+    receiver: ReceiverPose
     targets: Targets
     first_m: Floats
     second_m: Floats
     leaving: Floats
     arriving: Floats
-    mouth_corners_m: Floats
-    ear_corners_m: Floats
+    transmitter_corners_m: Floats
+    receiver_corners_m: Floats
     surface: bool = False
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class Paths:
     @property
     def names(self) -> tuple[str, ...]:
         """The target of each path, and the walls before and after it."""
-        before, after = self.mouth.walls, self.ear.walls
+        before, after = self.transmitter.walls, self.receiver.walls
         return tuple(" > ".join((*before, name, *after)) for name in self.targets.names) or (
             " > ".join((*before, *after)) or "direct sound",
         )
@@ -63,10 +63,12 @@ class Paths:
     @property
     def reflection(self) -> float:
         """Amplitude that the walls leave."""
-        return self.mouth.reflection * self.ear.reflection
+        return self.transmitter.reflection * self.receiver.reflection
 
 
-def by_targets(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: NDArray[np.intp]) -> Paths:
+def by_targets(
+    first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
+) -> Paths:
     """Return the paths over some targets, at least one.
 
     Parameters
@@ -82,8 +84,8 @@ def by_targets(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: 
 
 
 def turning(
-    first: Seen[Mouth],
-    second: Seen[Ear],
+    first: Seen[TransmitterPose],
+    second: Seen[ReceiverPose],
     targets: Targets,
     chosen: NDArray[np.intp],
     turns_m: Floats,
@@ -91,48 +93,50 @@ def turning(
     surface: bool,
 ) -> Paths:
     """Return the paths that turn at (path, mic, axis) places; the other arguments are those of `by_targets`."""
-    mouth, ear = first.end, second.end
-    there_m = turns_m - mouth.position_m
-    back_m = ear.positions_m - turns_m
+    transmitter, receiver = first.end, second.end
+    there_m = turns_m - transmitter.position_m
+    back_m = receiver.positions_m - turns_m
     shape = back_m.shape[:2]
     return Paths(
-        mouth=mouth,
-        ear=ear,
+        transmitter=transmitter,
+        receiver=receiver,
         targets=targets.chosen(chosen),
         first_m=np.broadcast_to(_length(there_m), shape),
         second_m=_length(back_m),
         leaving=np.broadcast_to(unit(there_m), back_m.shape),
         arriving=unit(back_m),
-        mouth_corners_m=first.to_corners_m(chosen),
-        ear_corners_m=second.to_corners_m(chosen),
+        transmitter_corners_m=first.to_corners_m(chosen),
+        receiver_corners_m=second.to_corners_m(chosen),
         surface=surface,
     )
 
 
-def without_target(mouth: Mouth, ear: Ear, targets: Targets, corners_m: Floats | None = None) -> Paths:
+def without_target(
+    transmitter: TransmitterPose, receiver: ReceiverPose, targets: Targets, corners_m: Floats | None = None
+) -> Paths:
     """Return the one path from an emitter or its image straight to the microphones.
 
     Parameters
     ----------
-    mouth : Mouth
-    ear : Ear
+    transmitter : Mouth
+    receiver : Ear
     targets : Targets
         All of them.
     corners_m : (wall, 1) float64, optional
         How far the mirror points are from the emitter, along the way.
     """
     none = np.zeros((0, 1))
-    way_m = (ear.positions_m - mouth.position_m)[None]
+    way_m = (receiver.positions_m - transmitter.position_m)[None]
     return Paths(
-        mouth=mouth,
-        ear=ear,
+        transmitter=transmitter,
+        receiver=receiver,
         targets=targets.chosen(np.arange(0)),
         first_m=np.zeros(way_m.shape[:2]),
         second_m=_length(way_m),
         leaving=unit(way_m),
         arriving=unit(way_m),
-        mouth_corners_m=none if corners_m is None else corners_m,
-        ear_corners_m=none,
+        transmitter_corners_m=none if corners_m is None else corners_m,
+        receiver_corners_m=none,
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
 
@@ -19,7 +19,7 @@ _FASTEST_M_S = 100.0  # a third of the speed of sound: beyond, the air itself gi
 _STILL: Vector = (0.0, 0.0, 0.0)
 
 
-class Placed(Table, frozen=True, kw_only=True):
+class Placed(TomlTable, frozen=True, kw_only=True):
     """Something that has a place in the world frame: x forward, y left, z up.
 
     Attributes
@@ -95,7 +95,7 @@ class Placed(Table, frozen=True, kw_only=True):
         return np.asarray((self.range_m or 0.0) * unit_vectors(np.array(azimuth_rad), np.array(elevation_rad)))
 
 
-def check_vector(name: str, vector: Vector, most: float) -> None:
-    """Refuse a vector with a part beyond ``most``."""
+def check_vector(name: str, vector: Vector, largest: float) -> None:
+    """Refuse a vector with a part beyond ``largest``."""
     for part in vector:
-        checks.between(name, part, -most, most)
+        checks.between(name, part, -largest, largest)

@@ -15,13 +15,13 @@ from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
-__all__ = ["Plan", "Verdict", "make_plan"]
+__all__ = ["EffectPlan", "Verdict", "make_plan"]
 
 ABRender = Callable[[int, frozenset[str], str], float | None]
 Rehearse = Callable[[], ABRender]
 
-_INSTANTS, _MOST_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
-_MOST_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
+_INSTANTS, _MAX_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
+_MAX_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
 _PART_ALLOWED = 0.5  # of the tolerance in the rendered measurements of a scene in motion, as others may change more
 _MAX_RENDERED = 3  # measurements of a scene in motion that are rendered for one verdict
 _ROUNDS = 6  # two are the rule; effects that wait for each other take more
@@ -56,7 +56,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class EffectPlan:
     """The effects that are simulated for a scene, with reasons.
 
     Attributes
@@ -80,7 +80,7 @@ class Plan:
         return tuple(verdict.name for verdict in self.verdicts if not verdict.on and verdict.estimate_db)
 
 
-def make_plan(scene: Scene) -> Plan:
+def make_plan(scene: Scene) -> EffectPlan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
     Effects that a key of the scene requests are on, see `names.ASKED_FOR`. With a tolerance of 0, all effects that
@@ -105,11 +105,11 @@ def make_plan(scene: Scene) -> Plan:
             verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
-            return Plan(tuple(verdicts.values()), notes)
+            return EffectPlan(tuple(verdicts.values()), notes)
     # They go in a circle: one matters only with the other, which matters only without it.
     circle = frozenset.union(*rounds[2:]) - frozenset.intersection(*rounds[2:])
     kept = (_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values())
-    return Plan(tuple(kept), notes)
+    return EffectPlan(tuple(kept), notes)
 
 
 def _kept_on(verdict: Verdict) -> Verdict:
@@ -129,7 +129,7 @@ def _indices(scene: Scene) -> list[int]:
     if scene.moves and scene.count > 1:
         corners_s = sorted({time_s for thing in scene.things() for time_s, *_ in thing.waypoints})
         between_s = [(a + b) / 2 for a, b in itertools.pairwise(corners_s)]
-        corners = np.clip(np.rint(np.array([*corners_s, *between_s][:_MOST_CORNERS]) * scene.rate_hz), 0, last)
+        corners = np.clip(np.rint(np.array([*corners_s, *between_s][:_MAX_CORNERS]) * scene.rate_hz), 0, last)
         indices = [int(index) for index in np.unique([*np.linspace(0, last, _INSTANTS).round(), *corners])]
     if any(sensor.electronics.clock_drift_ppm for sensor in scene.sensors):
         indices.append(min(last, scene.sync_every - 1))
@@ -156,7 +156,7 @@ def _decided(
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
     measured_db, moves = None, scene.moves and scene.count > 1
-    if worst.change_db / min(worst.sure, _MOST_TOO_HIGH) < scene.tolerance_db:
+    if worst.change_db / min(worst.sure, _MAX_TOO_HIGH) < scene.tolerance_db:
         indices = [index for estimate, index in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
         indices = [*dict.fromkeys(indices[:_MAX_RENDERED]), *_loudest(name, others, shots)]
         measured_db = _measured_db(scene, rehearse, indices, others, name)
@@ -205,9 +205,9 @@ def _measured_db(
 
 def _rehearsals(scene: Scene) -> ABRender:
     # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
-    from ertis_numba.simulation.rehearsal import Rehearsal  # noqa: PLC0415
+    from ertis_numba.simulation.ab_render import ABRender  # noqa: PLC0415
 
-    return functools.cache(Rehearsal(scene).change_db)
+    return functools.cache(ABRender(scene).change_db)
 
 
 def _active(verdicts: dict[str, Verdict]) -> frozenset[str]:

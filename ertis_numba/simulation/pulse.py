@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation.arrivals import effect
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.waveform import MatchedFilter, call_spectrum, matched_band_hz, matched_filter
+from ertis_numba.waveform import MatchedFilterSpectrum, call_spectrum, matched_band_hz, matched_filter_spectrum
 
 __all__ = ["N_NODES", "band", "baseband", "envelope", "match", "matched"]
 
@@ -20,11 +20,11 @@ N_NODES = 65
 
 
 @functools.lru_cache(maxsize=16)
-def match(settings: Settings) -> tuple[MatchedFilter, float, int]:
+def match(settings: Settings) -> tuple[MatchedFilterSpectrum, float, int]:
     """Return the matched filter of the own call, the rate of its signals and the length of its transform."""
     rate_hz = settings.signal_rate_hz
     n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * rate_hz))
-    return matched_filter(settings, n_fft=n_fft), rate_hz, n_fft
+    return matched_filter_spectrum(settings, n_fft=n_fft), rate_hz, n_fft
 
 
 def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
@@ -35,7 +35,7 @@ def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> N
     rate_hz = settings.signal_rate_hz
     rings_s = 0.0 if emitter is None else effect("emitter_response", "ringing_s")(emitter)
     n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s + rings_s) * rate_hz))
-    mine = matched_filter(settings, n_fft=n_fft)
+    mine = matched_filter_spectrum(settings, n_fft=n_fft)
     bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
     spectrum = np.zeros(n_fft, dtype=np.complex128)
     spectrum[bins] = call_spectrum(call, settings, n_fft=n_fft)[bins] * mine.values
@@ -69,7 +69,7 @@ def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats
 def band(settings: Settings) -> tuple[Floats, Floats]:
     """Return some frequencies of the call's band, and the share of the matched call's power at each."""
     rate_hz, n_fft = settings.signal_rate_hz, 32_768  # bins much narrower than a node
-    mine = matched_filter(settings, n_fft=n_fft)
+    mine = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (mine.first_bin + np.arange(len(mine.values))) * rate_hz / n_fft
     edges = np.linspace(*matched_band_hz(settings), N_NODES + 1)
     # S H is what the image sums; between the edges of its window H is conj(S).

@@ -3,9 +3,9 @@
 from ertis_numba import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Processing, Recording
+from ertis_numba.simulation.ab_render import ABRender
 from ertis_numba.simulation.engine import Engine
-from ertis_numba.simulation.plan import Plan, make_plan
-from ertis_numba.simulation.rehearsal import Rehearsal
+from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.targets import Point
@@ -32,7 +32,7 @@ class Simulator(Engine):
     """
 
     def __init__(
-        self, scene: Scene, *, sensor: str | None = None, plan: Plan | None = None, threads: int | None = None
+        self, scene: Scene, *, sensor: str | None = None, plan: EffectPlan | None = None, threads: int | None = None
     ) -> None:
         checks.instance("scene", scene, Scene, "load_scene returns")
         self.plan = make_plan(scene) if plan is None else plan
@@ -54,4 +54,4 @@ def compile_kernels() -> None:
     scene = Scene(sensors=(sensor,), points=(Point(range_m=0.25),))
     effects = frozenset({"propagation", "spreading", "modulation"})
     Engine(scene, sensor, effects).render()
-    Rehearsal(scene).change_db(0, effects, "absorption")
+    ABRender(scene).change_db(0, effects, "absorption")

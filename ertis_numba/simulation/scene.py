@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import msgspec
 
 from ertis_numba import checks
-from ertis_numba.documents import Document
+from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
@@ -22,10 +22,10 @@ from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
 
 __all__ = ["Scene", "load_scene"]
 
-_MOST_REFLECTIONS = 4
+_MAX_REFLECTIONS = 4
 
 
-class Scene(Document, frozen=True, kw_only=True):
+class Scene(TomlDocument, frozen=True, kw_only=True):
     """Sensors and what they hear.
 
     Attributes
@@ -73,12 +73,12 @@ class Scene(Document, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole("seed", self.seed, 0, 2**63 - 1)
+        checks.integer("seed", self.seed, 0, 2**63 - 1)
         checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
-        checks.whole("count", self.count, 1, 10**9)
-        checks.whole("sync_every", self.sync_every, 1, 10**9)
+        checks.integer("count", self.count, 1, 10**9)
+        checks.integer("sync_every", self.sync_every, 1, 10**9)
         checks.between("tolerance_db", self.tolerance_db, 0.0, 60.0)
-        checks.whole("max_reflections", self.max_reflections, 0, _MOST_REFLECTIONS)
+        checks.integer("max_reflections", self.max_reflections, 0, _MAX_REFLECTIONS)
         for name, wanted in self.effects.items():
             checks.choice("effect", name, EFFECTS)
             if name in INDISPENSABLE and not wanted:
@@ -129,10 +129,10 @@ class Scene(Document, frozen=True, kw_only=True):
 
         So are files of directions.
         """
-        sensors = [sensor.beside(folder) for sensor in self.sensors]
+        sensors = [sensor.resolve_paths(folder) for sensor in self.sensors]
         return self.replace(
             sensors=tuple(sensor.replace(array=_read(sensor.array)) for sensor in sensors),
-            sonars=tuple(sonar.replace(call=sonar.call.beside(folder)) for sonar in self.sonars),
+            sonars=tuple(sonar.replace(call=sonar.call.resolve_paths(folder)) for sonar in self.sonars),
         )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
@@ -25,7 +25,7 @@ _QUALITY_FACTOR = 5.0
 _MAX_DRIFT_PPM = 1000.0
 
 
-class Emitter(Table, frozen=True, kw_only=True):
+class Emitter(TomlTable, frozen=True, kw_only=True):
     """The loudspeaker, which faces forward.
 
     Attributes
@@ -81,7 +81,7 @@ class Emitter(Table, frozen=True, kw_only=True):
         return _QUALITY_FACTOR if self.quality_factor is None else self.quality_factor
 
 
-class Electronics(Table, frozen=True, kw_only=True):
+class Electronics(TomlTable, frozen=True, kw_only=True):
     """The microphones and what they do to the sound.
 
     Attributes
@@ -120,7 +120,7 @@ class Electronics(Table, frozen=True, kw_only=True):
         super().__post_init__()
         if self.noise_dbfs is not None:
             checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
-        checks.whole("electronics.modulator_order", self.modulator_order, 1, 4)
+        checks.integer("electronics.modulator_order", self.modulator_order, 1, 4)
         checks.between("electronics.dither", self.dither, 0.0, 2.0)
         checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, _LARGEST_M)
         checks.between("electronics.gain_spread_db", self.gain_spread_db, 0.0, 20.0)
@@ -187,7 +187,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         self.path()
         for name in ("dead_channels", "stuck_low", "stuck_high"):
             for channel in getattr(self.electronics, name):
-                checks.whole(f"electronics.{name}", channel, 0, 1023)
+                checks.integer(f"electronics.{name}", channel, 0, 1023)
 
     def require_microphones(self) -> None:
         """Refuse faults of channels that carry no microphone, which only the layout can tell.

@@ -17,7 +17,7 @@ from ertis_numba.simulation.arrivals import echoes, effect, emitted, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
@@ -34,7 +34,7 @@ _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by 
 SAME_RANGE_M = 0.05
 """Echoes so close in range count as at the same range."""
 # White noise of the level that modulators of each order leave between 20 and 80 kHz at the clock of eRTIS.
-_MODULATOR_DBFS, _MOST_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10.0
+_MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ class Sight:
         # Shaped noise rises with the band's share of the clock, by 6 dB per octave and order.
         slower = ERTIS_PDM_RATE_HZ / self.settings.recording.sample_rate_hz
         dbfs = _MODULATOR_DBFS[order] + 20 * order * math.log10(slower)
-        return self.of_white_noise(min(dbfs, _MOST_NOISE_DBFS))
+        return self.of_white_noise(min(dbfs, _MAX_NOISE_DBFS))
 
     def echoes(self, active: frozenset[str]) -> Echoes:
         """Return what arrives of calls with other effects."""
@@ -150,17 +150,17 @@ class Sight:
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the ways of an emitter's call to the middle of the array."""
         middle, geometry = self._middle, active & _GEOMETRY
-        return middle.once((number, geometry), lambda: echoes(middle, geometry, number, Stopwatch()))
+        return middle.once((number, geometry), lambda: echoes(middle, geometry, number, CostStopwatch()))
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
         emitter = self.shot.scene.sensors[number].emitter
         level = 10 ** (emitter.level_db / 20) * emitted(active, emitter, self.frequency_hz)
-        gain = level * responses(self._middle, active, paths, emitter, self.frequency_hz, Stopwatch())[:, 0]
+        gain = level * responses(self._middle, active, paths, emitter, self.frequency_hz, CostStopwatch())[:, 0]
         return Echoes(
             names=paths.names,
             gain=np.asarray(np.broadcast_to(gain, (len(paths), pulse.N_NODES))),
             delay_s=paths.length_m[:, 0] / self.shot.speed_m_s,
-            direction=-paths.arriving[:, 0] @ paths.ear.axes.T,
+            direction=-paths.arriving[:, 0] @ paths.receiver.axes.T,
         )
 
     def levels(self, seen: Echoes) -> Floats:

@@ -12,14 +12,14 @@ from ertis_numba.geometry import Layout, microphones
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 
-__all__ = ["Ear", "Mirror", "Mouth", "Snapshot", "Targets", "snapshot"]
+__all__ = ["Mirror", "ReceiverPose", "Snapshot", "Targets", "TransmitterPose", "snapshot"]
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mouth:
+class TransmitterPose:
     """An emitter, or its image in walls.
 
     Attributes
@@ -44,7 +44,7 @@ class Mouth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ear:
+class ReceiverPose:
     """The microphones of a sensor, or their image in walls.
 
     Attributes
@@ -144,7 +144,7 @@ class Snapshot:
         Its microphones.
     channels : (mic,) int64
         Their channels.
-    ear : Ear
+    receiver : Ear
     mouths : tuple of Mouth
         One per sensor of the scene.
     targets : Targets
@@ -160,8 +160,8 @@ class Snapshot:
     time_s: float
     layout: Layout
     channels: NDArray[np.int64]
-    ear: Ear
-    mouths: tuple[Mouth, ...]
+    receiver: ReceiverPose
+    mouths: tuple[TransmitterPose, ...]
     targets: Targets
     mirrors: tuple[Mirror, ...]
     speed_m_s: float
@@ -180,19 +180,19 @@ class Snapshot:
         return self.scene.sensors.index(self.sensor)
 
     @property
-    def mouth(self) -> Mouth:
+    def transmitter(self) -> TransmitterPose:
         """The listening sensor's own emitter."""
         return self.mouths[self.number]
 
     def of_mics(self, mics: slice) -> Self:
         """Return the same with some of the microphones."""
-        ear = replace(self.ear, positions_m=self.ear.positions_m[mics])
-        return replace(self, ear=ear, channels=self.channels[mics], memory={})
+        receiver = replace(self.receiver, positions_m=self.receiver.positions_m[mics])
+        return replace(self, receiver=receiver, channels=self.channels[mics], memory={})
 
     def at_centre(self) -> Self:
         """Return the same with one microphone, in the middle of the array."""
-        ear = replace(self.ear, positions_m=self.ear.centre_m[None])
-        return self.once("centre", lambda: replace(self, ear=ear, memory={}))
+        receiver = replace(self.receiver, positions_m=self.receiver.centre_m[None])
+        return self.once("centre", lambda: replace(self, receiver=receiver, memory={}))
 
 
 def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
@@ -206,14 +206,14 @@ def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
         time_s=time_s,
         layout=layout,
         channels=np.flatnonzero(layout.enabled),
-        ear=Ear(
+        receiver=ReceiverPose(
             positions_m=centre_m + layout.enabled_positions_m @ rotation.T,
             centre_m=centre_m,
             velocity_m_s=place.velocity_at(time_s),
             axes=rotation.T,
         ),
         mouths=tuple(
-            Mouth(
+            TransmitterPose(
                 position_m=other.path().position_at(time_s),
                 velocity_m_s=other.path().velocity_at(time_s),
                 facing=other.rotation()[:, 0],

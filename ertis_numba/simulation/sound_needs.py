@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ertis_numba.simulation.arrivals import effect, mouth_of
+from ertis_numba.simulation.arrivals import effect, transmitter_of
 from ertis_numba.simulation.estimates import Estimate, ghosts, noise, unequal
 from ertis_numba.simulation.sight import Sight, change_db
 from ertis_numba.simulation.sources import Sonar
@@ -56,7 +56,7 @@ def direct_sound(sight: Sight) -> Estimate | None:
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
-    paths = effect("direct_sound")(sight.shot, mouth_of(sight.shot, sight.active, sight.shot.number))
+    paths = effect("direct_sound")(sight.shot, transmitter_of(sight.shot, sight.active, sight.shot.number))
     amplitude = 10 ** (emitter.direct_sound_db / 20) * effect("spreading")(paths)[0]
     time_s, level = sight.near_field(amplitude, paths.length_m[0] / sight.shot.speed_m_s)
     over_m = sight.settings.call.duration_s * sight.shot.speed_m_s / 2
@@ -78,7 +78,7 @@ def interference(sight: Sight) -> Estimate | None:
         for number, source in enumerate(getattr(scene, kind)):
             paths = way_from(shot, source)
             amplitude = float(10 ** (source.level_db / 20) * np.mean(spread(paths)))
-            direction = -np.mean(paths.arriving, axis=1) @ paths.ear.axes.T
+            direction = -np.mean(paths.arriving, axis=1) @ paths.receiver.axes.T
             level = float(sight.coverage(direction)[0])
             if kind == "tones":
                 level *= sight.of_tone(amplitude, source.frequency_hz)

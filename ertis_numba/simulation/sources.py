@@ -1,7 +1,7 @@
 """Sounds that are no echoes: tones, noise, other sonars, and the room itself."""
 
 from ertis_numba import checks
-from ertis_numba.documents import Table
+from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call
 from ertis_numba.simulation.placed import Placed
@@ -77,7 +77,7 @@ class Sonar(Placed, frozen=True, kw_only=True):
         checks.between("sonar.offset_s", self.offset_s, 0.0, 1e3)
 
 
-class Ambient(Table, frozen=True, kw_only=True):
+class Ambient(TomlTable, frozen=True, kw_only=True):
     """Noise that comes from everywhere alike.
 
     Attributes

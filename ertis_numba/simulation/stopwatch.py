@@ -5,10 +5,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["Stopwatch"]
+__all__ = ["CostStopwatch"]
 
 
-class Stopwatch:
+class CostStopwatch:
     """Adds up milliseconds by name.
 
     Attributes

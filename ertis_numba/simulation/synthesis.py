@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.settings import Call
 from ertis_numba.simulation.arrivals import Arrivals, effect
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.waveform import call_at
 
 __all__ = ["BLOCK", "NODE_HZ", "highest_hz", "node_frequencies", "signals"]
@@ -43,7 +43,7 @@ def highest_hz(call: Call, rate_hz: float) -> float:
 
 
 def signals(
-    arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, threads: int, clock: Stopwatch
+    arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, threads: int, clock: CostStopwatch
 ) -> Iterator[Floats]:
     """Yield the signals of one block of the record after the other: (mic, sample) float64.
 

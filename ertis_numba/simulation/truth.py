@@ -8,7 +8,7 @@ from ertis_numba.simulation.arrivals import echoes, emitted, responses
 from ertis_numba.simulation.paths import Paths, unit
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
-from ertis_numba.simulation.stopwatch import Stopwatch
+from ertis_numba.simulation.stopwatch import CostStopwatch
 
 __all__ = ["reflectors"]
 
@@ -60,20 +60,20 @@ def _levels(shot: Snapshot, sight: Sight, number: int) -> Floats:
     emitter, active = other.emitter, sight.active
     loudness = 10 ** (emitter.level_db / 20) * sight.likeness(other.call)
     parts = [
-        responses(shot, active, paths, emitter, sight.frequency_hz, Stopwatch())
+        responses(shot, active, paths, emitter, sight.frequency_hz, CostStopwatch())
         * (emitted(active, emitter, sight.frequency_hz) * sight.power)
-        for paths in echoes(shot, active, number, Stopwatch())
+        for paths in echoes(shot, active, number, CostStopwatch())
     ]
     return loudness * np.concatenate([np.zeros(0), *(np.abs(np.sum(part, axis=2)).mean(axis=1) for part in parts)])
 
 
 def _velocity_m_s(paths: Paths) -> Floats:
     """Return velocities in the sensor frame: (path, axis) float64."""
-    mouth, ear, targets = paths.mouth, paths.ear, paths.targets
-    if len(targets) and not (mouth.walls or ear.walls):
-        return np.asarray((targets.velocities_m_s - ear.velocity_m_s) @ ear.axes.T)
+    transmitter, receiver, targets = paths.transmitter, paths.receiver, paths.targets
+    if len(targets) and not (transmitter.walls or receiver.walls):
+        return np.asarray((targets.velocities_m_s - receiver.velocity_m_s) @ receiver.axes.T)
     leaving, arriving = np.mean(paths.leaving, axis=1), np.mean(paths.arriving, axis=1)
-    corner_m_s = targets.velocities_m_s if len(targets) else np.broadcast_to(mouth.velocity_m_s, leaving.shape)
-    longer_m_s = np.sum(leaving * (corner_m_s - mouth.velocity_m_s), axis=1)
-    longer_m_s += np.sum(arriving * (ear.velocity_m_s - corner_m_s), axis=1)
-    return np.asarray(-arriving @ ear.axes.T * (longer_m_s / 2)[:, None])
+    corner_m_s = targets.velocities_m_s if len(targets) else np.broadcast_to(transmitter.velocity_m_s, leaving.shape)
+    longer_m_s = np.sum(leaving * (corner_m_s - transmitter.velocity_m_s), axis=1)
+    longer_m_s += np.sum(arriving * (receiver.velocity_m_s - corner_m_s), axis=1)
+    return np.asarray(-arriving @ receiver.axes.T * (longer_m_s / 2)[:, None])

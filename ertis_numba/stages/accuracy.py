@@ -12,7 +12,7 @@ filter therefore adds, to an image whose mean power is ``gain`` times that of un
 s is the share of a complex error that changes a magnitude: half of it in noise, where the other half turns the phase,
 which the envelope does not see; more where few coherent echoes make most of the image, since beam and error are then
 sums of the same waves and tend to have one phase. How much brighter coherent echoes make the image is what settings
-cannot tell; a `Texture` measures it, and where there is none the model assumes what errs on the safe side.
+cannot tell; a `SignalModel` measures it, and where there is none the model assumes what errs on the safe side.
 """
 
 import math
@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit
-from ertis_numba.stages.zones import NEAREST_M
-from ertis_numba.waveform import matched_band_hz, matched_spectrum
+from ertis_numba.stages.focal_zones import NEAREST_M
+from ertis_numba.waveform import matched_band_hz, matched_noise_spectrum
 
-__all__ = ["PARTS", "ErrorModel", "Texture", "decibels"]
+__all__ = ["PARTS", "ErrorModel", "SignalModel", "decibels"]
 
 PARTS: Final = {
     "delays": "interpolation of delayed samples",
@@ -59,7 +59,7 @@ def decibels(power: float) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Texture:
+class SignalModel:
     """What the error depends on besides the settings: a few numbers of what is heard.
 
     Attributes
@@ -96,9 +96,9 @@ class Texture:
     loudness: float = 0.0
 
     @classmethod
-    def unknown(cls, settings: Settings) -> "Texture":
+    def unknown(cls, settings: Settings) -> "SignalModel":
         """Return the texture that is assumed where none was measured: on the safe side."""
-        _, shares = matched_spectrum(settings, n_waves=WAVES)
+        _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
         if not settings.recording.is_pdm:  # beyond the band there may be as much sound as within
             return cls(shares, _SAFE_GAIN, _SAFE_CREST, np.ones(2), 1.0, np.ones(1), colour=_SAFE_COLOUR)
         frequency_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, 1025)
@@ -107,9 +107,9 @@ class Texture:
         return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
 
     @classmethod
-    def echo(cls, settings: Settings, n_mics: float) -> "Texture":
+    def echo(cls, settings: Settings, n_mics: float) -> "SignalModel":
         """Return the texture of a single echo, to which all microphones contribute in phase."""
-        _, shares = matched_spectrum(settings, n_waves=WAVES)
+        _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
         power = shares**2  # that of the echo, beside that of the filter
         return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
 
@@ -120,14 +120,14 @@ class ErrorModel:
     Parameters
     ----------
     settings : Settings
-    texture : Texture, optional
+    signal_model : Texture, optional
         Measured; what errs on the safe side by default.
     """
 
-    def __init__(self, settings: Settings, texture: Texture | None = None) -> None:
+    def __init__(self, settings: Settings, signal_model: SignalModel | None = None) -> None:
         self._settings = settings
-        self.texture = texture or Texture.unknown(settings)
-        self.frequency_hz, _ = matched_spectrum(settings, n_waves=WAVES)
+        self.signal_model = signal_model or SignalModel.unknown(settings)
+        self.frequency_hz, _ = matched_noise_spectrum(settings, n_waves=WAVES)
         self._weights = array_weights(settings)
 
     def delays(self, fit: DelayFit, *, n_mics: float, fractions: NDArray[np.float64] | None = None) -> float:
@@ -146,12 +146,16 @@ class ErrorModel:
         fractions : (delay,) float64, optional
             Fractions of a step in the delays, if the delays are too few to spread evenly.
         """
-        texture = self.texture
+        signal_model = self.signal_model
         if fractions is not None:
-            return texture.colour * float(fit.errors_at(fractions) @ texture.shares) * max(1.0, 0.5 / texture.gain)
-        varying, shared = (float(errors @ texture.shares) for errors in (fit.errors, fit.biases))
-        independent = 0.5 * (1 + 1 / n_mics) * varying / texture.gain
-        return texture.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
+            return (
+                signal_model.colour
+                * float(fit.errors_at(fractions) @ signal_model.shares)
+                * max(1.0, 0.5 / signal_model.gain)
+            )
+        varying, shared = (float(errors @ signal_model.shares) for errors in (fit.errors, fit.biases))
+        independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
+        return signal_model.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
 
     def beams(self, nodes: BeamNodes) -> float:
         """Return the part of interpolated beams, from an estimate of `BeamNodes`.
@@ -161,9 +165,9 @@ class ErrorModel:
 
             Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*  and so on.
         """
-        covariance = self.texture.covariance
+        covariance = self.signal_model.covariance
         if covariance is None or nodes.is_bent:
-            return self._of(_UNLIKE * self.texture.colour * float(nodes.errors @ self.texture.shares))
+            return self._of(_UNLIKE * self.signal_model.colour * float(nodes.errors @ self.signal_model.shares))
         n_tiles, n_waves, _, _ = covariance.shape
         n_directions = nodes.steering.shape[2]
         beams, errors = np.zeros((2, n_tiles, n_directions))
@@ -179,7 +183,7 @@ class ErrorModel:
         wrong = both.real**2 / beams + 0.5 * np.maximum(errors - np.abs(both) ** 2 / beams, 0.0)
         return _UNLIKE * float(wrong.sum() / beams.sum())
 
-    def zones(self, aperture: Aperture, bend_2: float, *, sound_speed_m_s: float) -> float:
+    def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
         """Return the part of delays that hold for a zone of ranges.
 
         Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
@@ -189,8 +193,8 @@ class ErrorModel:
         Parameters
         ----------
         aperture : Aperture
-        bend_2 : float
-            Mean square of what curvatures differ by from those of their zones, in 1/m²: see `zones.squared_bend`.
+        curvature_2 : float
+            Mean square of what curvatures differ by from those of their zones, in 1/m²: see `zones.squared_curvature`.
         sound_speed_m_s : float
         """
         along_m = aperture.directions @ aperture.positions_m.T
@@ -199,11 +203,11 @@ class ErrorModel:
         middle_m2 = np.mean(weights * across_m2, axis=1)
         spread_m4 = float(np.mean(np.mean(power * (across_m2 - middle_m2[:, None]) ** 2, axis=1)))
         turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
-        shares = self.texture.shares
+        shares = self.signal_model.shares
         centre_hz = float(self.frequency_hz @ shares)
         shared_m4 = float(np.mean(middle_m2**2))
         shift_2 = (2 * math.pi * (self.frequency_hz - centre_hz) / (2 * sound_speed_m_s)) ** 2 * shared_m4
-        return self._of(float(turn_2 @ shares) * bend_2) + float(shift_2 @ shares) * bend_2
+        return self._of(float(turn_2 @ shares) * curvature_2) + float(shift_2 @ shares) * curvature_2
 
     def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
         """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
@@ -226,7 +230,7 @@ class ErrorModel:
         taps : float
             Sum of the squared weights of the nodes that make a beam, 1 without nodes.
         """
-        of_samples = terms * self.texture.crest / limit**2 / 6
+        of_samples = terms * self.signal_model.crest / limit**2 / 6
         of_weights = n_terms / weight_limit**2 / 6
         return self._of(taps * (of_samples + of_weights))
 
@@ -243,7 +247,7 @@ class ErrorModel:
         filled : float
             What they add up to by 2³¹, at most 1.
         """
-        step_2 = self.texture.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
+        step_2 = self.signal_model.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
         return self._of(taps * step_2 / 6)
 
     def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
@@ -252,7 +256,7 @@ class ErrorModel:
         The filter is the one in whole numbers, so that what rounding leaves of its stop band counts. Noise is
         everywhere, and where the image is darker than that, it changes magnitudes by all of itself.
         """
-        settings, noise = self._settings, self.texture.noise
+        settings, noise = self._settings, self.signal_model.noise
         low_hz, high_hz = matched_band_hz(settings)
         n_fft = 2 * (len(noise) - 1)
         n_fft *= max(1, -(-8 * len(taps) // n_fft))  # fine enough for the filter's side lobes
@@ -263,8 +267,10 @@ class ErrorModel:
         distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
         outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
         passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
-        power = _UNLIKE * passed / self.texture.level / self.texture.gain
-        dark = np.exp(-4 * np.sqrt(self.texture.places / max(power, 1e-30)))  # near the mean of Rice's distribution
+        power = _UNLIKE * passed / self.signal_model.level / self.signal_model.gain
+        dark = np.exp(
+            -4 * np.sqrt(self.signal_model.places / max(power, 1e-30))
+        )  # near the mean of Rice's distribution
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
@@ -274,10 +280,10 @@ class ErrorModel:
         errors add up in a beam. PDM bits are as loud whatever is heard, which the measured figure includes.
         """
         if self._settings.recording.is_pdm:
-            return _ARITHMETIC / self.texture.gain
+            return _ARITHMETIC / self.signal_model.gain
         alike = effective_count(self._weights)
-        return (_ARITHMETIC + alike * _ROUNDING * self.texture.loudness) / self.texture.gain
+        return (_ARITHMETIC + alike * _ROUNDING * self.signal_model.loudness) / self.signal_model.gain
 
     def _of(self, power: float) -> float:
-        gain = self.texture.gain
+        gain = self.signal_model.gain
         return (0.5 if gain <= 1 else 1 - 0.5 / gain) * power / gain

@@ -100,5 +100,5 @@ def _roots(weights: NDArray[np.complex64], order: int) -> NDArray[np.complex64]:
 def _capon(
     kernels: KernelSet, offsets: NDArray[np.int32], weights: NDArray[np.complex64], processing: Processing
 ) -> _Combine:
-    snapshots, loading = processing.snapshots, processing.loading
+    snapshots, loading = processing.snapshots, processing.diagonal_loading
     return lambda analytic, out: kernels.combine_capon(analytic, offsets, weights, snapshots, loading, out)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet, Memory
-from ertis_numba.stages.beam_nodes import FEWEST_RANGES, BeamNodes
+from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamNodes
 from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
 

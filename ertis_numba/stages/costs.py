@@ -30,7 +30,7 @@ _LOG = logging.getLogger("ertis_numba")
 _RUNS = 5  # the best of which counts
 _FLOOR_S = 2e-4  # runs shorter than this are repeated
 _MICS, _RANGES = 32, 960
-_MOST_S = 1.0  # of a unit of work: more is no measurement
+_MAX_S = 1.0  # of a unit of work: more is no measurement
 _BEYOND = 0.2  # of a tile, by which its samples reach over its ranges
 _PHASES = {"few": 1, "many": 12, "most": 64}  # between them a term costs what a line over the logarithm says
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
@@ -184,7 +184,7 @@ def _kept(path: Path) -> Costs | None:
         seconds = {name: float(found[name]) for name in _UNITS}
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return Costs(seconds) if all(0 < value <= _MOST_S for value in seconds.values()) else None
+    return Costs(seconds) if all(0 < value <= _MAX_S for value in seconds.values()) else None
 
 
 def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
@@ -305,7 +305,7 @@ def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str,
     """Return the cost of a term at one range, by the number of phases."""
     found: dict[str, float] = {}
     kernels = bench.kernels
-    energy = np.empty((n_beams, _RANGES), dtype=np.float32)
+    amplitude = np.empty((n_beams, _RANGES), dtype=np.float32)
     points = n_beams * _MICS * _RANGES
     for name, n_phases in _PHASES.items():
         signals = np.ones((_MICS, n_phases, _RANGES + 40), dtype=np.complex64)
@@ -313,7 +313,7 @@ def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str,
         samples = random.integers(0, 16, (n_beams, _MICS))
         offsets = (rows * signals.shape[2] + samples).astype(np.int32)
         weights = np.full((n_beams, _MICS), 0.01 + 0.02j, dtype=np.complex64)
-        took_s = bench.best(kernels.delay_and_sum_envelope, signals, offsets, weights, 0, _RANGES, energy)
+        took_s = bench.best(kernels.delay_and_sum_envelope, signals, offsets, weights, 0, _RANGES, amplitude)
         found[f"sum_float32_{name}"] = took_s / points
         if kernels.tile_ranges:
             tiles, scales, starts = _tiles(kernels, _MICS, n_phases)
@@ -323,7 +323,7 @@ def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str,
             whole = np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
             took_s = bench.best(
                 kernels.delay_and_sum_envelope_int16,
-                *(tiles, scales, starts, _RANGES, places, whole, np.float32(1), energy),
+                *(tiles, scales, starts, _RANGES, places, whole, np.float32(1), amplitude),
             )
             found[f"sum_int16_{name}"] = took_s / points
     return found
@@ -337,7 +337,7 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
     """Return the cost of a pair of nodes at one range, and of one place in the image."""
     n_nodes, points = 400, n_directions * _RANGES
     kernels = bench.kernels
-    energy = np.empty((n_directions, _RANGES), dtype=np.float32)
+    amplitude = np.empty((n_directions, _RANGES), dtype=np.float32)
     rows = np.arange(n_directions, dtype=np.int32)
     offsets = np.zeros((n_nodes, 1), dtype=np.int32)
     first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # some directions share all nodes
@@ -350,7 +350,7 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
         took_s["float32"].append(
             bench.best(
                 kernels.interpolated_beams_envelope,
-                *(signals, offsets, weights, places, taps, rows, 0, _RANGES, 1, energy),
+                *(signals, offsets, weights, places, taps, rows, 0, _RANGES, 1, amplitude),
             )
         )
         if kernels.tile_ranges:
@@ -361,7 +361,7 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
                 bench.best(
                     kernels.interpolated_beams_envelope_int16,
                     *(tiles, scales, starts, _RANGES, offsets, whole, places, whole_taps, rows, np.float32(1), 1),
-                    energy,
+                    amplitude,
                 )
             )
     found: dict[str, float] = {}

@@ -17,7 +17,7 @@ from ertis_numba.geometry import Grid, array_weights, direction_grid, microphone
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.beam_nodes import Aperture, require_nodes
+from ertis_numba.stages.beam_grid import Aperture, require_nodes
 from ertis_numba.stages.beamform import beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone

@@ -36,7 +36,7 @@ WAVES = 40
 """Frequencies of the spectra that fits and errors are weighted by."""
 
 _TURNS = 12  # the error falls by less than 0.1 dB after that
-_LEAST_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
+_MIN_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
 _TARGETS = 65  # over one step of the samples that are kept
 
 
@@ -95,7 +95,7 @@ def fit(
     power: NDArray[np.float64],
     *,
     real: bool = False,
-    least_power: float = _LEAST_POWER,
+    min_power: float = _MIN_POWER,
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return the gain and the weights that make ``targets`` of ``taps`` with the least error.
 
@@ -106,7 +106,7 @@ def fit(
     power : (wave,) float64
     real : bool
         Give real weights only.
-    least_power : float
+    min_power : float
         Added to the taps' Gram matrix, by its mean diagonal.
 
     Returns
@@ -116,10 +116,10 @@ def fit(
     """
     gain: NDArray[Any] = np.ones(len(taps), dtype=np.complex128)
     for _ in range(_TURNS):
-        weights = weights_of(gain, taps, targets, power, real=real, least_power=least_power)
+        weights = weights_of(gain, taps, targets, power, real=real, min_power=min_power)
         made = taps @ weights
         gain = gain_of(made, targets)
-    return gain, weights_of(gain, taps, targets, power, real=real, least_power=least_power)
+    return gain, weights_of(gain, taps, targets, power, real=real, min_power=min_power)
 
 
 def gain_of(made: NDArray[np.complex128], targets: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -134,7 +134,7 @@ def weights_of(
     power: NDArray[np.float64],
     *,
     real: bool = False,
-    least_power: float = _LEAST_POWER,
+    min_power: float = _MIN_POWER,
 ) -> NDArray[np.complex128]:
     """Return the weights, (tap, target), that are best with a given gain; parameters as for `fit`."""
     gained = gain[:, None] * taps
@@ -142,7 +142,7 @@ def weights_of(
     gram, right = left @ gained, left @ targets
     if real:
         gram, right = gram.real.astype(np.complex128), right.real.astype(np.complex128)
-    gram += least_power * np.trace(gram).real / len(gram) * np.eye(len(gram))
+    gram += min_power * np.trace(gram).real / len(gram) * np.eye(len(gram))
     return np.asarray(np.linalg.solve(gram, right))
 
 

@@ -10,7 +10,7 @@ from ertis_numba.fft import Transforms
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
-from ertis_numba.waveform import filter_response, matched_filter
+from ertis_numba.waveform import filter_response, matched_filter_spectrum
 
 __all__ = ["Gain", "MatchedFilter"]
 
@@ -54,7 +54,7 @@ class MatchedFilter:
         gain: Gain,
     ) -> None:
         rate_hz = settings.signal_rate_hz
-        matched = matched_filter(settings, n_fft=window.n_fft)
+        matched = matched_filter_spectrum(settings, n_fft=window.n_fft)
         n_phases = settings.accuracy.oversampling or 1
         frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
         flat = matched.values / filter_response(

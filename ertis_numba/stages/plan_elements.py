@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamNodes
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
+from ertis_numba.stages.focal_zones import zone_edges
 from ertis_numba.stages.window import time_window
-from ertis_numba.stages.zones import zone_edges
-from ertis_numba.waveform import decimation_taps, matched_band_hz, matched_spectrum, whole_taps
+from ertis_numba.waveform import decimation_taps, integer_taps, matched_band_hz, matched_noise_spectrum
 
 __all__ = ["ahead_of", "chain_taps", "delay_fit", "nodes_of", "ringing_db", "spectrum_of", "zones_of"]
 
@@ -32,7 +32,7 @@ def spectrum_of(settings: Settings) -> Spectrum:
 @functools.lru_cache(maxsize=8)
 def _spectrum_of(settings: Settings) -> Spectrum:
     """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
-    return Spectrum(*matched_spectrum(settings, n_waves=WAVES))
+    return Spectrum(*matched_noise_spectrum(settings, n_waves=WAVES))
 
 
 def nodes_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamNodes | None:
@@ -60,15 +60,15 @@ def delay_fit(settings: Settings, spectrum: Spectrum) -> tuple[DelayFit, float]:
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
     """Return the decimation filter of a complete plan; PCM that is not decimated needs none."""
     if settings.decimation == 1 and not settings.recording.is_pdm:
-        return whole_taps(np.ones(1))
-    stop_band_db = settings.accuracy.stop_band_db or 60.0
+        return integer_taps(np.ones(1))
+    stopband_attenuation_db = settings.accuracy.stopband_attenuation_db or 60.0
     taps = decimation_taps(
         sample_rate_hz=settings.recording.sample_rate_hz,
         decimation=settings.decimation,
         pass_hz=matched_band_hz(settings)[1],
-        stop_band_db=stop_band_db,
+        stopband_attenuation_db=stopband_attenuation_db,
     )
-    return whole_taps(taps, bits=16 if stop_band_db <= _SHORT_TAPS_DB else 32)
+    return integer_taps(taps, bits=16 if stopband_attenuation_db <= _SHORT_TAPS_DB else 32)
 
 
 def ringing_db(settings: Settings) -> float:
@@ -79,7 +79,7 @@ def ringing_db(settings: Settings) -> float:
     """
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
-    return max(60.0, 1.2 * (settings.accuracy.stop_band_db or 60.0) - 12.0)
+    return max(60.0, 1.2 * (settings.accuracy.stopband_attenuation_db or 60.0) - 12.0)
 
 
 def ahead_of(fit: DelayFit, weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
@@ -101,4 +101,4 @@ def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
     range_m = time_window(settings, largest_delay_s=0.0, n_taps=1).range_m
     if settings.processing.wavefront == "plane":
         return [(0, len(range_m), math.inf)]
-    return zone_edges(range_m, settings.accuracy.zones or 1)
+    return zone_edges(range_m, settings.accuracy.focal_zones or 1)

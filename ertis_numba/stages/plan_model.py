@@ -12,17 +12,17 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture
-from ertis_numba.stages.beam_nodes import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
+from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel
+from ertis_numba.stages.beam_grid import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
 from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
 from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.focal_zones import NEAREST_M, squared_curvature
 from ertis_numba.stages.plan_elements import ahead_of, chain_taps, spectrum_of, zones_of
 from ertis_numba.stages.window import time_window
-from ertis_numba.stages.zones import NEAREST_M, squared_bend
 from ertis_numba.waveform import matched_band_hz
 
-__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "Nodes", "Plan", "PlanModel", "plan_of"]
+__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
 
 COARSEST_STOP_BAND_DB = 40.0
 TABLE_BYTES = 44
@@ -32,7 +32,7 @@ _MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reac
 _MAX_FITS = 288  # four times the number of fits in one search
 
 
-class Plan(NamedTuple):
+class ImagePlan(NamedTuple):
     """A complete plan."""
 
     precision: str
@@ -41,8 +41,8 @@ class Plan(NamedTuple):
     delay_taps: int
     beam_taps: int
     density: float
-    stop_band_db: float
-    zones: int
+    stopband_attenuation_db: float
+    focal_zones: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class PlanModel:
     Parameters
     ----------
     settings : Settings
-    texture : Texture, optional
+    signal_model : Texture, optional
         See `ErrorModel`.
     tile_ranges : int
         Ranges in a tile of 16-bit numbers.
@@ -87,10 +87,10 @@ class PlanModel:
         Cached properties of a choice of delayed samples, of beam-grid points and of a stop band.
     """
 
-    def __init__(self, settings: Settings, texture: Texture | None, *, tile_ranges: int) -> None:
+    def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:
         self.settings = settings
         self._tile_ranges = tile_ranges
-        self.errors = ErrorModel(settings, texture)
+        self.errors = ErrorModel(settings, signal_model)
         self._spectrum = spectrum_of(settings)
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
@@ -110,11 +110,11 @@ class PlanModel:
         self.nodes = functools.cache(self._made_nodes)
         self.filter = functools.cache(self._made_filter)
 
-    def parts(self, plan: Plan) -> dict[str, float]:
+    def parts(self, plan: ImagePlan) -> dict[str, float]:
         """Return the error power of each step of a plan, relative to the exact image."""
         delays = self.delays(plan.n_phases, plan.interpolation, plan.delay_taps)
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
-        _, filter_error = self.filter(plan.stop_band_db)
+        _, filter_error = self.filter(plan.stopband_attenuation_db)
         parts = dict.fromkeys(PARTS, 0.0)
         parts["delays"], parts["filter"] = delays.error, filter_error
         parts["arithmetic"] = self.errors.arithmetic()
@@ -122,15 +122,15 @@ class PlanModel:
             parts["beams"] = nodes.error
             parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
         if self.settings.processing.wavefront == "spherical":
-            parts["zones"] = self.zone_error(plan.zones)
+            parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
             parts["samples"] = self._whole_numbers(delays, nodes)
         return parts
 
-    def work(self, plan: Plan) -> Work:
+    def work(self, plan: ImagePlan) -> Work:
         """Return the work of a plan, from which its time is predicted."""
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
-        taps, _ = self.filter(plan.stop_band_db)
+        taps, _ = self.filter(plan.stopband_attenuation_db)
         tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
         return Work(
             n_mics=self.n_mics,
@@ -144,27 +144,27 @@ class PlanModel:
             n_outputs=self.window.n_outputs,
             n_directions=self.n_directions,
             n_ranges=len(self.window.range_m),
-            n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.zones)),
+            n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.focal_zones)),
             n_beams=self.n_directions if nodes is None else nodes.count,
             n_terms=self.n_mics * plan.delay_taps,
             n_pairs=0 if nodes is None else nodes.n_pairs,
             precision=plan.precision,
         )
 
-    def n_bytes(self, plan: Plan) -> int:
+    def n_bytes(self, plan: ImagePlan) -> int:
         """Return the memory of a plan's signals and delays."""
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self.n_directions if nodes is None else nodes.count
-        table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.zones))
+        table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
         return table + 16 * self.n_mics * plan.n_phases * self.window.n_outputs
 
     def zone_error(self, count: int) -> float:
         """Return the error power of a number of focal zones."""
-        bend_2 = squared_bend(self.window.range_m, self._zones(count))
-        return self._zone_scale * bend_2
+        curvature_2 = squared_curvature(self.window.range_m, self._zones(count))
+        return self._zone_scale * curvature_2
 
     def _made_zones(self, count: int) -> list[tuple[int, int, float]]:
-        return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(zones=count)))
+        return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(focal_zones=count)))
 
     @functools.cached_property
     def _zone_scale(self) -> float:
@@ -212,11 +212,14 @@ class PlanModel:
         n_pairs = n_taps**self.aperture.n_axes // 2
         return Nodes(self.count_nodes(n_taps, density), n_pairs, self.errors.beams(nodes), nodes.squares)
 
-    def _made_filter(self, stop_band_db: float) -> tuple[NDArray[Any], float]:
+    def _made_filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
         try:
-            taps = chain_taps(self.settings.replace(accuracy=Accuracy(stop_band_db=stop_band_db)))
+            taps = chain_taps(self.settings.replace(accuracy=Accuracy(stopband_attenuation_db=stopband_attenuation_db)))
         except ArgumentError:
-            if self.settings.accuracy.stop_band_db is not None or stop_band_db == COARSEST_STOP_BAND_DB:
+            if (
+                self.settings.accuracy.stopband_attenuation_db is not None
+                or stopband_attenuation_db == COARSEST_STOP_BAND_DB
+            ):
                 raise
             return np.ones(1, dtype=np.int16), math.inf
         return taps, self.errors.filter(taps)
@@ -257,15 +260,15 @@ def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) 
     return fit, np.abs(fit.weights(fit.fractions))
 
 
-def plan_of(accuracy: Accuracy) -> Plan:
+def plan_of(accuracy: Accuracy) -> ImagePlan:
     """Return a complete plan."""
-    return Plan(
+    return ImagePlan(
         accuracy.precision,
         accuracy.oversampling or 1,
         accuracy.interpolation,
         accuracy.delay_taps or 1,
         accuracy.beam_taps or 0,
         accuracy.beam_density or 2.0,
-        accuracy.stop_band_db or 60.0,
-        accuracy.zones or 1,
+        accuracy.stopband_attenuation_db or 60.0,
+        accuracy.focal_zones or 1,
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beam_nodes import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamNodes
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.plan_elements import ahead_of, delay_fit, nodes_of, spectrum_of
 

@@ -3,9 +3,9 @@
 import itertools
 import math
 
-from ertis_numba.settings import INTERPOLATIONS, MAX_ZONES
-from ertis_numba.stages.beam_nodes import FEWEST_RANGES
-from ertis_numba.stages.plan_model import COARSEST_STOP_BAND_DB, Plan, PlanModel
+from ertis_numba.settings import INTERPOLATIONS, MAX_FOCAL_ZONES
+from ertis_numba.stages.beam_grid import FEWEST_RANGES
+from ertis_numba.stages.plan_model import COARSEST_STOP_BAND_DB, ImagePlan, PlanModel
 
 __all__ = ["open_plans"]
 
@@ -18,7 +18,7 @@ _NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
 _SMALL = 0.1  # share of the budget for parts that cost little to keep small
 
 
-def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Plan]:
+def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
     """Return the plans that the settings permit, except needlessly exact ones.
 
     Parameters
@@ -36,17 +36,17 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Plan
         precisions.append("int16")
     zones = _zone_count(model, budget)
     return [
-        Plan(
+        ImagePlan(
             precision,
             n_phases,
             given.interpolation,
             n_taps,
             beam_taps,
             density,
-            stop_band_db,
+            stopband_attenuation_db,
             zones,
         )
-        for precision, (n_phases, n_taps), (beam_taps, density), stop_band_db in itertools.product(
+        for precision, (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
             precisions,
             _open_delays(model, budget, adaptive=adaptive),
             _open_nodes(model, budget, adaptive=adaptive),
@@ -95,20 +95,22 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
 
 def _stop_bands_db(model: PlanModel, budget: float) -> list[float]:
     """Return the stop bands that leave some of the budget to other parts, the best one where none does."""
-    if model.settings.accuracy.stop_band_db is not None:
-        return [model.settings.accuracy.stop_band_db]
-    errors = {stop_band_db: model.filter(stop_band_db)[1] for stop_band_db in _STOP_BANDS_DB}
-    enough = [stop_band_db for stop_band_db, error in errors.items() if error < budget]
-    return enough[:_STOP_BANDS] or [min(errors, key=lambda stop_band_db: errors[stop_band_db])]
+    if model.settings.accuracy.stopband_attenuation_db is not None:
+        return [model.settings.accuracy.stopband_attenuation_db]
+    errors = {
+        stopband_attenuation_db: model.filter(stopband_attenuation_db)[1] for stopband_attenuation_db in _STOP_BANDS_DB
+    }
+    enough = [stopband_attenuation_db for stopband_attenuation_db, error in errors.items() if error < budget]
+    return enough[:_STOP_BANDS] or [min(errors, key=lambda stopband_attenuation_db: errors[stopband_attenuation_db])]
 
 
 def _zone_count(model: PlanModel, budget: float) -> int:
     """Return as many zones as keep their part small; it falls with the square of their number."""
-    if model.settings.accuracy.zones is not None:
-        return model.settings.accuracy.zones
+    if model.settings.accuracy.focal_zones is not None:
+        return model.settings.accuracy.focal_zones
     if model.settings.processing.wavefront == "plane":
         return 1
     count = 1
-    while model.zone_error(count) > _SMALL * budget and count < MAX_ZONES:
-        count = min(MAX_ZONES, max(count + 1, math.ceil(1.2 * count)))
+    while model.zone_error(count) > _SMALL * budget and count < MAX_FOCAL_ZONES:
+        count = min(MAX_FOCAL_ZONES, max(count + 1, math.ceil(1.2 * count)))
     return count

@@ -8,13 +8,13 @@ from pathlib import Path
 from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.accuracy import PARTS, ErrorModel, Texture, decibels
+from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel, decibels
 from ertis_numba.stages.adaptive import require_order
 from ertis_numba.stages.beamform import require_int16
 from ertis_numba.stages.costs import Costs, cache_file, costs_of
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.memory import available_bytes
-from ertis_numba.stages.plan_model import Plan, PlanModel, plan_of
+from ertis_numba.stages.plan_model import ImagePlan, PlanModel, plan_of
 from ertis_numba.stages.plan_search import open_plans
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.wavefronts import with_wavefront
@@ -79,7 +79,7 @@ class Planner:
         What their accuracy does not leave open is kept to.
     kernels : KernelSet
     threads : int
-    texture : Texture, optional
+    signal_model : Texture, optional
         Of what is heard; what errs on the safe side by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
@@ -98,7 +98,7 @@ class Planner:
         kernels: KernelSet,
         *,
         threads: int,
-        texture: Texture | None = None,
+        signal_model: SignalModel | None = None,
         max_bytes: int | None = None,
         sensitivity: Sensitivity | None = None,
     ) -> None:
@@ -108,7 +108,7 @@ class Planner:
         if settings.accuracy.precision == "int16":
             require_int16(kernels)
         self._threads = threads
-        self._plans = PlanModel(settings, texture, tile_ranges=kernels.tile_ranges)
+        self._plans = PlanModel(settings, signal_model, tile_ranges=kernels.tile_ranges)
         if settings.processing.beamformer == "dmas":
             require_order(settings.processing.dmas_order, self._plans.n_mics)
         self._sensitivity = sensitivity or Sensitivity.of(settings.processing, self._plans.n_mics)
@@ -119,11 +119,13 @@ class Planner:
         return self._plans.errors
 
     def _rated(
-        self, plans: Sequence[Plan], sizes: Sequence[int], least: int, most: int
-    ) -> list[tuple[Plan, dict[str, float]]]:
-        """Return plans that need ``least`` to ``most`` bytes, with the parts of their errors."""
+        self, plans: Sequence[ImagePlan], sizes: Sequence[int], smallest: int, largest: int
+    ) -> list[tuple[ImagePlan, dict[str, float]]]:
+        """Return plans that need ``smallest`` to ``largest`` bytes, with the parts of their errors."""
         return [
-            (plan, self._plans.parts(plan)) for plan, size in zip(plans, sizes, strict=True) if least <= size <= most
+            (plan, self._plans.parts(plan))
+            for plan, size in zip(plans, sizes, strict=True)
+            if smallest <= size <= largest
         ]
 
     def choose(self) -> Chosen:
@@ -156,7 +158,7 @@ class Planner:
             raise ArgumentError(
                 f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
                 "Give a later or shorter processing.range_m, fewer directions or "
-                "microphones, or less of accuracy.oversampling or accuracy.zones"
+                "microphones, or less of accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
             # By the costs of all threads whatever their number now, so that it does not decide about the plan.
@@ -204,18 +206,18 @@ class Planner:
         amplified = self._sensitivity.output(beams) / beams if 0 < beams < math.inf else 1.0
         return {name: amplified * power for name, power in parts.items()}
 
-    def _accuracy(self, plan: Plan) -> Accuracy:
+    def _accuracy(self, plan: ImagePlan) -> Accuracy:
         return self.settings.accuracy.replace(
             precision=plan.precision,
             oversampling=plan.n_phases,
             delay_taps=plan.delay_taps,
             beam_taps=plan.beam_taps,
             beam_density=plan.density,
-            stop_band_db=plan.stop_band_db,
-            zones=plan.zones,
+            stopband_attenuation_db=plan.stopband_attenuation_db,
+            focal_zones=plan.focal_zones,
         )
 
-    def _time(self, plan: Plan, costs: Costs) -> float:
+    def _time(self, plan: ImagePlan, costs: Costs) -> float:
         return sum(costs.stages_ms(self._plans.work(plan)).values())
 
     @property

@@ -40,7 +40,9 @@ class Sensitivity:
             case "dmas":
                 return cls(float(processing.dmas_order))
             case "capon":
-                return cls(1 + (_CAPON - 1) / (1 + processing.loading / 0.01), n_mics / processing.loading)
+                return cls(
+                    1 + (_CAPON - 1) / (1 + processing.diagonal_loading / 0.01), n_mics / processing.diagonal_loading
+                )
             case _:
                 return cls()
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 from ertis_numba.stages.demodulate import demodulation
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.window import TimeWindow
-from ertis_numba.waveform import matched_filter
-from ertis_numba.words import word_format
+from ertis_numba.waveform import matched_filter_spectrum
 
 __all__ = ["matched_signals_of", "signals_of"]
 
@@ -23,7 +23,7 @@ def signals_of(
     *,
     settings: Settings | None = None,
     window: TimeWindow | None = None,
-    most_samples: int | None = None,
+    max_samples: int | None = None,
 ) -> NDArray[np.float32]:
     """Return the signals of the enabled microphones, low-passed and decimated: (mic, sample) float32, full scale 1.
 
@@ -37,7 +37,7 @@ def signals_of(
         Whose decimation and stop band count; the measurement's own by default.
     window : TimeWindow, optional
         Which of the samples; all by default.
-    most_samples : int, optional
+    max_samples : int, optional
         Of the words that are looked at where no window is given.
 
     Raises
@@ -48,7 +48,7 @@ def signals_of(
     settings = settings or measurement.settings
     layout = microphones(settings.array)
     recorded = settings.recording.n_samples
-    count = -(-min(recorded, most_samples or recorded) // settings.decimation)
+    count = -(-min(recorded, max_samples or recorded) // settings.decimation)
     window = window or TimeWindow(
         range_m=np.zeros(0), first_sample=0, n_samples=count, n_fft=count, n_outputs=0, lead=0, start_s=0.0
     )
@@ -56,7 +56,7 @@ def signals_of(
     memory = plain.memory()
     demodulate = demodulation(settings, layout, window, plain, memory, taps=chain_taps(settings))
     out: NDArray[np.float32] = memory.zeros(demodulate.shape, np.float32)
-    demodulate(word_format(settings).checked(measurement.words), demodulate.new_room(), out)
+    demodulate(sample_format(settings).validated(measurement.data), demodulate.new_room(), out)
     out /= layout.gain[layout.enabled, None].astype(np.float32)
     return out
 
@@ -81,7 +81,7 @@ def matched_signals_of(measurement: Measurement, *, settings: Settings | None = 
     signals = signals_of(measurement, settings=settings)
     count = signals.shape[1]
     n_fft = count + math.ceil(settings.call.duration_s * settings.signal_rate_hz) + 1
-    matched = matched_filter(settings, n_fft=n_fft)
+    matched = matched_filter_spectrum(settings, n_fft=n_fft)
     occupied = slice(matched.first_bin, matched.first_bin + len(matched.values))
     spectra = np.zeros((len(signals), n_fft), dtype=np.complex128)
     spectra[:, occupied] = np.fft.rfft(signals, n_fft, axis=1)[:, occupied] * matched.values

@@ -1,6 +1,6 @@
 """Files: recordings and energyscapes. The only door to h5py."""
 
-from ertis_numba.atomic import check_target, replacing
+from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.energyscape import (
     EnergyscapeReader,
@@ -9,7 +9,7 @@ from ertis_numba.storage.energyscape import (
     write_energyscapes,
 )
 from ertis_numba.storage.recording import (
-    Gap,
+    RecordingGap,
     RecordingReader,
     RecordingWriter,
     open_recording,
@@ -20,16 +20,16 @@ from ertis_numba.storage.truth import Truth, TruthLog
 __all__ = [
     "EnergyscapeReader",
     "EnergyscapeWriter",
-    "Gap",
+    "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
     "Truth",
     "TruthLog",
+    "atomic_write",
     "check_target",
     "file_kind",
     "open_energyscapes",
     "open_recording",
-    "replacing",
     "sensor_names",
     "write_energyscapes",
     "write_recording",

@@ -21,7 +21,7 @@ class Missing(NamedTuple):
     first: int
     last: int
     reason: str
-    epoch: int = 0
+    session_id: int = 0
 
 
 class Runs:
@@ -30,13 +30,13 @@ class Runs:
     def __init__(self) -> None:
         self._numbers: dict[int, Numbers] = {}
 
-    def holds(self, number: int, epoch: int) -> bool:
+    def holds(self, number: int, session_id: int) -> bool:
         """Return whether a number of a run has come."""
-        return epoch in self._numbers and number in self._numbers[epoch]
+        return session_id in self._numbers and number in self._numbers[session_id]
 
-    def add(self, number: int, epoch: int) -> None:
+    def add(self, number: int, session_id: int) -> None:
         """Take the next number of a run."""
-        self._numbers.setdefault(epoch, Numbers()).add(number)
+        self._numbers.setdefault(session_id, Numbers()).add(number)
 
     def missing(self, noted: Iterable[Missing]) -> list[Missing]:
         """Return what is missing, in order of the runs: as they came, then those of which only gaps are known.
@@ -47,12 +47,12 @@ class Runs:
             What somebody knows about.
         """
         known: dict[int, list[Hole]] = {}
-        for first, last, reason, epoch in noted:
-            known.setdefault(epoch, []).append((first, last, reason))
+        for first, last, reason, session_id in noted:
+            known.setdefault(session_id, []).append((first, last, reason))
         return [
-            Missing(*hole, epoch)
-            for epoch in (*self._numbers, *sorted(known.keys() - self._numbers.keys()))
-            for hole in self._numbers.get(epoch, Numbers()).missing(known.get(epoch, ()))
+            Missing(*hole, session_id)
+            for session_id in (*self._numbers, *sorted(known.keys() - self._numbers.keys()))
+            for hole in self._numbers.get(session_id, Numbers()).missing(known.get(session_id, ()))
         ]
 
 

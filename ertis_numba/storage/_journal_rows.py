@@ -36,7 +36,7 @@ class JournalRows:
         self._journal = journal
         self.keys = journal.index(sensor)
         self._noted = [
-            Missing(gap.first, gap.last, gap.reason, gap.epoch) for gap in journal.gaps if gap.sensor == sensor
+            Missing(gap.first, gap.last, gap.reason, gap.session_id) for gap in journal.gaps if gap.sensor == sensor
         ]
         self._numbers = Runs()
         self.damaged: list[Damage] = []
@@ -53,11 +53,13 @@ class JournalRows:
             except DamagedError as error:  # others may pass: nothing is lost yet
                 self.damaged.append(Damage(index, key.sequence, str(error)))
                 continue
-            self._numbers.add(key.sequence, key.epoch)
+            self._numbers.add(key.sequence, key.session_id)
             yield entry
 
     @property
     def missing(self) -> list[Missing]:
         """What is missing, in order; with what is damaged."""
-        lost = [Missing(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].epoch) for item in self.damaged]
+        lost = [
+            Missing(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id) for item in self.damaged
+        ]
         return self._numbers.missing([*lost, *self._noted])

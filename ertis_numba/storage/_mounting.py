@@ -37,15 +37,15 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
     DamagedError
         The attributes are no mounting.
     """
-    said = group.attrs
-    status = str(plain(said["mounting"])) if "mounting" in said else ""
-    if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & said.keys()):
+    stated = group.attrs
+    status = str(plain(stated["mounting"])) if "mounting" in stated else ""
+    if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & stated.keys()):
         return None, None
     if status not in {"", _GIVEN}:
         raise DamagedError(f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}")
     sensor = group.name.rpartition("/")[2]
     try:
-        place = mounting(sensor, said["translation_m"], said["rotation_xyzw"])
+        place = mounting(sensor, stated["translation_m"], stated["rotation_xyzw"])
     except (ArgumentError, TypeError, ValueError) as error:
         raise DamagedError(f"{path}: {error}") from error
     translation_m, rotation_xyzw = place["translation_m"], place["rotation_xyzw"]

@@ -17,15 +17,15 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVer
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256, plain
+from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, content_sha256, plain
 from ertis_numba.storage.structure import child, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import Truth, read_truth
 
-__all__ = ["Reader", "file_kind", "sensor_names"]
+__all__ = ["FileReader", "file_kind", "sensor_names"]
 
 Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
-_SYSTEM_SAYS = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
+_SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
 _PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
 _LEFT_OPEN = "already open for write"  # a mark in the file, which a program that is killed leaves behind
 _OMITTED = {"word"}  # where there is one of them
@@ -59,7 +59,7 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
         return sensors_of(file)
 
 
-class Reader(Sequence[Item]):
+class FileReader(Sequence[Item]):
     """A file of one row per measurement, as a sequence that reads a row when asked for it; slices are lists.
 
     Close it after use, or use it in a ``with`` statement.
@@ -91,7 +91,7 @@ class Reader(Sequence[Item]):
                 self._require_kind()
                 self.sensors: tuple[str, ...] = sensors_of(self._file)
                 self.sensor = self._choose(sensor)
-                self._group = child(self._file["sensors"], self.sensor, h5py.Group)
+                self._group = SensorGroup(child(self._file["sensors"], self.sensor, h5py.Group))
                 self._look()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data)
@@ -232,9 +232,9 @@ def _reading(file: h5py.File, path: Path) -> Iterator[None]:
     except _UNREADABLE as error:
         if not file:
             raise DataError(f"{path} is closed; open it again") from error
-        told = _SYSTEM_SAYS.search(str(error))
-        if told and int(told[1]) in _PASSING:
-            raise DataError(f"{path} cannot be read ({told[2]}); check the disk") from error
+        reported = _SYSTEM_ERROR.search(str(error))
+        if reported and int(reported[1]) in _PASSING:
+            raise DataError(f"{path} cannot be read ({reported[2]}); check the disk") from error
         raise DamagedError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.atomic import require_room
+from ertis_numba.atomic_files import require_free_space
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Stamp
 from ertis_numba.storage._gaps import Runs
@@ -22,7 +22,7 @@ _STAMP_FIELDS = {
     "time_uncertainty": "timestamp_uncertainty_ns",
     "sequence": "sequence",
     "sync_count": "sync_count",
-    "epoch": "epoch",
+    "session_id": "session_id",
 }
 _COUNT = (0, 2**63 - 1)
 _INT64 = (-(2**63), 2**63 - 1)
@@ -31,7 +31,7 @@ _LIMITS = {
     "timestamp_uncertainty_ns": (0, 2**32 - 1),
     "sequence": _COUNT,
     "sync_count": _INT64,
-    "epoch": _COUNT,
+    "session_id": _COUNT,
 }
 
 
@@ -64,25 +64,25 @@ class RowWriter:
         stored = np.ascontiguousarray(row, dtype=self._data.dtype)
         checks.shape(f"measurement {self._n_rows}", stored.shape, self._data.shape[1:])
         stamps = {
-            name: checks.whole(field, getattr(stamp, field), *_LIMITS[field]) for name, field in _STAMP_FIELDS.items()
+            name: checks.integer(field, getattr(stamp, field), *_LIMITS[field]) for name, field in _STAMP_FIELDS.items()
         }
-        self._require_new(stamps["sequence"], stamps["epoch"])
-        require_room(self._folder, stored.nbytes)
+        self._require_new(stamps["sequence"], stamps["session_id"])
+        require_free_space(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
         # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
-        self.runs.add(stamps["sequence"], stamps["epoch"])
+        self.runs.add(stamps["sequence"], stamps["session_id"])
         self.check = zlib.crc32(stored.data, self.check)
         for name, value in {**stamps, "crc32": zlib.crc32(stored.data), **columns}.items():
             self._columns.setdefault(name, []).append(value)
         if self._n_rows % CHUNK_ROWS == 0:
             self.flush()
 
-    def _require_new(self, sequence: int, epoch: int) -> None:
-        if self._numbered and self.runs.holds(sequence, epoch):
+    def _require_new(self, sequence: int, session_id: int) -> None:
+        if self._numbered and self.runs.holds(sequence, session_id):
             raise ArgumentError(
-                f"measurement {self._n_rows} has sequence {sequence} of epoch {epoch}, which one before it has; give "
+                f"measurement {self._n_rows} has sequence {sequence} of epoch {session_id}, which one before it has; give "
                 "each measurement of a sensor a number of its own (Stamp.sequence)"
             )
 

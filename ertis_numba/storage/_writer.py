@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
-from ertis_numba.atomic import check_target, remedy, replacing, require_room
+from ertis_numba.atomic_files import atomic_write, check_target, remedy, require_free_space
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
@@ -85,7 +85,7 @@ class Writer(ABC, Generic[Item]):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._part = stack.enter_context(replacing(self.path, overwrite=self._overwrite, token=self._part_token))
+            self._part = stack.enter_context(atomic_write(self.path, overwrite=self._overwrite, token=self._part_token))
             self._file = stack.enter_context(self._open_part())
             self._stack = stack.pop_all()
         return self
@@ -120,7 +120,7 @@ class Writer(ABC, Generic[Item]):
     @contextmanager
     def _open_part(self) -> Iterator[h5py.File]:
         """Yield the part file; complete, close and compare it when the block ends well."""
-        require_room(self.path.parent, 0)
+        require_free_space(self.path.parent, 0)
         with self._naming_file():
             # The newer layout has a checksum in every table, so that a damaged one is noticed.
             file = h5py.File(self._part, "w", track_order=True, libver=("v110", "v110"))

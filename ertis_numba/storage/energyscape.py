@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.atomic import check_target
+from ertis_numba.atomic_files import check_target
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import self_contained
 from ertis_numba.storage._mounting import describe_mounting, read_mounting
-from ertis_numba.storage._reader import Reader
+from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.recording import Mounting, RecordingReader
@@ -54,7 +54,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
     """
 
     _kind: ClassVar[str] = "energyscape"
-    _data: ClassVar[str] = "energy"
+    _data: ClassVar[str] = "amplitude"
     _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
     _numbered: ClassVar[bool] = False
 
@@ -145,7 +145,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             group,
             ENERGYSCAPE,
             sizes={"direction": n_directions, "range": n_ranges},
-            dtypes={"energy": self._dtype},
+            dtypes={"amplitude": self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},
         )
         describe_mounting(group, self._mounting.get(first.stamp.sensor, {}))
@@ -156,7 +156,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             describe(group, {"wavefront_error_db": self._wavefront_errors_db[first.stamp.sensor]})
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
-        describe(group["energy"], {"coordinates": "azimuth elevation"})
+        describe(group["amplitude"], {"coordinates": "azimuth elevation"})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first[item.stamp.sensor]
@@ -166,7 +166,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
             ours, theirs = getattr(item, field), getattr(first, field)
             if ours is not theirs and not np.array_equal(ours, theirs):
                 raise ArgumentError(f"an energyscape has another {field} than the first; write it to its own file")
-        return item.energy, {}
+        return item.amplitude, {}
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
@@ -208,7 +208,7 @@ def _origin(readers: Sequence[RecordingReader]) -> dict[str, str]:
     }
 
 
-class EnergyscapeReader(Reader[Energyscape]):
+class EnergyscapeReader(FileReader[Energyscape]):
     """An energyscape file as a sequence of energyscapes, read one at a time.
 
     Attributes
@@ -235,7 +235,7 @@ class EnergyscapeReader(Reader[Energyscape]):
     """
 
     _kind: ClassVar[str] = "energyscape"
-    _data = "energy"
+    _data = "amplitude"
     _table = ENERGYSCAPE
 
     azimuth_rad: NDArray[np.float64]
@@ -253,13 +253,13 @@ class EnergyscapeReader(Reader[Energyscape]):
     def _load(self) -> None:
         for name, field in _AXES.items():
             setattr(self, field, np.asarray(self._group[name][:]))
-        said = self._group.attrs
+        stated = self._group.attrs
         self.predicted_error_db, self.max_error_db, self.wavefront_error_db = (
-            _number(self.path, name, said[name]) if name in said else None
+            _number(self.path, name, stated[name]) if name in stated else None
             for name in ("predicted_error_db", "max_error_db", "wavefront_error_db")
         )
         self.budget_applies_to, self.error_warning, self.call_warning = (
-            str(plain(said.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
+            str(plain(stated.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
@@ -268,7 +268,7 @@ class EnergyscapeReader(Reader[Energyscape]):
 
     def _item(self, index: int) -> Energyscape:
         return Energyscape(
-            energy=self._rows.row(index).astype(np.float32, copy=False),
+            amplitude=self._rows.row(index).astype(np.float32, copy=False),
             azimuth_rad=self.azimuth_rad,
             elevation_rad=self.elevation_rad,
             range_m=self.range_m,

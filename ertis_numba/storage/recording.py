@@ -15,20 +15,20 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, self_contained, storable
 from ertis_numba.geometry import mounting as mounted
+from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._gaps import Missing
 from ertis_numba.storage._mounting import describe_mounting, read_mounting
-from ertis_numba.storage._reader import Reader
+from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import Writer
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out, plain
 from ertis_numba.storage.truth import Truth, TruthLog
 from ertis_numba.waveform import call_samples
-from ertis_numba.words import WordFormat, word_format
 
 __all__ = [
     "JOURNAL_DAMAGE",
-    "Gap",
+    "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
     "lay_out_sensor",
@@ -46,13 +46,13 @@ _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressur
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class RecordingGap:
     """Sequence numbers of a run of the sensor that are missing, ``first`` and ``last`` included, and why."""
 
     first: int
     last: int
     reason: str
-    epoch: int = 0
+    session_id: int = 0
 
 
 class RecordingWriter(Writer[Measurement]):
@@ -99,16 +99,16 @@ class RecordingWriter(Writer[Measurement]):
         self._given = settings
         self._settings: dict[str, Settings] = {}
         self._checked: dict[str, Settings] = {}
-        self._formats: dict[str, WordFormat] = {}
+        self._formats: dict[str, SampleFormat] = {}
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
         self._noted: dict[str, list[Missing]] = {}
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, epoch: int = 0) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
         """Say why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
 
         They may also lie before the first measurement of the sensor or after its last one. What is there
-        after all is no gap; of other gaps, the reason is "not among the measurements given". ``epoch`` is that of the
+        after all is no gap; of other gaps, the reason is "not among the measurements given". ``session_id`` is that of the
         stamps of the run.
 
         Raises
@@ -116,8 +116,10 @@ class RecordingWriter(Writer[Measurement]):
         ArgumentError
             ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
         """
-        checks.gap(first, last, reason)
-        self._noted.setdefault(sensor, []).append(Missing(first, last, reason, checks.whole("epoch", epoch, 0)))
+        checks.sequence_gap(first, last, reason)
+        self._noted.setdefault(sensor, []).append(
+            Missing(first, last, reason, checks.integer("session_id", session_id, 0))
+        )
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
         sensor = first.stamp.sensor
@@ -128,7 +130,7 @@ class RecordingWriter(Writer[Measurement]):
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
-        self._formats[sensor] = word_format(settings)
+        self._formats[sensor] = sample_format(settings)
         lay_out_sensor(
             group,
             settings,
@@ -140,7 +142,7 @@ class RecordingWriter(Writer[Measurement]):
         self._require_same(item.stamp.sensor, item.settings)
         self._require_words(item)
         air = item.settings.air
-        return item.words, {name: getattr(air, field) for name, field in _AIR.items()}
+        return item.data, {name: getattr(air, field) for name, field in _AIR.items()}
 
     def _require_same(self, sensor: str, settings: Settings) -> None:
         """Refuse what one set of settings cannot describe: all but the air must be equal."""
@@ -155,13 +157,13 @@ class RecordingWriter(Writer[Measurement]):
     def _require_words(self, item: Measurement) -> None:
         """Refuse words that would be stored as others, and what no pipeline would take."""
         name, wanted = f"measurement {len(self._rows[item.stamp.sensor])}", self._formats[item.stamp.sensor].dtype
-        if not np.can_cast(item.words.dtype, wanted, "equiv"):  # which passes another byte order
+        if not np.can_cast(item.data.dtype, wanted, "equiv"):  # which passes another byte order
             raise ArgumentError(
-                f"{name} holds {item.words.dtype} words, its settings want {wanted.name}; convert them, or give the "
+                f"{name} holds {item.data.dtype} words, its settings want {wanted.name}; convert them, or give the "
                 "settings that it was recorded with"
             )
         if wanted.kind == "f":
-            checks.finite_array(name, item.words)
+            checks.finite_array(name, item.data)
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
@@ -180,7 +182,7 @@ class RecordingWriter(Writer[Measurement]):
             "gap_first": [gap.first for gap in gaps],
             "gap_last": [gap.last for gap in gaps],
             "gap_reason": [gap.reason.encode() for gap in gaps],
-            "gap_epoch": [gap.epoch for gap in gaps],
+            "gap_session_id": [gap.session_id for gap in gaps],
         }
         for name, column in values.items():
             group[name].resize((len(gaps),))
@@ -206,7 +208,7 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
     ArgumentError
         A row is longer than HDF5 can hold.
     """
-    layout, words, samples = microphones(settings.array), word_format(settings), call_samples(settings.call)
+    layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)
     lay_out(
         group,
@@ -253,7 +255,7 @@ def _identity(sensor: str, settings: Settings, firmware: str) -> dict[str, Any]:
     return {"serial_number": sensor, "model": settings.array.layout, "firmware": firmware, "frame_id": sensor}
 
 
-class RecordingReader(Reader[Measurement]):
+class RecordingReader(FileReader[Measurement]):
     """A recording as a sequence of measurements, read one at a time.
 
     Attributes
@@ -269,7 +271,7 @@ class RecordingReader(Reader[Measurement]):
 
     _kind: ClassVar[str] = "recording"
 
-    gaps: tuple[Gap, ...]
+    gaps: tuple[RecordingGap, ...]
     firmware: str
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
@@ -280,10 +282,12 @@ class RecordingReader(Reader[Measurement]):
     def _load(self) -> None:
         self._require_agreement()
         columns = (self._group[f"gap_{name}"][:].tolist() for name in ("first", "last", "reason"))
-        epochs = self._group["gap_epoch"][:].tolist() if "gap_epoch" in self._group else itertools.repeat(0)
+        session_ids = (
+            self._group["gap_session_id"][:].tolist() if "gap_session_id" in self._group else itertools.repeat(0)
+        )
         self.gaps = tuple(
-            Gap(first, last, reason.decode(), epoch)
-            for (first, last, reason), epoch in zip(zip(*columns, strict=True), epochs, strict=False)
+            RecordingGap(first, last, reason.decode(), session_id)
+            for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
         )
         self.firmware = str(plain(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
@@ -298,7 +302,7 @@ class RecordingReader(Reader[Measurement]):
 
     def _require_agreement(self) -> None:
         """Refuse a file whose arrays say something else than its settings, which are what is used."""
-        came, words = self._group[self._data].dtype, word_format(self.settings)
+        came, words = self._group[self._data].dtype, sample_format(self.settings)
         if came != words.dtype:
             raise DataError(
                 f"{self.path}: {self._data} holds {came}, the settings in the file want {words.dtype} "

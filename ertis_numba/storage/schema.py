@@ -25,10 +25,12 @@ __all__ = [
     "CONVENTIONS",
     "ENERGYSCAPE",
     "FORMAT_VERSION",
+    "FORMER_NAMES",
     "RECORDING",
     "RECORDING_OF_PCM",
     "STAMPS",
     "TRUTH",
+    "SensorGroup",
     "Variable",
     "content_sha256",
     "content_uuid",
@@ -42,11 +44,11 @@ __all__ = [
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2  # version 1 used the names of FORMER_NAMES
 CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
 _TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
 _COLUMN_TEXT_BYTES: Final = 64
-_MOST_CHUNK_BYTES: Final = 2**32 - 1
+_MAX_CHUNK_BYTES: Final = 2**32 - 1
 _DIGEST_ITEMS: Final = 2**20
 _UNLIMITED: Final = ("time", "gap")
 
@@ -82,7 +84,7 @@ STAMPS: Final = (
     Variable("time_uncertainty", ("time",), "<u4", "uncertainty of time", "ns"),
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
-    Variable("epoch", ("time",), "<i8", "run of the sensor that gave the sequence numbers"),
+    Variable("session_id", ("time",), "<i8", "run of the sensor that gave the sequence numbers"),
     Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or energy, as its bytes lie in the file"),
 )
 
@@ -104,7 +106,7 @@ RECORDING: Final = (
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
     Variable("gap_reason", ("gap",), "str", "why they are missing"),
-    Variable("gap_epoch", ("gap",), "<i8", "run of the sensor that would have given the numbers", optional=True),
+    Variable("gap_session_id", ("gap",), "<i8", "run of the sensor that would have given the numbers", optional=True),
 )
 
 RECORDING_OF_PCM: Final = tuple(
@@ -117,7 +119,7 @@ RECORDING_OF_PCM: Final = tuple(
 
 ENERGYSCAPE: Final = (
     *STAMPS,
-    Variable("energy", ("time", "direction", "range"), "", "envelope; 1 is a full-scale echo in every microphone"),
+    Variable("amplitude", ("time", "direction", "range"), "", "envelope; 1 is a full-scale echo in every microphone"),
     Variable("azimuth", ("direction",), "<f8", "azimuth, from x forward towards y", "radian"),
     Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
     Variable("range", ("range",), "<f8", "half of the way of the sound", "m"),
@@ -137,6 +139,36 @@ TRUTH: Final = (
     ),
 )
 """In the group ``truth`` of a sensor."""
+
+FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_session_id": "gap_epoch"}
+"""Variables that have another name in files of format version 1."""
+
+
+class SensorGroup(h5py.Group):
+    """Group of a sensor whose variables answer to their present names, in files of all format versions.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    """
+
+    def __init__(self, group: h5py.Group) -> None:
+        super().__init__(group.id)
+
+    def stored_name(self, name: str) -> str:
+        """Return the name of a variable in this file."""
+        former = FORMER_NAMES.get(name, name)
+        return former if super().__contains__(former) and not super().__contains__(name) else name
+
+    def __getitem__(self, name: str) -> Any:
+        return super().__getitem__(self.stored_name(name))
+
+    def __contains__(self, name: str) -> bool:
+        return bool(super().__contains__(self.stored_name(name)))
+
+    def get(self, name: str, *args: Any, **options: Any) -> Any:
+        """Return a member or its link, as `h5py.Group.get` does."""
+        return super().get(self.stored_name(name), *args, **options)
 
 
 def lay_out(
@@ -195,7 +227,7 @@ def _dataset(
         return group.create_dataset(name, shape, kind)
     rows = _TIME_CHUNK_ROWS if name == "time" else CHUNK_ROWS
     chunks = (rows,) if len(dims) == 1 else (1, *shape[1:])
-    if math.prod(chunks) * np.dtype(kind).itemsize > _MOST_CHUNK_BYTES:
+    if math.prod(chunks) * np.dtype(kind).itemsize > _MAX_CHUNK_BYTES:
         wanted = " × ".join(f"{size} {dim}s" for dim, size in zip(dims[1:], shape[1:], strict=True))
         raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB that HDF5 can hold in one piece; give fewer")
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
@@ -255,7 +287,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
     for variable in table:
         if variable.dtype and (variable.name in group or not variable.optional):
             dataset = group[variable.name]
-            digest.update(variable.name.encode())
+            digest.update(dataset.name.rsplit("/", 1)[-1].encode())  # as stored, so that older files stay valid
             # In parts: the truth of many measurements with many reflectors exceeds the memory.
             rows = max(1, _DIGEST_ITEMS // max(1, math.prod(dataset.shape[1:])))
             for first in range(0, dataset.shape[0], rows) if dataset.shape else ():

@@ -17,12 +17,12 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
-from ertis_numba.atomic import part_of, sync
+from ertis_numba.atomic_files import fsync, temporary_path
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import storable
-from ertis_numba.journal import LOST, SUFFIX, Journal, Sealed, Sensor
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, Sealed
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import (
@@ -75,10 +75,10 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
     if not path.exists() and before != path and _made_of(path, before):  # killed after the journal went
-        return _told(path, before)
+        return _reported(path, before)
     with Journal.open(path) as journal:
         target = journal.target
-        part_of(target, TOKEN).unlink(missing_ok=True)
+        temporary_path(target, TOKEN).unlink(missing_ok=True)
         rows = {name: JournalRows(journal, name) for name in journal.sensors}
         refused = _refused(journal, rows)
         if refused and not any(map(len, rows.values())):
@@ -90,7 +90,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             return Sealed(path, None)
         if target.is_file() and _holds(target, journal, rows):
             for place in (target, target.parent):  # who wrote it may have been killed before it did this
-                sync(place)
+                fsync(place)
         elif target.is_file() and not overwrite:
             raise DataError(f"{target} exists and holds something else than {path}; move it, or give --force")
         else:
@@ -98,9 +98,9 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         n_damaged = sum(len(held.damaged) for held in rows.values())
         if n_damaged or refused:
             aside = journal.set_aside("damaged" if n_damaged else REFUSED)
-            return _told(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
+            return _reported(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
         journal.remove()
-    return _told(path, target)
+    return _reported(path, target)
 
 
 def _require_nothing_lost(journal: Journal) -> None:
@@ -138,7 +138,7 @@ def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
     return refused
 
 
-def _refusal(sensor: Sensor, first: Measurement) -> str:
+def _refusal(sensor: JournalSensor, first: Measurement) -> str:
     """Return the reason why a recording cannot hold a sensor, from a trial in memory; empty if it can."""
     try:
         with h5py.File("trial", "w", driver="core", backing_store=False, libver=("v110", "v110")) as trial:
@@ -178,7 +178,7 @@ class _Sealer(RecordingWriter):
         """Say what happened to the measurements."""
         self._attributes["history"] = history
 
-    def say_damage(self, damage: str) -> None:
+    def report_damage(self, damage: str) -> None:
         """Store a description of losses that no gap covers."""
         self._attributes[JOURNAL_DAMAGE] = damage
 
@@ -215,7 +215,7 @@ def _write(
         if not n_written:
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
         if damage := _damage(journal, rows):
-            writer.say_damage(damage)
+            writer.report_damage(damage)
         kept = (f"sensor {name} was set aside: {reason}" for name, reason in refused.items())
         writer.say("; ".join([_origin(journal.path), *_absent(rows), *kept])[:MAX_HISTORY])
 
@@ -242,7 +242,7 @@ def _holds(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool
         return False
 
 
-def _same(sensor: Sensor, rows: JournalRows, recording: RecordingReader) -> bool:
+def _same(sensor: JournalSensor, rows: JournalRows, recording: RecordingReader) -> bool:
     with recording:
         place = (recording.translation_m, recording.rotation_xyzw)
         known = (*(None if part is None else tuple(part.tolist()) for part in place), recording.firmware)
@@ -251,14 +251,14 @@ def _same(sensor: Sensor, rows: JournalRows, recording: RecordingReader) -> bool
         for entry, back in zip_longest(rows, recording):
             if entry is None or back is None or not _equal(entry.measurement, back):
                 return False
-        return [(gap.first, gap.last, gap.reason, gap.epoch) for gap in recording.gaps] == rows.missing
+        return [(gap.first, gap.last, gap.reason, gap.session_id) for gap in recording.gaps] == rows.missing
 
 
 def _equal(one: Measurement, other: Measurement) -> bool:
-    return (one.stamp, one.settings) == (other.stamp, other.settings) and np.array_equal(one.words, other.words)
+    return (one.stamp, one.settings) == (other.stamp, other.settings) and np.array_equal(one.data, other.data)
 
 
-def _told(
+def _reported(
     path: Path,
     recording: Path,
     *,
@@ -279,6 +279,6 @@ def _told(
 
 
 if __name__ == "__main__":
-    from ertis_numba.storage._sealing_process import main
+    from ertis_numba.storage.sealing_process import main
 
     sys.exit(main())

@@ -150,13 +150,13 @@ def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
     """Refuse a type or a number of axes that the table does not name."""
     dtype, is_text = dataset.dtype, variable.dtype == "str"
     if is_text:
-        most = MAX_TEXT_BYTES.get(variable.name, MAX_COLUMN_TEXT_BYTES)
-        fits = dtype.kind == "S" and dtype.itemsize <= most
+        largest = MAX_TEXT_BYTES.get(variable.name, MAX_COLUMN_TEXT_BYTES)
+        fits = dtype.kind == "S" and dtype.itemsize <= largest
     else:  # in older files, some have other sizes
         kinds = "iuf" if not variable.dtype else "iu" if np.dtype(variable.dtype).kind in "iu" else "f"
         fits = dtype.kind in kinds and dtype.itemsize <= 8
     if not fits:
-        wanted = f"text of up to {most} bytes" if is_text else variable.dtype or "numbers"
+        wanted = f"text of up to {largest} bytes" if is_text else variable.dtype or "numbers"
         raise DamagedError(f"{dataset.name} holds {str(dtype)[:80]}, wanted {wanted}; copy it again")
     n_axes = len(variable.dims)
     # A word axis is left out where there is one word.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.atomic import remedy
+from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.storage.schema import TRUTH, describe, lay_out, plain, text_type
@@ -28,7 +28,7 @@ _FIELDS = {
 }
 _TEXTS = ("name", "emitter")
 _ANGLES = ("azimuth", "elevation")  # radians in the file, as its other angles
-_MOST_SEED = 2**63 - 1  # what an attribute holds
+_MAX_SEED = 2**63 - 1  # what an attribute holds
 _BLOCK_ROWS = 512  # measurements whose reflectors are in memory at a time
 _RECORD = np.dtype(
     [("row", "<i8"), ("target", "<i4"), *((name, "<i4") for name in _TEXTS)]
@@ -57,7 +57,7 @@ class Truth:
     left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        checks.whole("seed", self.seed, 0, _MOST_SEED)
+        checks.integer("seed", self.seed, 0, _MAX_SEED)
         for name, values in _columns(self.reflectors).items():
             checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
 
@@ -78,12 +78,12 @@ class TruthLog:
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
         self.scene = scene
-        self.seed = checks.whole("seed", seed, 0, _MOST_SEED)
+        self.seed = checks.integer("seed", seed, 0, _MAX_SEED)
         self.left_out = left_out
         self._texts: dict[str, dict[str, int]] = {field: {} for field in _TEXTS}
         self._rows = 0
-        self._most_targets = 0
-        self._most_own = 0
+        self._max_targets = 0
+        self._max_own = 0
         self._last: tuple[Sequence[Reflector], NDArray[Any]] = ((), np.zeros(0, _RECORD))
         self._waiting: list[NDArray[Any]] = []
         self._block_sizes: list[int] = []
@@ -104,12 +104,12 @@ class TruthLog:
     @property
     def n_targets(self) -> int:
         """The largest number of reflectors of a measurement."""
-        return self._most_targets
+        return self._max_targets
 
     @property
     def n_own_targets(self) -> int:
         """The largest number of reflectors of a measurement that return the sensor's own call."""
-        return self._most_own
+        return self._max_own
 
     def texts(self, field: str) -> list[bytes]:
         """Return the values of a text field of reflectors, by the number that records hold."""
@@ -123,8 +123,8 @@ class TruthLog:
         records["row"] = self._rows
         self._waiting.append(records)
         self._rows += 1
-        self._most_targets = max(self._most_targets, len(records))
-        self._most_own = max(self._most_own, sum(not each.emitter for each in reflectors))
+        self._max_targets = max(self._max_targets, len(records))
+        self._max_own = max(self._max_own, sum(not each.emitter for each in reflectors))
         if self._rows % _BLOCK_ROWS == 0:
             self._flush()
 

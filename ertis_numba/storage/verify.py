@@ -9,7 +9,7 @@ from ertis_numba.journal import Journal
 from ertis_numba.storage._axes_check import fault_of
 from ertis_numba.storage._journal_rows import Damage, JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import JOURNAL_DAMAGE, Gap, RecordingReader, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingGap, RecordingReader, open_recording
 
 __all__ = ["Damage", "SensorReport", "verify"]
 
@@ -38,7 +38,7 @@ class SensorReport:
 
     sensor: str
     measurements: int = 0
-    gaps: tuple[Gap, ...] = ()
+    gaps: tuple[RecordingGap, ...] = ()
     damaged: tuple[Damage, ...] = ()
     disordered: tuple[int, ...] = ()
     fault: str = ""
@@ -118,7 +118,7 @@ def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
             measurements=len(recording),
             gaps=recording.gaps,
             damaged=tuple(damaged),
-            disordered=_disordered((stamp.epoch, stamp.sequence) for stamp in stamps),
+            disordered=_disordered((stamp.session_id, stamp.sequence) for stamp in stamps),
             remark="; ".join(filter(None, (_journal_damage(recording), structure))),
         )
 
@@ -132,10 +132,10 @@ def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
     """Return the places of the numbers that are not above the one before of the same epoch."""
     last: dict[int, int] = {}
     found = []
-    for index, (epoch, number) in enumerate(numbers):
-        if number <= last.get(epoch, number - 1):
+    for index, (session_id, number) in enumerate(numbers):
+        if number <= last.get(session_id, number - 1):
             found.append(index)
-        last[epoch] = number
+        last[session_id] = number
     return tuple(found)
 
 
@@ -146,8 +146,8 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
     return SensorReport(
         sensor=sensor,
         measurements=len(rows),
-        gaps=tuple(Gap(*item) for item in rows.missing),
+        gaps=tuple(RecordingGap(*item) for item in rows.missing),
         damaged=tuple(rows.damaged),
-        disordered=_disordered((key.epoch, key.sequence) for key in rows.keys),
+        disordered=_disordered((key.session_id, key.sequence) for key in rows.keys),
         remark=f"lost in a damaged journal: {journal.damage}" if journal.damage else "",
     )

@@ -60,7 +60,7 @@ def _capon(y: Delayed, processing: Processing) -> NDArray[np.float64]:
         covariance = snapshots @ snapshots.conj().transpose(0, 2, 1) / n_snapshots
         power = np.trace(covariance, axis1=1, axis2=2).real / n_mics
         heard = power > 0
-        loaded = covariance[heard] + (processing.loading * power[heard])[:, None, None] * np.eye(n_mics)
+        loaded = covariance[heard] + (processing.diagonal_loading * power[heard])[:, None, None] * np.eye(n_mics)
         solved = np.linalg.solve(loaded, np.ones((len(loaded), n_mics, 1)))[:, :, 0]
         beams = np.sum(solved.conj() * y[:, some[heard]].T, axis=1)
         out[some[heard]] = np.abs(beams / solved.conj().sum(axis=1))

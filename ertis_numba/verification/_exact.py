@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import array_weights, far_field_delays, microphones, unit_vectors
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 from ertis_numba.verification._beamformers import combine
 from ertis_numba.waveform import call_samples, matched_band_hz
-from ertis_numba.words import word_format
 
 __all__ = ["ExactImage"]
 
@@ -58,7 +58,7 @@ class ExactImage:
         self._n_fft = _transform_length(settings)
         self._bins, response = _matched_response(settings, self._n_fft)
         self._wave_rad_s = 2 * math.pi * self._bins * settings.recording.sample_rate_hz / self._n_fft
-        words = word_format(settings).checked(measurement.words)
+        words = sample_format(settings).validated(measurement.data)
         spectra = [
             scipy.fft.rfft(_signal(words, channel, settings), self._n_fft)[self._bins] * response
             for channel in np.flatnonzero(layout.enabled).tolist()

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.stages.detect import find_peaks
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.verification._exact import ExactImage
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
@@ -51,14 +51,14 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
         The exact image is silent, or the words are not those of the settings.
     """
     exact = ExactImage(image, measurement)
-    share = _MAX_OPERATIONS / exact.operations_per_direction / len(image.energy)
+    share = _MAX_OPERATIONS / exact.operations_per_direction / len(image.amplitude)
     if share < 1:
         return _measured_in_part(image, exact, share=share)
     wanted = _whole(image, exact)
     return Measured(
-        error_db=error_db(image.energy, wanted),
+        error_db=error_db(image.amplitude, wanted),
         n_directions=len(wanted),
-        peaks=peak_errors(image, find_peaks(image.replace(energy=wanted.astype(np.float32)), top=PEAKS)),
+        peaks=peak_errors(image, find_peaks(image.replace(amplitude=wanted.astype(np.float32)), top=PEAKS)),
     )
 
 
@@ -74,14 +74,14 @@ def sampled_error_db(image: Energyscape, measurement: Measurement, *, max_direct
     """
     exact = ExactImage(image, measurement)
     count = min(max_directions, max(_MIN_DIRECTIONS, int(_QUICK_OPERATIONS / exact.operations_per_direction)))
-    if count >= len(image.energy):
-        return error_db(image.energy, _whole(image, exact))
-    return _measured_in_part(image, exact, share=count / len(image.energy)).error_db
+    if count >= len(image.amplitude):
+        return error_db(image.amplitude, _whole(image, exact))
+    return _measured_in_part(image, exact, share=count / len(image.amplitude)).error_db
 
 
 def _measured_in_part(image: Energyscape, exact: ExactImage, *, share: float) -> Measured:
     """Return the error measured on a share of the directions, or of the image points if wavefronts are spherical."""
-    power = np.square(image.energy, dtype=np.float64)
+    power = np.square(image.amplitude, dtype=np.float64)
     by_place = image.settings.processing.wavefront == "spherical"
     power = power if by_place else power.sum(axis=1, keepdims=True)
     chosen, weights = sampled(power.ravel(), max(1, int(share * power.size)))
@@ -90,8 +90,8 @@ def _measured_in_part(image: Energyscape, exact: ExactImage, *, share: float) ->
     with one_thread():
         for direction in np.unique(directions).tolist():
             mine = directions == direction
-            places = ranges[mine] if by_place else np.arange(image.energy.shape[1])
-            both = np.stack([image.energy[direction, places], exact.amplitudes(direction, places)])
+            places = ranges[mine] if by_place else np.arange(image.amplitude.shape[1])
+            both = np.stack([image.amplitude[direction, places], exact.amplitudes(direction, places)])
             pairs.append(np.sqrt(weights[mine]) * both)
     found, wanted = np.concatenate(pairs, axis=1)
     return Measured(error_db=error_db(found, wanted), n_directions=len(pairs), peaks=None)
@@ -107,16 +107,16 @@ def exact_image(image: Energyscape, measurement: Measurement) -> Energyscape:
     DataError
         The words are not those of the settings.
     """
-    return image.replace(energy=_whole(image, ExactImage(image, measurement)).astype(np.float32))
+    return image.replace(amplitude=_whole(image, ExactImage(image, measurement)).astype(np.float32))
 
 
 def _whole(image: Energyscape, exact: ExactImage) -> NDArray[np.float64]:
-    ranges = np.arange(image.energy.shape[1])
+    ranges = np.arange(image.amplitude.shape[1])
     with one_thread():
-        return np.stack([exact.amplitudes(direction, ranges) for direction in range(len(image.energy))])
+        return np.stack([exact.amplitudes(direction, ranges) for direction in range(len(image.amplitude))])
 
 
-def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
+def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
     """Return the norm of the difference relative to the norm of the exact image.
 
     Raises
@@ -129,7 +129,7 @@ def error_db(energy: NDArray[np.floating], exact: NDArray[np.floating]) -> float
         raise DataError(
             "the exact image is silent, so no error relative to it can be measured; give a measurement with echoes"
         )
-    difference = float(np.linalg.norm(energy.astype(np.float64) - exact))
+    difference = float(np.linalg.norm(amplitude.astype(np.float64) - exact))
     return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf
 
 

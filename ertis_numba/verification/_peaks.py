@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.stages.detect import find_peaks
 
 __all__ = ["PEAKS", "PeakErrors", "peak_errors"]
 

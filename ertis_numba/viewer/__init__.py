@@ -1,7 +1,7 @@
 """Live view in the browser. The only door to viser.
 
-A source has images: `Live` those that a central node publishes, `Film` those of a file. `Scene` makes of them what is
-to be drawn, without a browser. `View` hands that to the page and does what is chosen there.
+A source has images: `Live` those that a central node publishes, `Playback` those of a file. `ViewedScene` makes of them what is
+to be drawn, without a browser. `Viewer` hands that to the page and does what is chosen there.
 """
 
 import importlib
@@ -10,28 +10,28 @@ from typing import TYPE_CHECKING, Any
 from ertis_numba.extras import extra
 from ertis_numba.viewer._choices import COLOURS, Choices
 from ertis_numba.viewer._polar import Polar
-from ertis_numba.viewer._scene import Scene
-from ertis_numba.viewer._shapes import Dome, Drawn, Frame, Pose, Sector, Taken
+from ertis_numba.viewer._scene import ViewedScene
+from ertis_numba.viewer._shapes import Dome, Drawn, DrawnFrame, Pose, ReceivedImage, Sector
 
 if TYPE_CHECKING:
-    from ertis_numba.viewer._film import Film
     from ertis_numba.viewer._live import Live
-    from ertis_numba.viewer._view import View
+    from ertis_numba.viewer._playback import Playback
+    from ertis_numba.viewer._view import Viewer
 
 __all__ = [
     "COLOURS",
     "Choices",
     "Dome",
     "Drawn",
-    "Film",
-    "Frame",
+    "DrawnFrame",
     "Live",
+    "Playback",
     "Polar",
     "Pose",
-    "Scene",
+    "ReceivedImage",
     "Sector",
-    "Taken",
-    "View",
+    "ViewedScene",
+    "Viewer",
 ]
 
 _HOMES = {"Film": "_film", "Live": "_live", "View": "_view"}

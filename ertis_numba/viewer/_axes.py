@@ -30,7 +30,7 @@ _ROOF_PX, _FLOOR_PX = 26, 66  # above and below the sector, for the names of ray
 _SCALE_PX: Final = 10  # height of the scale of colours
 _RING_PX: Final = 36  # between rings at least, so that their names have room
 _APART_PX: Final = 2  # between names at least
-_LEAST_RATIO, _MOST_RATIO = 0.25, 1.0  # of the sector's height to its width
+_MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # of the sector's height to its width
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,8 @@ class Place:
         west, east = float(right_m.min()), float(right_m.max())
         low, high = float(ahead_m.min()), float(ahead_m.max())
         inner_px = width_px - 2 * SIDE_PX
-        scale_px_m = min(inner_px / (east - west), inner_px * _MOST_RATIO / (high - low))
-        tall_px = max(inner_px * _LEAST_RATIO, (high - low) * scale_px_m)
+        scale_px_m = min(inner_px / (east - west), inner_px * _MAX_RATIO / (high - low))
+        tall_px = max(inner_px * _MIN_RATIO, (high - low) * scale_px_m)
         middle_px = width_px / 2
         sensor_px = (
             middle_px - (west + east) / 2 * scale_px_m,

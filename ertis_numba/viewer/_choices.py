@@ -14,7 +14,7 @@ __all__ = [
     "COLOURS",
     "DYNAMIC_RANGE_DB",
     "LOWEST_THRESHOLD_DB",
-    "MOST_DECAY_S",
+    "MAX_DECAY_S",
     "Choices",
     "colour_table",
 ]
@@ -28,7 +28,7 @@ LOWEST_THRESHOLD_DB: Final = -60.0
 DYNAMIC_RANGE_DB: Final = (10.0, 80.0)
 """Least and most dynamic range of pictures."""
 
-MOST_DECAY_S: Final = 10.0
+MAX_DECAY_S: Final = 10.0
 """Longest time for which points stay."""
 
 
@@ -65,7 +65,7 @@ class Choices:
         checks.between("dynamic_range_db", self.dynamic_range_db, *DYNAMIC_RANGE_DB)
         if self.range_m is not None:
             checks.interval("range_m", self.range_m, 0.0, 10_000.0)
-        checks.between("decay_s", self.decay_s, 0.0, MOST_DECAY_S)
+        checks.between("decay_s", self.decay_s, 0.0, MAX_DECAY_S)
         checks.choice("colours", self.colours, COLOURS)
 
 

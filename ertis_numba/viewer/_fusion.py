@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.viewer._polar import Look, Polar
+from ertis_numba.viewer._polar import Polar, PolarSampling
 from ertis_numba.viewer._shapes import Pose, Sector
 
 __all__ = ["Fusion", "is_level"]
@@ -42,7 +42,7 @@ class Fusion:
         self.extent_m = (-last_y, -last_y + columns * step_m, last_x - rows * step_m, last_x)
         x_m = np.repeat(last_x - (np.arange(rows) + 0.5) * step_m, columns)
         y_m = np.tile(last_y - (np.arange(columns) + 0.5) * step_m, rows)
-        self._looks: list[Look] = []
+        self._looks: list[PolarSampling] = []
         for polar, pose in sensors:
             yaw_rad = _yaw_rad(pose)
             from_x, from_y = x_m - pose.translation_m[0], y_m - pose.translation_m[1]

@@ -9,7 +9,7 @@ import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.viewer._shapes import Frame
+from ertis_numba.viewer._shapes import DrawnFrame
 
 __all__ = ["with_legend"]
 
@@ -22,7 +22,7 @@ _STYLE: Final = """
 """
 
 
-def with_legend(page: str, title: str, frame: Frame | None) -> str:
+def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     """Return a saved page with a legend in its upper right corner.
 
     Parameters

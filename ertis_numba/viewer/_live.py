@@ -11,8 +11,8 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.storage.recording import Mounting
-from ertis_numba.viewer._moments import usual_s
-from ertis_numba.viewer._shapes import Pose, Taken
+from ertis_numba.viewer._shapes import Pose, ReceivedImage
+from ertis_numba.viewer._time_steps import usual_s
 
 if TYPE_CHECKING:
     from ertis_numba.network.messages import Product
@@ -50,7 +50,7 @@ class Live:
         The address cannot be used, or not without keys.
     """
 
-    is_film: Literal[False] = False
+    is_playback: Literal[False] = False
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Live:
         self._wanted = set([sensors] if isinstance(sensors, str) else sensors or ())
         self._begun_s = time.monotonic()
         self._connected_s: float | None = None  # when it was first
-        self._is_told = False  # that nobody answers
+        self._is_reported = False  # that nobody answers
         self._turn = threading.Lock()
         self._waiting: dict[str, Arrival] = {}
         self._arrived_s: dict[str, deque[float]] = {}
@@ -121,17 +121,17 @@ class Live:
         waited_s = time.monotonic() - self._begun_s
         if self._connected_s is None and not self.connected and (waited_s < _SOON_S or self._failure is not None):
             return []
-        told = []
+        reported = []
         while self._notes:
-            told.append(self._notes.popleft())
+            reported.append(self._notes.popleft())
         if self._connected_s is None and self.connected:
             self._connected_s = time.monotonic()
-        if self._connected_s is None and not told and not self._is_told:
-            told.append(f"no publisher at {self.title} yet; is 'ertis serve' running?")
-        self._is_told = True
-        return told
+        if self._connected_s is None and not reported and not self._is_reported:
+            reported.append(f"no publisher at {self.title} yet; is 'ertis serve' running?")
+        self._is_reported = True
+        return reported
 
-    def take(self) -> list[Taken]:
+    def take(self) -> list[ReceivedImage]:
         """Return the images that have come since this was asked last, the latest of each sensor.
 
         Raises
@@ -145,7 +145,7 @@ class Live:
         if self._failure is not None:
             raise self._failure
         return [
-            Taken(
+            ReceivedImage(
                 arrival.item,
                 self._given.get(arrival.item.stamp.sensor) or Pose.of(arrival.translation_m, arrival.rotation_xyzw),
                 arrival.arrived_ns / 1e9,
@@ -155,12 +155,12 @@ class Live:
             if isinstance(arrival.item, Energyscape)
         ]
 
-    def latency_s(self, taken: Sequence[Taken]) -> float | None:
+    def latency_s(self, taken: Sequence[ReceivedImage]) -> float | None:
         """Return from the emission to now, of the oldest of some images; None where their time is not known."""
         known_ns = [each.image.stamp.timestamp_ns for each in taken if each.image.stamp.is_timed]
         return (time.time_ns() - min(known_ns)) / 1e9 if known_ns else None
 
-    def _look_for_sensors(self, status: Status) -> None:
+    def _find_sensors(self, status: Status) -> None:
         """Tell, once, which of the sensors that were asked for there are not."""
         if not self._wanted or self._connected_s is None or time.monotonic() - self._connected_s < _SOON_S:
             return
@@ -175,7 +175,7 @@ class Live:
                 item = self._subscriber.receive(_LOOK_S)
                 arrival = self._subscriber.latest
                 if isinstance(item, Status):
-                    self._look_for_sensors(item)
+                    self._find_sensors(item)
                 if not isinstance(item, Energyscape) or arrival is None:
                     continue
                 sensor = item.stamp.sensor

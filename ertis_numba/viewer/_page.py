@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import viser
 
 from ertis_numba.errors import NetworkError
-from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MOST_DECAY_S, Choices
+from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MAX_DECAY_S, Choices
 from ertis_numba.viewer._origins import is_loopback, own_pages
-from ertis_numba.viewer._recordings import MOST_BYTES
-from ertis_numba.viewer._shapes import Frame
+from ertis_numba.viewer._recordings import MAX_BYTES
+from ertis_numba.viewer._shapes import DrawnFrame
 from ertis_numba.viewer._space import Space, round_step
 
 if TYPE_CHECKING:
     from queue import SimpleQueue
 
-__all__ = ["Order", "Page"]
+__all__ = ["ControlRequest", "ViewerPage"]
 
 _PANEL_PX, _PICTURES_PX = 330, 560  # the latter such that pictures are shown pixel by pixel
 _SMALL: Final = "<div style='margin:0 0.8em 0.6em;font-size:0.85em;color:#9aa0b0'>{}</div>"
@@ -32,7 +32,7 @@ _STEPS: Final = 100  # of the window of ranges
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class ControlRequest:
     """What somebody wants: the name of a control, its value, and who is to get a file."""
 
     name: str
@@ -40,10 +40,10 @@ class Order:
     client: viser.ClientHandle | None = None
 
 
-Orders: TypeAlias = "SimpleQueue[Order | None]"
+Orders: TypeAlias = "SimpleQueue[ControlRequest | None]"
 
 
-class Page:
+class ViewerPage:
     """Serves the page; what is chosen there goes into a queue.
 
     Parameters
@@ -96,12 +96,14 @@ class Page:
         pictures.set_width(_PICTURES_PX)
         self._state = gui.add_html("")
         self._play = gui.add_button("Pause")
-        self._play.on_click(lambda _: self._orders.put(Order("play")))
+        self._play.on_click(lambda _: self._orders.put(ControlRequest("play")))
         if n_moments is None:
             self._button("Step", "step", value=1)
         else:
             steps = gui.add_button_group("Step", ("back", "ahead"))
-            steps.on_click(lambda event: self._orders.put(Order("step", 1 if event.target.value == "ahead" else -1)))
+            steps.on_click(
+                lambda event: self._orders.put(ControlRequest("step", 1 if event.target.value == "ahead" else -1))
+            )
             self._line = gui.add_slider("Measurement", 0, max(1, n_moments - 1), 1, 0, visible=n_moments > 1)
             self._obey(self._line, "seek")
         self._controls(choices)
@@ -114,7 +116,7 @@ class Page:
         token = "" if self._token is None else f"?token={self._token}"
         return f"http://{shown}:{self._server.get_port()}/{token}"
 
-    def show(self, frame: Frame, place: int = 0) -> None:
+    def show(self, frame: DrawnFrame, place: int = 0) -> None:
         """Draw a frame, and where it is on the time line."""
         with self._server.atomic():
             self._space.show(frame)
@@ -134,7 +136,7 @@ class Page:
             if self._line is not None and self._line.value != place:
                 self._line.value = place
 
-    def tell(self, rows: Mapping[str, tuple[str, str]], *, playing: bool) -> None:
+    def notify(self, rows: Mapping[str, tuple[str, str]], *, playing: bool) -> None:
         """Tell counters and times: by their names what they are and their values."""
         cells = "".join(
             f"<tr><td style='color:#9aa0b0;padding-right:1em'>{html.escape(label)}</td>"
@@ -152,18 +154,18 @@ class Page:
         """Return what keeps all that is drawn in the scene from now on."""
         return self._server.get_scene_serializer()
 
-    def tell_recordings(self, n_bytes: Mapping[Hashable, int]) -> None:
+    def report_recordings(self, n_bytes: Mapping[Hashable, int]) -> None:
         """Tell each browser whether it is recording, and how much of the most there can be: by the browser's number."""
-        for number, (button, told) in [*self._recorders.items()]:
+        for number, (button, reported) in [*self._recorders.items()]:
             here = n_bytes.get(number)
-            most = f"at most {MOST_BYTES / 1e6:g} MB"
+            largest = f"at most {MAX_BYTES / 1e6:g} MB"
             label = "Begin HTML recording" if here is None else "End HTML recording"
-            content = _SMALL.format(most if here is None else f"{here / 1e6:.1f} MB, {most}")
+            content = _SMALL.format(largest if here is None else f"{here / 1e6:.1f} MB, {largest}")
             with contextlib.suppress(RuntimeError):  # the browser has just left
                 if button.label != label:
                     button.label = label
-                if told.content != content:
-                    told.content = content
+                if reported.content != content:
+                    reported.content = content
 
     def close(self) -> None:
         """Serve no longer."""
@@ -181,7 +183,7 @@ class Page:
         self._range: Any = gui.add_multi_slider(_RANGE, 0.0, 1.0, 1 / _STEPS, (0.0, 1.0), min_range=2 / _STEPS)
         self._range.visible = False  # until it is known how far images reach
         self._obey(self._range, "range_m")
-        self._obey(gui.add_slider("Decay (s)", 0.0, MOST_DECAY_S, 0.1, choices.decay_s), "decay_s")
+        self._obey(gui.add_slider("Decay (s)", 0.0, MAX_DECAY_S, 0.1, choices.decay_s), "decay_s")
         self._obey(gui.add_dropdown("Colours", COLOURS, initial_value=choices.colours), "colours")
         self._saving = gui.add_folder("Save")
         with self._saving:
@@ -195,17 +197,17 @@ class Page:
         self.is_seen = True
         with self._saving:
             button = client.gui.add_button("Begin HTML recording")
-            button.on_click(lambda _: self._orders.put(Order("record", None, client)))
-            told = client.gui.add_html(_SMALL.format(f"at most {MOST_BYTES / 1e6:g} MB"))
-        self._recorders[client.client_id] = button, told
+            button.on_click(lambda _: self._orders.put(ControlRequest("record", None, client)))
+            reported = client.gui.add_html(_SMALL.format(f"at most {MAX_BYTES / 1e6:g} MB"))
+        self._recorders[client.client_id] = button, reported
 
     def _forget(self, client: viser.ClientHandle) -> None:
         self._recorders.pop(client.client_id, None)
-        self._orders.put(Order("leave", None, client))
+        self._orders.put(ControlRequest("leave", None, client))
 
     def _button(self, label: str, name: str, value: Any = None) -> viser.GuiButtonHandle:
         button = self._server.gui.add_button(label)
-        button.on_click(lambda event: self._orders.put(Order(name, value, event.client)))
+        button.on_click(lambda event: self._orders.put(ControlRequest(name, value, event.client)))
         return button
 
     def _obey(self, control: Any, name: str) -> None:
@@ -213,7 +215,7 @@ class Page:
 
         def chosen(event: Any) -> None:
             if event.client is not None:
-                self._orders.put(Order(name, event.target.value))
+                self._orders.put(ControlRequest(name, event.target.value))
 
         control.on_update(chosen)
         self._chosen[name] = control

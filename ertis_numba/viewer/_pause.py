@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ertis_numba.viewer._shapes import Taken
+    from ertis_numba.viewer._shapes import ReceivedImage
 
 __all__ = ["Pause"]
 
@@ -30,8 +30,8 @@ class Pause:
         self._steps = 0
         self._first_s: float | None = None  # when the first image of a step came
         self._due_s: dict[str, float] = {}  # from when on each sensor is overdue
-        self._latest: dict[str, Taken] = {}  # of each, which is not shown
-        self._new: dict[str, Taken] = {}  # of them, those since the step
+        self._latest: dict[str, ReceivedImage] = {}  # of each, which is not shown
+        self._new: dict[str, ReceivedImage] = {}  # of them, those since the step
 
     def toggle(self, now_s: float) -> None:
         """Hold what is shown, or go on."""
@@ -45,7 +45,7 @@ class Pause:
             self.toggle(now_s)
         self._steps += 1
 
-    def shown(self, taken: "Sequence[Taken]", now_s: float) -> "list[Taken]":
+    def shown(self, taken: "Sequence[ReceivedImage]", now_s: float) -> "list[ReceivedImage]":
         """Return what is to be shown of what came: all of it, or while this is held the images of a step."""
         came = {each.image.stamp.sensor: each for each in taken}
         self._due_s |= {name: each.due_s for name, each in came.items()}

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import ALONE_RAD, azimuth_columns, is_closed, reach_rad, unrolled_rad
-from ertis_numba.stages.levels import below_strongest_db
 from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_text
 
-__all__ = ["Look", "Polar", "cropped", "is_within"]
+__all__ = ["Polar", "PolarSampling", "cropped", "is_within"]
 
 _SHARES: Final = 256  # in which what lies between two directions is weighed
 
@@ -34,12 +34,12 @@ def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energysc
     last = max(int(last), first + 1)
     if last - first == len(image.range_m):
         return image
-    energy = np.ascontiguousarray(image.energy[:, first:last])
-    return image.replace(energy=energy, range_m=image.range_m[first:last])
+    amplitude = np.ascontiguousarray(image.amplitude[:, first:last])
+    return image.replace(amplitude=amplitude, range_m=image.range_m[first:last])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class PolarSampling:
     """Which directions and ranges some places of a plane show; called, it returns their levels.
 
     Attributes
@@ -129,9 +129,9 @@ class Polar:
         """Return azimuth in degrees and range in metres of a place in the picture; the inverse of `pixel_of`."""
         return self._place.place_of(x_px, y_px)
 
-    def levels(self, energy: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def levels(self, amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the levels to draw: (azimuth, range) uint8, 255 the strongest and 0 silence."""
-        joined = np.maximum.reduceat(energy, self._bins, axis=1)
+        joined = np.maximum.reduceat(amplitude, self._bins, axis=1)
         highest = self._columns.strongest(joined)
         level_db = below_strongest_db(highest, self._dynamic_range_db)
         return np.asarray(np.rint(255 * (1 + level_db / self._dynamic_range_db)), dtype=np.uint8)
@@ -186,7 +186,7 @@ class Polar:
         step_px = float(range_m[1] - range_m[0]) * self._place.scale_px_m
         return np.arange(0, len(range_m), max(1, math.floor(1 / step_px) if step_px < 1 else 1), dtype=np.intp)
 
-    def look(self, right_m: NDArray[np.float64], ahead_m: NDArray[np.float64]) -> Look:
+    def look(self, right_m: NDArray[np.float64], ahead_m: NDArray[np.float64]) -> PolarSampling:
         """Return which directions and ranges places in the sensor's plane show.
 
         Parameters
@@ -211,14 +211,14 @@ class Polar:
         after = np.minimum(before + 1, last) % n_azimuths
         before %= n_azimuths
         bins = np.searchsorted((self._bins_m[1:] + self._bins_m[:-1]) / 2, radius_m[inside])
-        return Look(
+        return PolarSampling(
             np.flatnonzero(inside),
             before * n_bins + bins,
             after * n_bins + bins,
             share,
         )
 
-    def _look_of_picture(self) -> Look:
+    def _look_of_picture(self) -> PolarSampling:
         """Return which directions and ranges each pixel of the picture shows."""
         rows, columns = self.shape
         (x, y), scale = self._place.sensor_px, self._place.scale_px_m

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from ertis_numba.atomic import check_target, replacing
+from ertis_numba.atomic_files import atomic_write, check_target
 
-__all__ = ["MOST_BYTES", "Recordings", "ToBrowser", "ToFile"]
+__all__ = ["MAX_BYTES", "Recordings", "ToBrowser", "ToFile"]
 
-MOST_BYTES: Final = 256_000_000
+MAX_BYTES: Final = 256_000_000
 """Of a recording. Its page holds them as text, a third longer, and Chromium takes no text of more than 512 MB."""
 _PLAIN_BYTES: Final = 8
 _NOTICE_S: Final = 10.0
 
 
-class Receiver(Protocol):
+class RecordingReceiver(Protocol):
     """Who gets a recording."""
 
     def full(self) -> None:
@@ -63,11 +63,11 @@ class ToFile:
 
     def full(self) -> None:
         """Note it."""
-        self._on_note(f"{self._path} is full at {MOST_BYTES / 1e6:g} MB: what came until now is written")
+        self._on_note(f"{self._path} is full at {MAX_BYTES / 1e6:g} MB: what came until now is written")
 
     def deliver(self, page: str, n_frames: int) -> None:
         """Write the file."""
-        with replacing(self._path, overwrite=self._overwrite) as part:
+        with atomic_write(self._path, overwrite=self._overwrite) as part:
             part.write_text(page, encoding="utf-8")
         self.n_frames = n_frames
 
@@ -96,7 +96,7 @@ class ToBrowser:
 
     def full(self) -> None:
         """Show it."""
-        self._tell("The HTML recording is full", f"at {MOST_BYTES / 1e6:g} MB; what came until now is saved")
+        self._emit_event("The HTML recording is full", f"at {MAX_BYTES / 1e6:g} MB; what came until now is saved")
 
     def deliver(self, page: str, _: int) -> None:
         """Send the file."""
@@ -104,19 +104,19 @@ class ToBrowser:
 
     def failed(self, error: Exception) -> None:
         """Show it: what a browser cannot have is no reason to end a view."""
-        self._tell("Nothing is saved", str(error))
+        self._emit_event("Nothing is saved", str(error))
 
-    def _tell(self, title: str, text: str) -> None:
+    def _emit_event(self, title: str, text: str) -> None:
         with suppress(Exception):  # who has left meanwhile
             self._client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color="red")
 
 
 @dataclass(slots=True)
-class _Recording:
+class _PageRecording:
     """What is being recorded, how much of it has been counted, and since when what was drawn last is shown."""
 
     serializer: Any
-    receiver: Receiver
+    receiver: RecordingReceiver
     shown_s: float
     n_frames: int = 0
     n_bytes: int = 0
@@ -165,7 +165,7 @@ class Recordings:
         self, serializer: Callable[[], Any], finished: Callable[[], Callable[[str], str]] = lambda: str
     ) -> None:
         self._serializer, self._finished = serializer, finished
-        self._made: dict[Hashable, _Recording] = {}
+        self._made: dict[Hashable, _PageRecording] = {}
         self._threads: list[threading.Thread] = []
 
     def __contains__(self, key: Hashable) -> bool:
@@ -175,9 +175,9 @@ class Recordings:
         """Return how much each holds."""
         return {key: recording.n_bytes for key, recording in self._made.items()}
 
-    def begin(self, key: Hashable, receiver: Receiver, now_s: float = math.inf) -> None:
+    def begin(self, key: Hashable, receiver: RecordingReceiver, now_s: float = math.inf) -> None:
         """Begin a recording; where something is shown already, it begins with that, now."""
-        self._made[key] = _Recording(self._serializer(), receiver, now_s)
+        self._made[key] = _PageRecording(self._serializer(), receiver, now_s)
 
     def end(self, key: Hashable, now_s: float) -> None:
         """End a recording and deliver it, where there is one."""
@@ -202,7 +202,7 @@ class Recordings:
         for key, recording in [*self._made.items()]:
             recording.n_frames += frames
             recording.count()
-            if recording.n_bytes >= MOST_BYTES:
+            if recording.n_bytes >= MAX_BYTES:
                 recording.receiver.full()
                 self.end(key, recording.shown_s)
 

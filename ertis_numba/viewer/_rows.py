@@ -6,21 +6,21 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from ertis_numba.frames import Stamp
-from ertis_numba.viewer._recordings import MOST_BYTES
+from ertis_numba.viewer._recordings import MAX_BYTES
 from ertis_numba.viewer._shapes import Drawn
 
 if TYPE_CHECKING:
-    from ertis_numba.viewer._film import Film
     from ertis_numba.viewer._live import Live
+    from ertis_numba.viewer._playback import Playback
 
-__all__ = ["Counts", "rows_of"]
+__all__ = ["FrameCounts", "rows_of"]
 
 _RATE_S: Final = 2.0
 _COARSE_S: Final = 10.0
 _NONE: Final = "–"
 
 
-class Counts:
+class FrameCounts:
     """What was drawn.
 
     Attributes
@@ -52,9 +52,9 @@ class Counts:
 
 
 def rows_of(
-    source: "Live | Film",
+    source: "Live | Playback",
     sensors: Mapping[str, Drawn],
-    counts: Counts,
+    counts: FrameCounts,
     *,
     paused: bool,
     n_held: int,
@@ -62,7 +62,7 @@ def rows_of(
 ) -> dict[str, tuple[str, str]]:
     """Return what there is to tell, by name: what it is, and its value."""
     latest = max((each.stamp for each in sensors.values()), key=lambda stamp: stamp.timestamp_ns, default=Stamp())
-    live = source.is_film is False
+    live = source.is_playback is False
     silent = live and bool(sensors) and all(each.overdue for each in sensors.values())
     latency_s = None if silent else counts.latency_s  # which is of an image of long ago then
     rows = {
@@ -82,15 +82,15 @@ def rows_of(
     if unplaced:
         rows["unplaced"] = ("place not known", f"{', '.join(unplaced)}: not on the platform")
     if n_bytes is not None:
-        rows["recording"] = ("HTML recording", f"{n_bytes / 1e6:.1f} MB, at most {MOST_BYTES / 1e6:g} MB")
+        rows["recording"] = ("HTML recording", f"{n_bytes / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:g} MB")
     return rows
 
 
-def _state(source: "Live | Film", sensors: Mapping[str, Drawn], *, paused: bool) -> str:
+def _state(source: "Live | Playback", sensors: Mapping[str, Drawn], *, paused: bool) -> str:
     """Return the state of the source and, where a live one is connected, whether its sensors send."""
     if paused:
         return f"{source.state}, paused"
-    if source.is_film is True or not source.connected:
+    if source.is_playback is True or not source.connected:
         return source.state
     if not sensors:
         return "connected, no sensor sends"
@@ -103,7 +103,9 @@ def _age(drawn: Drawn, clock_s: float) -> str:
     return (f"{age_s:.1f} s" if age_s < _COARSE_S else f"{age_s:.0f} s") + (" (overdue)" if drawn.overdue else "")
 
 
-def _of_each(sensors: Mapping[str, Drawn], told: Callable[[Drawn], str]) -> str:
+def _of_each(sensors: Mapping[str, Drawn], reported: Callable[[Drawn], str]) -> str:
     """Return what is told of each sensor, with its name where there are several."""
     several = len(sensors) > 1
-    return ", ".join(f"{name} {told(each)}" if several else told(each) for name, each in sensors.items()) or _NONE
+    return (
+        ", ".join(f"{name} {reported(each)}" if several else reported(each) for name, each in sensors.items()) or _NONE
+    )

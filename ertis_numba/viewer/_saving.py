@@ -12,7 +12,7 @@ from ertis_numba.interop._mountings import checked
 from ertis_numba.interop._point_files import write_ply
 from ertis_numba.interop._points import PointTable
 from ertis_numba.viewer._axes import PAGE
-from ertis_numba.viewer._shapes import Frame, Pose
+from ertis_numba.viewer._shapes import DrawnFrame, Pose
 
 __all__ = ["picture_png", "points_ply"]
 
@@ -20,7 +20,7 @@ _DPI: Final = 100
 _HEAD_PX: Final = 34
 
 
-def picture_png(frame: Frame) -> bytes:
+def picture_png(frame: DrawnFrame) -> bytes:
     """Return the pictures of all sensors below each other, with their names and times, as PNG."""
     drawn = list(frame.sensors.items())
     width_px = max(each.picture.shape[1] for _, each in drawn)

@@ -8,20 +8,20 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.finder import PointFinder, same_directions
+from ertis_numba.analysis.levels import below_strongest_db
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.stages.finder import PointFinder, same_directions
-from ertis_numba.stages.levels import below_strongest_db
-from ertis_numba.stages.side_lobes import without_side_lobes
 from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, Choices, colour_table
 from ertis_numba.viewer._fusion import Fusion, is_level
 from ertis_numba.viewer._polar import Polar, cropped, is_within
-from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, Frame, Pose, Sector, Taken
+from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, DrawnFrame, Pose, ReceivedImage, Sector
 
-__all__ = ["Scene"]
+__all__ = ["ViewedScene"]
 
-_MOST_POINTS: Final = 512  # of an image
-_MOST_CLOUDS: Final = 256  # that fade, of a sensor: fifteen a second, for as long as they may stay, and some more
+_MAX_POINTS: Final = 512  # of an image
+_MAX_CLOUDS: Final = 256  # that fade, of a sensor: fifteen a second, for as long as they may stay, and some more
 _FARTHEST_DOME: Final = 0.25  # radius of the dome, by the range that is seen
 _DIM: Final = 0.35  # what is left of the colours of a sensor that is overdue
 
@@ -47,11 +47,11 @@ class _Cloud:
 
 
 @dataclass(slots=True)
-class _Sensor:
+class _SensorImages:
     """What is kept of a sensor; what was drawn last is kept as long as it would come out the same."""
 
-    latest: Taken
-    clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MOST_CLOUDS))
+    latest: ReceivedImage
+    clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MAX_CLOUDS))
     polar: Polar | None = None
     polar_for: tuple[object, ...] = ()
     outside: bool = False  # of the window
@@ -62,7 +62,7 @@ class _Sensor:
     drawn_for: tuple[object, ...] = ()
 
 
-class Scene:
+class ViewedScene:
     """Keeps the latest image of each sensor and makes of it what to draw, with the choices of the moment.
 
     Points are found once for an image, in all of its ranges; thresholds and windows choose among them, so that what
@@ -76,8 +76,8 @@ class Scene:
 
     def __init__(self, *, width_px: int = 520) -> None:
         self._width_px = width_px
-        self._find = PointFinder(top=_MOST_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
-        self._sensors: dict[str, _Sensor] = {}
+        self._find = PointFinder(top=_MAX_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
+        self._sensors: dict[str, _SensorImages] = {}
         self._fusion: tuple[list[tuple[Polar, Pose]], Fusion] | None = None
         self._plan: tuple[list[object], Sector] | None = None
 
@@ -97,18 +97,18 @@ class Scene:
         """Forget all that was taken, as where somebody goes to another time of a film."""
         self._sensors.clear()
 
-    def take(self, taken: Taken) -> None:
+    def take(self, taken: ReceivedImage) -> None:
         """Take an image to be drawn next; points of later times are forgotten, as where a recording begins anew."""
         name = taken.image.stamp.sensor
         kept = self._sensors.get(name)
         if kept is None or not _same_axes(kept.latest.image, taken.image):
-            kept = self._sensors[name] = _Sensor(taken, *(() if kept is None else (kept.clouds,)))
+            kept = self._sensors[name] = _SensorImages(taken, *(() if kept is None else (kept.clouds,)))
         kept.latest = taken
         while kept.clouds and kept.clouds[-1].time_s >= taken.time_s:
             kept.clouds.pop()
         kept.clouds.append(_cloud_of(self._find(taken.image), taken))
 
-    def draw(self, choices: Choices, now_s: float | None = None) -> Frame:
+    def draw(self, choices: Choices, now_s: float | None = None) -> DrawnFrame:
         """Return what to draw of the images taken so far.
 
         Parameters
@@ -132,7 +132,7 @@ class Scene:
             pose = each.latest.pose or (UNTURNED if len(kept) == 1 else None)
             alone = pose is not None and (overdue or not fused)
             sensors[name] = _drawn(each, choices, now_s, pose, overdue=overdue, alone=alone)
-        frame = Frame(
+        frame = DrawnFrame(
             sensors,
             self.farthest_m if choices.range_m is None else min(self.farthest_m, choices.range_m[1]),
             until_s=_until_s(timely, sensors, choices, now_s),
@@ -142,7 +142,7 @@ class Scene:
         fusion = self._fusion_of(joined)
         return replace(frame, fused=self._plan_of(fusion, joined, choices), height_m=fusion.height_m)
 
-    def _prepare(self, kept: _Sensor, choices: Choices) -> None:
+    def _prepare(self, kept: _SensorImages, choices: Choices) -> None:
         """Find the levels of a sensor's image, where that or what was chosen is another."""
         image = kept.latest.image
         kept.outside = not is_within(image, choices.range_m)
@@ -153,16 +153,16 @@ class Scene:
             kept.polar = Polar(image, dynamic_range_db=choices.dynamic_range_db, width_px=self._width_px)
             kept.polar_for = polar_for
         if kept.levels_for != (kept.latest, kept.polar):
-            kept.levels, kept.levels_for = kept.polar.levels(_echoes(image).energy), (kept.latest, kept.polar)
+            kept.levels, kept.levels_for = kept.polar.levels(_echoes(image).amplitude), (kept.latest, kept.polar)
 
-    def _fusion_of(self, several: list[_Sensor]) -> Fusion:
+    def _fusion_of(self, several: list[_SensorImages]) -> Fusion:
         """Return what joins the images of several sensors, made anew where one has moved or has other axes."""
         pairs = [(kept.polar, kept.latest.pose) for kept in several if kept.polar is not None and kept.latest.pose]
         if self._fusion is None or self._fusion[0] != pairs:
             self._fusion = pairs, Fusion(pairs)
         return self._fusion[1]
 
-    def _plan_of(self, fusion: Fusion, several: list[_Sensor], choices: Choices) -> Sector:
+    def _plan_of(self, fusion: Fusion, several: list[_SensorImages], choices: Choices) -> Sector:
         """Return the image of several sensors, the same one as long as theirs are."""
         made_for = [fusion, choices.colours, *(kept.levels_for for kept in several)]
         if self._plan is None or self._plan[0] != made_for:
@@ -176,25 +176,27 @@ def _same_axes(image: Energyscape, other: Energyscape) -> bool:
 
 def _chosen(cloud: PointCloud, some: NDArray[np.bool_]) -> PointCloud:
     uncertainty_m = None if cloud.uncertainty_m is None else cloud.uncertainty_m[some]
-    return cloud.replace(position_m=cloud.position_m[some], energy=cloud.energy[some], uncertainty_m=uncertainty_m)
+    return cloud.replace(
+        position_m=cloud.position_m[some], amplitude=cloud.amplitude[some], uncertainty_m=uncertainty_m
+    )
 
 
-def _cloud_of(cloud: PointCloud, taken: Taken) -> _Cloud:
+def _cloud_of(cloud: PointCloud, taken: ReceivedImage) -> _Cloud:
     return _Cloud(
         cloud,
         (taken.pose or UNTURNED).placed(cloud.position_m),
-        np.asarray(20 * np.log10(np.maximum(cloud.energy, np.float32(1e-30))), dtype=np.float32),
+        np.asarray(20 * np.log10(np.maximum(cloud.amplitude, np.float32(1e-30))), dtype=np.float32),
         np.asarray(np.linalg.norm(cloud.position_m, axis=1), dtype=np.float32),
         taken.time_s,
     )
 
 
-def _is_level(taken: Taken) -> bool:
+def _is_level(taken: ReceivedImage) -> bool:
     """Whether an image lies in the level of a platform, on which the place of its sensor is known."""
     return taken.pose is not None and taken.image.is_planar and is_level(taken.pose)
 
 
-def _until_s(timely: list[_Sensor], sensors: dict[str, Drawn], choices: Choices, now_s: float) -> float:
+def _until_s(timely: list[_SensorImages], sensors: dict[str, Drawn], choices: Choices, now_s: float) -> float:
     """Return when another picture is due though nothing comes: at once where points fade."""
     if choices.decay_s and any(len(drawn.position_m) for drawn in sensors.values()):
         return now_s
@@ -206,7 +208,9 @@ def _table(choices: Choices, *, dim: bool) -> Table:
     return np.asarray(table * _DIM, dtype=np.uint8) if dim else table
 
 
-def _drawn(kept: _Sensor, choices: Choices, now_s: float, pose: Pose | None, *, overdue: bool, alone: bool) -> Drawn:
+def _drawn(
+    kept: _SensorImages, choices: Choices, now_s: float, pose: Pose | None, *, overdue: bool, alone: bool
+) -> Drawn:
     """Return what to draw of a sensor, whose shape is its own if it is ``alone``."""
     taken, polar = kept.latest, kept.polar
     assert polar is not None  # noqa: S101  it was prepared
@@ -264,7 +268,7 @@ def _echoes(image: Energyscape) -> Energyscape:
 
 def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
     """Return the directions with echoes as loud as the points that are shown."""
-    level_db = below_strongest_db(image.energy.max(axis=1), choices.dynamic_range_db)
+    level_db = below_strongest_db(image.amplitude.max(axis=1), choices.dynamic_range_db)
     shade = 1 + level_db / choices.dynamic_range_db
     radius_m = _FARTHEST_DOME * float(image.range_m[-1])
     # Directions that are spread evenly over half a sphere have a square of this side each.

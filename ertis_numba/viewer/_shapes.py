@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
-__all__ = ["UNTURNED", "Dome", "Drawn", "Frame", "Pose", "Sector", "Taken"]
+__all__ = ["UNTURNED", "Dome", "Drawn", "DrawnFrame", "Pose", "ReceivedImage", "Sector"]
 
 _OVERDUE_S: Final = 1.0  # at least, as images come in bursts where a network or a computer is busy
 _UNKNOWN_S: Final = 10.0  # without an image, where a single one has come and nobody knows when the next is due
@@ -46,8 +46,8 @@ class Pose:
 
     def placed(self, position_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return places of the sensor's frame in that of the platform: (point, axis) float32."""
-        energy = np.ones(len(position_m), np.float32)
-        cloud = PointCloud(position_m, energy, Settings(), Stamp(), self.translation_m, self.rotation_xyzw)
+        amplitude = np.ones(len(position_m), np.float32)
+        cloud = PointCloud(position_m, amplitude, Settings(), Stamp(), self.translation_m, self.rotation_xyzw)
         return cloud.on_platform_m()
 
 
@@ -56,7 +56,7 @@ UNTURNED: Final = Pose()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taken:
+class ReceivedImage:
     """An image to show.
 
     Attributes
@@ -157,7 +157,7 @@ class Drawn:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class DrawnFrame:
     """What to draw of all sensors.
 
     Attributes

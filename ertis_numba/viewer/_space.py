@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
-from ertis_numba.viewer._shapes import Dome, Drawn, Frame, Sector
+from ertis_numba.viewer._shapes import Dome, Drawn, DrawnFrame, Sector
 
 __all__ = ["Space", "round_step"]
 
@@ -41,7 +41,7 @@ class Space:
         self._labels: list[viser.LabelHandle] = []
         self._stood = False  # the camera where all can be seen, rather than where viser puts it
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: DrawnFrame) -> None:
         """Draw a frame."""
         self._look_at(frame)
         for name, drawn in frame.sensors.items():
@@ -51,7 +51,7 @@ class Space:
             nodes.show(frame.sensors.get(name), frame.range_m)
         self._show_fused(frame)
 
-    def _show_fused(self, frame: Frame) -> None:
+    def _show_fused(self, frame: DrawnFrame) -> None:
         """Draw one image of all sensors, where there is one."""
         if self._fused is not None:
             self._fused[1].visible = frame.fused is not None
@@ -64,7 +64,7 @@ class Space:
         else:
             self._fused = made_for, _plan(self._scene, "/fused", frame.fused, frame.height_m)
 
-    def _look_at(self, frame: Frame) -> None:
+    def _look_at(self, frame: DrawnFrame) -> None:
         """Draw the ground, and set the camera where all of it can be seen, again where more is seen or others join."""
         farthest_m, names = max(self._farthest_m, frame.range_m), self._names | frame.sensors.keys()
         if (farthest_m, names) == (self._farthest_m, self._names) or not frame.sensors:
@@ -120,11 +120,11 @@ class Space:
         self._stood = True
 
 
-def round_step(length: float, most: int) -> float:
+def round_step(length: float, largest: int) -> float:
     """Return the smallest of 1, 2 and 5 times a power of ten of which no more than so many fit into a length."""
-    least = length / most * (1 - 1e-9)
-    power = 10.0 ** math.floor(math.log10(least))
-    return next(each * power for each in (1, 2, 5, 10) if each * power >= least)
+    smallest = length / largest * (1 - 1e-9)
+    power = 10.0 ** math.floor(math.log10(smallest))
+    return next(each * power for each in (1, 2, 5, 10) if each * power >= smallest)
 
 
 class _Nodes:

@@ -13,30 +13,30 @@ from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.viewer._choices import Choices
 from ertis_numba.viewer._legend import with_legend
 from ertis_numba.viewer._origins import is_loopback
-from ertis_numba.viewer._page import Order, Page
+from ertis_numba.viewer._page import ControlRequest, ViewerPage
 from ertis_numba.viewer._pause import Pause
 from ertis_numba.viewer._recordings import Recordings, ToBrowser, ToFile
-from ertis_numba.viewer._rows import Counts, rows_of
+from ertis_numba.viewer._rows import FrameCounts, rows_of
 from ertis_numba.viewer._saving import picture_png, points_ply
-from ertis_numba.viewer._scene import Scene
+from ertis_numba.viewer._scene import ViewedScene
 
 if TYPE_CHECKING:  # one brings HDF5, the other ZeroMQ
-    from ertis_numba.viewer._film import Film
     from ertis_numba.viewer._live import Live
-    from ertis_numba.viewer._shapes import Frame, Taken
+    from ertis_numba.viewer._playback import Playback
+    from ertis_numba.viewer._shapes import DrawnFrame, ReceivedImage
 
-__all__ = ["View"]
+__all__ = ["Viewer"]
 
-_LEAST_DRAW_S: Final = 1 / 15
+_MIN_DRAW_S: Final = 1 / 15
 _LOOK_S: Final = 1 / 60
-_TELL_S: Final = 0.5
+_REPORT_INTERVAL_S: Final = 0.5
 _FADE_S: Final = 0.2  # between pictures of a recorded film in which nothing is new but what fades
 _TYPED_S: Final = 1.5  # after which a number that cannot be is not half of one that is being typed
 _LAST_S: Final = 1.0  # for which the last of a recorded film stays
 _OURS: Final = "ours"  # of recordings, the one that is not of a browser
 
 
-class View:
+class Viewer:
     """Shows what a source has on a page; use it in a ``with`` statement.
 
     Parameters
@@ -66,7 +66,7 @@ class View:
 
     def __init__(
         self,
-        source: "Live | Film",
+        source: "Live | Playback",
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -75,27 +75,27 @@ class View:
     ) -> None:
         self.choices = choices or Choices()
         self._source, self._on_note = source, on_note
-        self._film: Film | None = source if source.is_film is True else None
-        self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
-        self._scene = Scene()
-        self._frame: Frame | None = None
+        self._playback: Playback | None = source if source.is_playback is True else None
+        self._orders: queue.SimpleQueue[ControlRequest | None] = queue.SimpleQueue()
+        self._scene = ViewedScene()
+        self._frame: DrawnFrame | None = None
         self.is_local = is_loopback(host)
-        self._page = Page(
+        self._page = ViewerPage(
             host,
             port,
             orders=self._orders,
             title=source.title,
             choices=self.choices,
-            n_moments=None if self._film is None else len(self._film.moments),
+            n_moments=None if self._playback is None else len(self._playback.time_steps),
         )
         self._recordings = Recordings(self._page.serializer, self._completion)
         self._file: ToFile | None = None
         self._pause = Pause()  # of a live view
         self._changed, self._ended = False, False
         self._refused_s = math.inf  # when a number was chosen that cannot be
-        self._drawn_s = self._told_s = -math.inf
+        self._drawn_s = self._reported_s = -math.inf
         self._clock_drawn_s = -math.inf  # by the clock of the source
-        self._counts = Counts()
+        self._counts = FrameCounts()
 
     def __enter__(self) -> Self:
         return self
@@ -138,29 +138,29 @@ class View:
         end_s = time.monotonic() + duration_s
         if html is not None:
             self._begin(html, overwrite=overwrite)
-        if self._film is not None:  # a short one would be over before a browser is there
-            self._film.held = html is None and not self._page.is_seen
+        if self._playback is not None:  # a short one would be over before a browser is there
+            self._playback.held = html is None and not self._page.is_seen
         while not self._ended and time.monotonic() < end_s:
             self._obey()
             if self._file is not None:
                 self._file.check()
             self._note_all()
             now_s = time.monotonic()
-            if self._film is not None and self._page.is_seen:
-                self._film.held = False
+            if self._playback is not None and self._page.is_seen:
+                self._playback.held = False
             if now_s - self._refused_s >= _TYPED_S:
                 self._page.put_back(self.choices)
                 self._refused_s = math.inf
-            if now_s - self._drawn_s >= _LEAST_DRAW_S:
+            if now_s - self._drawn_s >= _MIN_DRAW_S:
                 self._draw(now_s)
-            if now_s - self._told_s >= _TELL_S:
-                self._tell()
+            if now_s - self._reported_s >= _REPORT_INTERVAL_S:
+                self._emit_event()
         self._finish(time.monotonic())
 
     def prepare(self) -> None:
         """Make the images of a film's first moment, which takes long where kernels are to be compiled."""
-        if self._film is not None:
-            self._film.at(0)
+        if self._playback is not None:
+            self._playback.at(0)
 
     def record(self, html: Path, *, overwrite: bool = False) -> None:
         """Write a recording of all of a film, as a page that needs neither server nor network.
@@ -174,25 +174,29 @@ class View:
         ArgumentError
             No page can be put there, or it is the file itself.
         """
-        film = self._film
-        if film is None:
+        playback = self._playback
+        if playback is None:
             raise TypeError("a live view is recorded by run")
         self._begin(html, overwrite=overwrite)
-        for place, moment in enumerate(film.moments):
+        for place, time_step in enumerate(playback.time_steps):
             self._note_all()
             if self._stopped():  # part of a film is not what was asked for
                 self._recordings.drop(_OURS)
                 return
             if _OURS not in self._recordings:
                 break
-            for taken in film.at(place):
+            for taken in playback.at(place):
                 self._scene.take(taken)
             self._counts.shown += 1
-            self._recordings.pass_to(moment.time_s)
-            self._show(moment.time_s, place, new=True)
-            after_s = film.moments[place + 1].time_s if place + 1 < len(film.moments) else moment.time_s + _LAST_S
-            self._fade(moment.time_s, after_s, place)
-        self._finish(film.moments[-1].time_s + _LAST_S)
+            self._recordings.pass_to(time_step.time_s)
+            self._show(time_step.time_s, place, new=True)
+            after_s = (
+                playback.time_steps[place + 1].time_s
+                if place + 1 < len(playback.time_steps)
+                else time_step.time_s + _LAST_S
+            )
+            self._fade(time_step.time_s, after_s, place)
+        self._finish(playback.time_steps[-1].time_s + _LAST_S)
 
     @property
     def shown(self) -> int:
@@ -223,7 +227,7 @@ class View:
         return lambda page: with_legend(page, title, frame)
 
     def _begin(self, html: Path, *, overwrite: bool) -> None:
-        sources = () if self._film is None else (self._film.path,)
+        sources = () if self._playback is None else (self._playback.path,)
         self._file = ToFile(html, overwrite=overwrite, on_note=self._note, sources=sources)
         self._recordings.begin(_OURS, self._file, self._begun_s)
 
@@ -256,18 +260,18 @@ class View:
         outdated = frame is not None and (self._changed or self._clock_drawn_s < clock_s >= frame.until_s)
         if not taken and not outdated:
             return
-        if taken and self._film is not None and self._film.anew:
+        if taken and self._playback is not None and self._playback.anew:
             self._scene.clear()
         for each in taken:
             self._scene.take(each)
         self._changed = False
         self._recordings.pass_to(now_s)
         self._drawn_s = now_s
-        self._show(clock_s, 0 if self._film is None else self._film.shown, new=bool(taken))
+        self._show(clock_s, 0 if self._playback is None else self._playback.shown, new=bool(taken))
         self._page.limit_range(self._scene.farthest_m, self.choices.range_m)
         if taken:
             self._counts.count(now_s, self._source.latency_s(taken))
-        self._tell()
+        self._emit_event()
 
     def _show(self, clock_s: float, place: int, *, new: bool) -> None:
         """Draw what was taken, as it is at a time."""
@@ -275,17 +279,17 @@ class View:
         self._page.show(self._frame, place)
         self._recordings.add(frames=int(new))
 
-    def _taken(self) -> "list[Taken]":
+    def _taken(self) -> "list[ReceivedImage]":
         """Return what is to be shown; while a live view is paused that is nothing, but for what steps ask for."""
         taken = self._source.take()
-        return taken if self._film is not None else self._pause.shown(taken, self._source.clock_s)
+        return taken if self._playback is not None else self._pause.shown(taken, self._source.clock_s)
 
     @property
     def _playing(self) -> bool:
-        return self._pause.since_s is None if self._film is None else self._film.playing
+        return self._pause.since_s is None if self._playback is None else self._playback.playing
 
-    def _tell(self) -> None:
-        self._told_s = time.monotonic()
+    def _emit_event(self) -> None:
+        self._reported_s = time.monotonic()
         n_bytes = self._recordings.n_bytes()
         rows = rows_of(
             self._source,
@@ -295,8 +299,8 @@ class View:
             n_held=self._pause.n_held,
             n_bytes=n_bytes.get(_OURS),
         )
-        self._page.tell(rows, playing=self._playing)
-        self._page.tell_recordings(n_bytes)
+        self._page.notify(rows, playing=self._playing)
+        self._page.report_recordings(n_bytes)
 
     def _obey(self) -> None:
         """Do what was ordered; wait a moment for an order."""
@@ -311,7 +315,7 @@ class View:
         except queue.Empty:
             return
 
-    def _do(self, order: Order) -> None:
+    def _do(self, order: ControlRequest) -> None:
         if order.name in Choices.__dataclass_fields__:
             chosen: dict[str, Any] = {order.name: order.value}
             try:
@@ -324,26 +328,26 @@ class View:
             self._play()
         elif order.name == "step":
             self._step(order.value)
-        elif order.name == "seek" and self._film is not None:
-            self._film.seek(order.value)
+        elif order.name == "seek" and self._playback is not None:
+            self._playback.seek(order.value)
         else:
             self._save(order)
 
     def _play(self) -> None:
-        if self._film is not None:
-            self._film.play(playing=not self._film.playing)
+        if self._playback is not None:
+            self._playback.play(playing=not self._playback.playing)
         else:
             self._pause.toggle(self._source.clock_s)
-        self._told_s = -math.inf
+        self._reported_s = -math.inf
 
     def _step(self, by: int) -> None:
-        if self._film is not None:
-            self._film.play(playing=False)
-            self._film.seek(self._film.place + by)
+        if self._playback is not None:
+            self._playback.play(playing=False)
+            self._playback.seek(self._playback.place + by)
         else:
             self._pause.step(self._source.clock_s)
 
-    def _save(self, order: Order) -> None:
+    def _save(self, order: ControlRequest) -> None:
         """Send a file to who asked for it, or say why there is none."""
         client = order.client
         if client is None:
@@ -366,12 +370,12 @@ class View:
             self._recordings.end(client.client_id, time.monotonic())
         else:
             self._recordings.begin(client.client_id, ToBrowser(client, self._name("html")), self._begun_s)
-        self._told_s = -math.inf
+        self._reported_s = -math.inf
 
     def _name(self, ending: str) -> str:
-        return f"{'live' if self._film is None else self._film.path.stem}.{ending}"
+        return f"{'live' if self._playback is None else self._playback.path.stem}.{ending}"
 
-    def _content(self, name: str, frame: "Frame") -> tuple[bytes, str]:
+    def _content(self, name: str, frame: "DrawnFrame") -> tuple[bytes, str]:
         """Return what a file holds, and its ending."""
         if name == "picture":
             return picture_png(frame), "png"

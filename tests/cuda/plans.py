@@ -15,8 +15,8 @@ DIRECT = Accuracy(
     delay_taps=2,
     beam_taps=0,
     beam_density=2.0,
-    stop_band_db=40.0,
-    zones=1,
+    stopband_attenuation_db=40.0,
+    focal_zones=1,
 )
 NODES = DIRECT.replace(beam_taps=2, beam_density=3.0)
 PLANS = {
@@ -26,11 +26,11 @@ PLANS = {
     "float32, nodes": (TINY.replace(accuracy=NODES), -120),
     "int16": (TINY.replace(accuracy=DIRECT.replace(precision="int16")), -100),
     "int16, nodes": (TINY.replace(accuracy=NODES.replace(precision="int16")), -90),
-    "taps of 32 bits": (TINY.replace(accuracy=DIRECT.replace(stop_band_db=80.0)), -120),
+    "taps of 32 bits": (TINY.replace(accuracy=DIRECT.replace(stopband_attenuation_db=80.0)), -120),
     "two zones": (
         TINY.replace(
             processing=TINY.processing.replace(wavefront="spherical"),
-            accuracy=DIRECT.replace(zones=2),
+            accuracy=DIRECT.replace(focal_zones=2),
         ),
         -120,
     ),

@@ -17,7 +17,7 @@ def test_rounds_of_directions_and_of_windows_leave_nothing_out(monkeypatch):
     offsets = np.arange(N_MICS) * (N_RANGES + 9) + random.integers(0, 10, (N_DIRECTIONS, N_MICS))
     offsets = offsets.astype(np.int32)
     weights = np.ones((N_DIRECTIONS, N_MICS), dtype=np.complex64)
-    monkeypatch.setattr(MODULE, "_MOST_BYTES", 2 * 16 * N_RANGES * (N_SNAPSHOTS + 1))  # two directions; 20 windows
+    monkeypatch.setattr(MODULE, "_MAX_BYTES", 2 * 16 * N_RANGES * (N_SNAPSHOTS + 1))  # two directions; 20 windows
     launched = []
     launch = MODULE.launch
     monkeypatch.setattr(MODULE, "launch", lambda *given: launched.append(given[1]) or launch(*given))

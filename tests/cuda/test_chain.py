@@ -25,7 +25,7 @@ def test_image_is_the_processors(pair):
     cpu, cuda, bound_db = pair
     assert cuda.settings == cpu.settings
     measurement = noise(cuda.settings)
-    images = [pipeline.process(measurement).energy for pipeline in (cpu, cuda)]
+    images = [pipeline.process(measurement).amplitude for pipeline in (cpu, cuda)]
     assert images[0].any()
     assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
@@ -38,22 +38,22 @@ def cuda():
 
 def test_batch_of_more_than_there_are_lanes_is_bit_by_bit_what_one_at_a_time_gives(cuda):
     measurements = [noise(cuda.settings, seed) for seed in range(4)]
-    single = [cuda.process(measurement).energy.copy() for measurement in (measurements[0], measurements[3])]
-    batch = [image.energy for image in cuda.process_batch(measurements)]
-    assert [batch[0].tobytes(), batch[3].tobytes()] == [energy.tobytes() for energy in single]
-    assert len({energy.tobytes() for energy in batch}) == 4
+    single = [cuda.process(measurement).amplitude.copy() for measurement in (measurements[0], measurements[3])]
+    batch = [image.amplitude for image in cuda.process_batch(measurements)]
+    assert [batch[0].tobytes(), batch[3].tobytes()] == [amplitude.tobytes() for amplitude in single]
+    assert len({amplitude.tobytes() for amplitude in batch}) == 4
 
 
 def test_image_goes_where_it_is_wanted(cuda):
     out = np.full((len(cuda.grid), len(cuda.range_m)), -1.0, dtype=np.float32)
     measurement = noise(cuda.settings)
-    assert cuda.process(measurement, out).energy is out
-    assert (out == cuda.process(measurement).energy).all()
+    assert cuda.process(measurement, out).amplitude is out
+    assert (out == cuda.process(measurement).amplitude).all()
 
 
 def test_signals_and_analytic_signals_are_the_processors():
     settings = PLANS["float32"][0]
-    words = noise(settings).words.reshape(-1, 1)
+    words = noise(settings).data.reshape(-1, 1)
     signals = 0.5 * np.random.default_rng(3).standard_normal((2, settings.recording.n_samples))
     found = {}
     for device in ("cpu", "cuda"):
@@ -71,7 +71,7 @@ def test_signals_and_analytic_signals_are_the_processors():
 def test_image_may_stay_on_the_device():
     settings = PLANS["float32"][0]
     chain = FastChain(settings, kernels.load("cuda"), threads=1)
-    words = noise(settings).words.reshape(-1, 1)
+    words = noise(settings).data.reshape(-1, 1)
     chain.process_batch([words, words], [None, None])
     image = chain.new_image()
     chain.process(words, image)
@@ -81,6 +81,6 @@ def test_image_may_stay_on_the_device():
 def test_plan_is_chosen_for_the_gpu():
     """Without a GPU by nominal costs; what is chosen keeps its budget all the same."""
     with Pipeline(TINY.replace(accuracy=TINY.accuracy.replace(max_error_db=-50.0)), device="cuda") as pipeline:
-        image = pipeline.process(noise(pipeline.settings)).energy
+        image = pipeline.process(noise(pipeline.settings)).amplitude
     exact = Pipeline(pipeline.settings.replace(accuracy=TINY.accuracy.replace(max_error_db=-100.0)), device="cpu")
-    assert reference.error_db(exact.process(noise(exact.settings)).energy, image) < -50
+    assert reference.error_db(exact.process(noise(exact.settings)).amplitude, image) < -50

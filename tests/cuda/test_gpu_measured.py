@@ -99,7 +99,7 @@ def test_wrong_image_is_not_timed(monkeypatch):
 
     def louder(self, measurement, out=None):
         image = process(self, measurement, out)
-        return image.replace(energy=1.001 * image.energy) if self.device == "cuda" else image
+        return image.replace(amplitude=1.001 * image.amplitude) if self.device == "cuda" else image
 
     monkeypatch.setattr(Pipeline, "process", louder)
     with pytest.raises(DataError, match=r"on 'cuda' is -60.0 dB off that on 'cpu'; wanted at most -100 dB"):

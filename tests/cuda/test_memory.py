@@ -49,7 +49,7 @@ def test_all_is_made_before_the_second_measurement(made):
 def test_close_gives_all_back_without_the_garbage_collector(made):
     pipeline = Pipeline(SETTINGS, device="cuda")
     image = pipeline.process(noise(SETTINGS))
-    before = image.energy.copy()
+    before = image.amplitude.copy()
     gc.disable()
     try:
         pipeline.close()
@@ -57,13 +57,13 @@ def test_close_gives_all_back_without_the_garbage_collector(made):
     finally:
         gc.enable()
     assert len(alive) == 1  # the memory of the image that is still looked at
-    assert (image.energy == before).all()
+    assert (image.amplitude == before).all()
 
 
 def test_pipelines_share_a_gpu():
     settings = [SETTINGS, PLANS["float32"][0]]
     with Pipeline(settings[0], device="cuda") as first, Pipeline(settings[1], device="cuda") as second:
-        images = [pipeline.process(noise(TINY)).energy.copy() for pipeline in (first, second, first, second)]
+        images = [pipeline.process(noise(TINY)).amplitude.copy() for pipeline in (first, second, first, second)]
     assert (images[0] == images[2]).all()
     assert (images[1] == images[3]).all()
     assert not (images[0] == images[1]).all()
@@ -124,7 +124,7 @@ def test_what_did_not_fit_is_gone_where_the_error_is_caught(monkeypatch, made):
 def test_close_waits_for_what_is_under_way():
     """And refuses what comes later; the image of the measurement that was under way is whole."""
     pipeline = Pipeline(SETTINGS, device="cuda")
-    expected = pipeline.process(noise(SETTINGS)).energy.copy()
+    expected = pipeline.process(noise(SETTINGS)).amplitude.copy()
     chain, begun, images = pipeline._chain, threading.Event(), []  # noqa: SLF001 - to hold it at the worst moment
     finish = chain._finish  # noqa: SLF001
 
@@ -135,7 +135,7 @@ def test_close_waits_for_what_is_under_way():
         finish(buffers)
 
     chain._finish = slow  # noqa: SLF001
-    working = threading.Thread(target=lambda: images.append(pipeline.process(noise(SETTINGS)).energy))
+    working = threading.Thread(target=lambda: images.append(pipeline.process(noise(SETTINGS)).amplitude))
     closing = threading.Thread(target=lambda: (begun.wait(), pipeline.close()))
     working.start()
     closing.start()
@@ -143,7 +143,7 @@ def test_close_waits_for_what_is_under_way():
     closing.join()
     assert (images[0] == expected).all()
     with pytest.raises(ArgumentError, match="the pipeline is closed"):
-        chain.process(noise(SETTINGS).words.reshape(-1, 1), images[0])
+        chain.process(noise(SETTINGS).data.reshape(-1, 1), images[0])
 
 
 def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
@@ -170,7 +170,7 @@ def test_memory_of_an_image_is_used_again_when_nobody_looks_at_any_part_of_it():
 
 
 def test_images_without_number_are_not_all_pinned(made, monkeypatch):
-    monkeypatch.setattr(_images, "_MOST_BYTES", 9 * 48)
+    monkeypatch.setattr(_images, "_MAX_BYTES", 9 * 48)
     memory = kernels.load("cuda").memory()
     images = [memory.image((3, 4)) for _ in range(50)]
     assert len(made) < 10

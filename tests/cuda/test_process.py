@@ -38,15 +38,15 @@ def run(recording, device, *arguments):
     done = CliRunner().invoke(cli, [str(argument) for argument in command])
     assert done.exit_code == 0, (done.stderr, done.exception)
     with open_energyscapes(target) as images:
-        return json.loads(done.stdout), np.array([image.energy for image in images])
+        return json.loads(done.stdout), np.array([image.amplitude for image in images])
 
 
 def test_device_is_told_and_all_measurements_are_there(made):
-    for (plan, device), (report, energies) in made.items():
+    for (plan, device), (report, amplitudes) in made.items():
         count = COUNT if plan == "explicit" else 1
         assert (report["device"], report["measurements"]) == (device, count)
         assert report["median_ms"] > 0
-        assert len({energy.tobytes() for energy in energies}) == count
+        assert len({amplitude.tobytes() for amplitude in amplitudes}) == count
 
 
 def test_images_of_one_plan_differ_by_rounding_only(made):
@@ -68,9 +68,9 @@ def test_images_of_plans_chosen_for_each_device_differ_by_their_errors_at_most(m
 
 def test_file_is_the_same_one_at_a_time(made, tmp_path):
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER.replace(accuracy=DIRECT), count=COUNT))
-    report, energies = run(recording, "cuda", "--batch", 1)
+    report, amplitudes = run(recording, "cuda", "--batch", 1)
     assert report["measurements"] == COUNT
-    assert energies.tobytes() == made["explicit", "cuda"][1].tobytes()
+    assert amplitudes.tobytes() == made["explicit", "cuda"][1].tobytes()
 
 
 def test_threads_are_refused(tmp_path):

@@ -43,5 +43,5 @@ def image_of(scene, index=0):
         assert reflector.level_db <= 0 or reflector.emitter  # sound of others may be louder than the strongest echo
         assert reflector.range_m >= 0
     image = Pipeline(simulator.sensor.settings(), predict=False).process(measurement)  # some are silent
-    assert np.all(np.isfinite(image.energy))
+    assert np.all(np.isfinite(image.amplitude))
     return image

@@ -100,11 +100,11 @@ def test_image_of_the_paper_needs_the_sections(monkeypatch):
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
     pipeline, measurement = Pipeline(settings), noise(SHORT)
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    wanted, _ = reference.paper(measurement.words, settings, directions)
-    assert reference.error_db(pipeline.process(measurement).energy, wanted) < -100
+    wanted, _ = reference.paper(measurement.data, settings, directions)
+    assert reference.error_db(pipeline.process(measurement).amplitude, wanted) < -100
 
     def as_polynomial(sections, signals):
         return scipy.signal.lfilter(*(part.astype(signals.dtype) for part in scipy.signal.sos2tf(sections)), signals)
 
     monkeypatch.setattr(scipy.signal, "sosfilt", as_polynomial)
-    assert not pipeline.process(measurement).energy.max() < 1e6  # 4e9, or no number at all
+    assert not pipeline.process(measurement).amplitude.max() < 1e6  # 4e9, or no number at all

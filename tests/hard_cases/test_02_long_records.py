@@ -41,7 +41,7 @@ def shifted_image(first, precision, shift=0):
     settings = tuned(LONG.replace(processing=processing), precision=precision)
     image = Pipeline(settings).process(Measurement(words, settings))
     assert image.range_m[0] == pytest.approx(near_m + farther_m, abs=1e-9)
-    return image.energy
+    return image.amplitude
 
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])

@@ -7,12 +7,12 @@ signals before them to 100 dB.
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.simulation import Emitter, Point, Sensor
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.detect import find_peaks
 from ertis_numba.waveform import call_samples
 from tests.cases import noise
 from tests.hard_cases.tuned import chain_of
@@ -46,15 +46,15 @@ def recorded(simulator):
 def heard(simulator):
     """The image of the signals before the modulators."""
     chain = chain_of(SHORT)
-    energy = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
-    chain.process_signals(simulator.signals(), energy)
-    return Energyscape(energy, chain.grid.azimuth_rad, chain.grid.elevation_rad, chain.range_m, SHORT)
+    amplitude = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+    chain.process_signals(simulator.signals(), amplitude)
+    return Energyscape(amplitude, chain.grid.azimuth_rad, chain.grid.elevation_rad, chain.range_m, SHORT)
 
 
 def beyond(image, range_m):
     """The part of an image that lies beyond a range."""
     there = image.range_m > range_m
-    return image.replace(energy=np.ascontiguousarray(image.energy[:, there]), range_m=image.range_m[there])
+    return image.replace(amplitude=np.ascontiguousarray(image.amplitude[:, there]), range_m=image.range_m[there])
 
 
 def strongest(image):
@@ -83,16 +83,16 @@ def test_an_echo_under_the_direct_sound_is_at_its_place(image_of, below_db, rang
     peak = strongest(image)
     assert peak.azimuth_deg == pytest.approx(20, abs=0.5)
     assert peak.range_m == pytest.approx(range_m, abs=2e-3)
-    assert 20 * np.log10(image.energy.max()) == pytest.approx(level_db, abs=1.5)
+    assert 20 * np.log10(image.amplitude.max()) == pytest.approx(level_db, abs=1.5)
     elsewhere = np.abs(image.range_m - range_m) > 0.15
-    assert image.energy[:, elsewhere].max() < image.energy.max() / 4
+    assert image.amplitude[:, elsewhere].max() < image.amplitude.max() / 4
 
 
 @pytest.mark.parametrize(("farther_m", "least_db"), [(0.1, 50), (0.2, 75), (0.3, 90), (0.5, 135), (1.5, 140)])
-def test_direct_sound_dies_out(farther_m, least_db):
+def test_direct_sound_dies_out(farther_m, min_db):
     """Of the loudest microphone: -54 dB at 10 cm, -77 at 20, -96 at 30, -143 at 50 and -149 beyond (float32)."""
     image = heard(simulator_of(direct_sound_db=DIRECT_DB))
-    assert 20 * np.log10(beyond(image, farther_m).energy.max()) - LOUDEST_DB < -least_db
+    assert 20 * np.log10(beyond(image, farther_m).amplitude.max()) - LOUDEST_DB < -min_db
 
 
 @pytest.mark.parametrize("azimuth_deg", [25.0, -20.0])
@@ -104,14 +104,14 @@ def test_two_echoes_60_db_and_half_a_metre_apart(image_of, azimuth_deg):
     near, far = strongest(image), strongest(beyond(image, 1.1))
     assert (near.azimuth_deg, far.azimuth_deg) == pytest.approx((-20, azimuth_deg), abs=0.5)
     assert (near.range_m, far.range_m) == pytest.approx((0.8, 1.3), abs=2e-3)
-    assert 20 * np.log10(beyond(image, 1.1).energy.max() / image.energy.max()) == pytest.approx(-60, abs=1)
+    assert 20 * np.log10(beyond(image, 1.1).amplitude.max() / image.amplitude.max()) == pytest.approx(-60, abs=1)
 
 
 def full_scale_noise(settings):
     """Full-scale noise as long as the call at the start, then an idle pattern far out of band."""
     loud = int(settings.call.duration_s * settings.recording.sample_rate_hz)
     words = np.where(np.arange(settings.recording.n_samples) % 2, 0xFFFFFFFF, 0).astype(np.uint32)
-    words[:loud] = noise(settings).words[:loud]
+    words[:loud] = noise(settings).data[:loud]
     return words
 
 
@@ -121,8 +121,8 @@ def test_direct_sound_does_not_wrap_to_far_ranges(method):
         processing=Processing(directions="2d:5", range_m=(0.0, 2.0), method=method)
     )
     image = Pipeline(settings).process(Measurement(full_scale_noise(settings), settings))
-    near = image.energy[:, image.range_m < 0.43].max()
-    far_db = 20 * np.log10(image.energy[:, image.range_m > 0.6].max(axis=0) / near + 1e-9)
+    near = image.amplitude[:, image.range_m < 0.43].max()
+    far_db = 20 * np.log10(image.amplitude[:, image.range_m > 0.6].max(axis=0) / near + 1e-9)
     # What is left is the ringing of the band edges, and it dies out instead of coming back.
     assert far_db.max() < -60
     assert far_db[-100:].max() < -80

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.detect import find_peaks
-from ertis_numba.waveform import matched_filter
+from ertis_numba.waveform import matched_filter_spectrum
 from tests.cases import SHORT, words_of
 from tests.hard_cases.echoes import echo_signals, echo_words
 
@@ -36,13 +36,13 @@ def pulses(rate_hz):
 
 def image_of(words, settings=SETTINGS):
     image = Pipeline(settings, predict=False).process(Measurement(words, settings))
-    assert np.isfinite(image.energy).all()
-    assert image.energy.min() >= 0
+    assert np.isfinite(image.amplitude).all()
+    assert image.amplitude.min() >= 0
     return image
 
 
 def level_db(image):
-    return 20 * np.log10(float(image.energy.max()))
+    return 20 * np.log10(float(image.amplitude.max()))
 
 
 def require_echo(image, changed_db, abs_db):
@@ -66,7 +66,7 @@ def test_the_step_at_the_beginning_of_the_record_is_all_there_is(name, largest_d
     """A constant begins at sample 0, a step of full scale: -79 dB there, -124 dB beyond 0.5 m."""
     image = image_of(SILENT[name], SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.0, 1.0))))
     assert level_db(image) < largest_db
-    assert 20 * np.log10(image.energy[:, image.range_m > 0.5].max()) < -110
+    assert 20 * np.log10(image.amplitude[:, image.range_m > 0.5].max()) < -110
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
@@ -93,8 +93,8 @@ def test_idle_tone_of_all_channels_is_as_strong_as_the_filter_lets_it_be(rate_hz
     """Compression spreads a tone over the length of the call: within 0.3 dB of the filter's gain there."""
     image = image_of(pulses(rate_hz) * ALL)
     n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz
-    matched = matched_filter(SETTINGS, n_fft=n_fft)
+    matched = matched_filter_spectrum(SETTINGS, n_fft=n_fft)
     gain = np.abs(matched.values[round(rate_hz * n_fft / signal_rate_hz) - matched.first_bin]) / 2
     amplitude = 4 * rate_hz / SETTINGS.recording.sample_rate_hz  # of the first harmonic of short pulses from -1 to 1
-    ahead = image.energy[np.argmin(np.abs(image.azimuth_rad))]
+    ahead = image.amplitude[np.argmin(np.abs(image.azimuth_rad))]
     assert 20 * np.log10(ahead.max()) == pytest.approx(20 * np.log10(gain * amplitude), abs=0.3)

@@ -4,13 +4,13 @@ import mpmath
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import far_field_delays, microphones, spherical_delays, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point
 from ertis_numba.simulation.names import EFFECTS
-from ertis_numba.stages.detect import find_peaks
 from tests import reference
 from tests.cases import SHORT
 from tests.hard_cases.echoes import echo_words
@@ -42,7 +42,7 @@ def test_plane_waves_lose_what_spherical_ones_keep(range_m, plane_db):
     assert 20 * np.log10(spherical.max() / 0.5) == pytest.approx(0, abs=0.12)
     assert 20 * np.log10(plane.max() / 0.5) == pytest.approx(plane_db, abs=0.15)
     everywhere = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    assert reference.error_db(image.energy, reference.exact(words, NEAR, everywhere, image.range_m)) < -45
+    assert reference.error_db(image.amplitude, reference.exact(words, NEAR, everywhere, image.range_m)) < -45
 
 
 def test_range_0_is_in_the_image():
@@ -50,7 +50,7 @@ def test_range_0_is_in_the_image():
     words = echo_words(NEAR, azimuth_deg=0.0, range_m=0.0, level=0.5)
     image = Pipeline(NEAR, predict=False).process(Measurement(words, NEAR))
     assert image.range_m[0] == 0
-    assert image.energy[:, 0].max() == image.energy.max() == pytest.approx(0.5, rel=0.1)
+    assert image.amplitude[:, 0].max() == image.amplitude.max() == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_target_so_near_is_found(range_m):
 @pytest.mark.parametrize("range_m", [0.001, 0.005])
 def test_a_target_upon_the_array_is_bounded(range_m):
     scene = scene_of(Point(range_m=range_m, strength_db=-90), sensor=EIGHT)
-    assert image_of(scene).energy.max() < 1
+    assert image_of(scene).amplitude.max() < 1
     assert np.abs(heard(scene, "spreading")).max() < 1.001 * 10 ** (-90 / 20) * 1e4
 
 

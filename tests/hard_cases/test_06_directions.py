@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.names import EFFECTS
-from ertis_numba.stages.detect import find_peaks
 from tests import reference
 from tests.cases import SHORT, noise, words_of
 from tests.hard_cases.echoes import echo_signals, echo_words
@@ -36,18 +36,18 @@ def with_grid(tmp_path, rows_deg):
     return with_processing(directions=str(path))
 
 
-def require_same(energy, other):
+def require_same(amplitude, other):
     """Refuse what differs by more than rounding: -120 dB of the largest value."""
-    assert_allclose(energy, np.broadcast_to(other, energy.shape), rtol=0, atol=1e-6 * energy.max())
+    assert_allclose(amplitude, np.broadcast_to(other, amplitude.shape), rtol=0, atol=1e-6 * amplitude.max())
 
 
 def require_exact(settings, measurement):
     pipeline = Pipeline(settings)
-    energy = pipeline.process(measurement).energy
+    amplitude = pipeline.process(measurement).amplitude
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    wanted = reference.exact(measurement.words, settings, directions, pipeline.range_m)
-    assert reference.error_db(energy, wanted) < -42
-    return energy
+    wanted = reference.exact(measurement.data, settings, directions, pipeline.range_m)
+    assert reference.error_db(amplitude, wanted) < -42
+    return amplitude
 
 
 @pytest.mark.parametrize("azimuth_deg", [-90.0, 90.0])
@@ -60,23 +60,23 @@ def test_an_echo_along_the_plane_of_the_array(azimuth_deg):
     [peak] = find_peaks(image, top=1)
     assert peak.azimuth_deg == pytest.approx(azimuth_deg, abs=5)
     assert peak.range_m == pytest.approx(0.7, abs=5e-4)
-    near, other = (image.energy[index].max() for index in ((0, -1) if azimuth_deg < 0 else (-1, 0)))
+    near, other = (image.amplitude[index].max() for index in ((0, -1) if azimuth_deg < 0 else (-1, 0)))
     assert near == pytest.approx(0.5, rel=0.1)
     assert other < near / 10
 
 
 def test_a_planar_array_hears_no_difference_between_front_and_back():
     """Azimuths α and 180° − α have the same delays: rounding apart, the same image."""
-    energy = require_exact(with_processing(directions="2d:9", azimuth_limits_deg=(-180.0, 180.0)), noise(SHORT))
-    require_same(energy[[5, 8, 0]], energy[[7, 4, 4]])  # 45° and 135°, 180° and 0°
-    assert reference.error_db(energy[5], energy[6]) > -10
+    amplitude = require_exact(with_processing(directions="2d:9", azimuth_limits_deg=(-180.0, 180.0)), noise(SHORT))
+    require_same(amplitude[[5, 8, 0]], amplitude[[7, 4, 4]])  # 45° and 135°, 180° and 0°
+    assert reference.error_db(amplitude[5], amplitude[6]) > -10
 
 
 @pytest.mark.parametrize("pole_deg", [-90, 90])
 def test_at_a_pole_the_azimuth_does_not_matter(tmp_path, pole_deg):
     rows = [(azimuth, pole_deg) for azimuth in (-180, -90, -37.5, 0, 90, 180)]
-    energy = require_exact(with_grid(tmp_path, rows), noise(SHORT))
-    require_same(energy, energy[3])
+    amplitude = require_exact(with_grid(tmp_path, rows), noise(SHORT))
+    require_same(amplitude, amplitude[3])
 
 
 def test_an_echo_from_the_pole_is_found_there_once(tmp_path):
@@ -110,7 +110,7 @@ def test_two_microphones_in_one_place_hear_as_one():
     pair, single = SHORT.replace(array=TWO_IN_ONE_PLACE), SHORT.replace(array=ONE)
     bits = np.random.default_rng(1).integers(0, 2, SHORT.recording.n_samples, dtype=np.uint8)
     both = require_exact(pair, Measurement(3 * bits, pair))
-    alone = Pipeline(single).process(Measurement(bits, single)).energy
+    alone = Pipeline(single).process(Measurement(bits, single)).amplitude
     assert_allclose(both, np.broadcast_to(alone, both.shape), rtol=0, atol=1e-2 * alone.max())  # two exact images
     require_same(both, both[0])
 

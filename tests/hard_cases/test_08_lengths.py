@@ -56,17 +56,17 @@ def test_image_of_any_length_is_the_exact_one(n_samples, precision):
     """Within a budget of -60 dB of noise, those have -45 dB that hold no more than one end of the call's band."""
     settings = tuned(of_length(n_samples), precision=precision, max_error_db=-60.0)
     pipeline, measurement = Pipeline(settings, predict=False), noise(settings)
-    energy = pipeline.process(measurement).energy
+    amplitude = pipeline.process(measurement).amplitude
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    wanted = reference.exact(measurement.words, settings, directions, pipeline.range_m)
-    assert reference.error_db(energy, wanted) < -45
+    wanted = reference.exact(measurement.data, settings, directions, pipeline.range_m)
+    assert reference.error_db(amplitude, wanted) < -45
 
 
 @pytest.mark.parametrize("n_samples", [1009, 12_347, 32_769])
 def test_whole_blocks_only_would_lose_the_end(n_samples):
     """The naive form: without the samples past the last multiple of 32 the image is off by -15 to -52 dB."""
     settings = of_length(n_samples)
-    words = noise(settings).words
+    words = noise(settings).data
     directions, range_m = np.eye(3)[:1], np.linspace(0, settings.processing.range_m[1], 50)
     cut = words[: n_samples // 32 * 32]
     lost_db = reference.error_db(
@@ -81,6 +81,6 @@ def test_whole_blocks_only_would_lose_the_end(n_samples):
 @pytest.mark.parametrize("n_samples", [1, 100, 4097])
 def test_records_shorter_than_the_call(n_samples):
     sensor = Sensor(array=EAR.array, recording=Recording(n_samples=n_samples), emitter=FULL.emitter)
-    assert Simulator(
-        forced(scene_of(Point(range_m=0.05), sensor=sensor)), plan=only(*EFFECTS)
-    ).render().words.shape == (n_samples,)
+    assert Simulator(forced(scene_of(Point(range_m=0.05), sensor=sensor)), plan=only(*EFFECTS)).render().data.shape == (
+        n_samples,
+    )

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from ertis_numba.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, load_layout
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Processing, Settings
 from ertis_numba.simulation import Point
-from ertis_numba.stages.detect import find_peaks
 from tests.cases import SHORT
 from tests.hard_cases.echoes import echo_words
 from tests.hard_cases.forced import EIGHT, image_of
@@ -167,4 +167,4 @@ def test_extreme_air(temperature_c, humidity_percent):
 
 def test_thin_air():
     air = Air(temperature_c=60, humidity_percent=100, pressure_pa=10_000)
-    assert image_of(scene_of(Point(range_m=0.4), sensor=EIGHT.replace(air=air))).energy.max() > 0
+    assert image_of(scene_of(Point(range_m=0.4), sensor=EIGHT.replace(air=air))).amplitude.max() > 0

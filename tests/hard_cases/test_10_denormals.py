@@ -47,11 +47,11 @@ def time_ratio(usual, other, *, times=5, rounds=12):
 def test_words_of_silence_take_no_longer(name, method):
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
     pipeline = Pipeline(settings, threads=1)
-    words = noise(settings).words
+    words = noise(settings).data
     silent = {"all zero": np.zeros_like(words), "alternating": IDLE, "noise, then alternating": words.copy()}[name]
     if name.startswith("noise"):
         silent[5000:] = IDLE[5000:]
-    out = pipeline.process(Measurement(words, settings)).energy
+    out = pipeline.process(Measurement(words, settings)).amplitude
     usual, other = (
         lambda given=given: pipeline.process(Measurement(given, settings), out=out) for given in (words, silent)
     )

@@ -84,7 +84,7 @@ def test_same_bits_for_one_and_two_threads(precision):
         processing=Processing(directions="3d:301", range_m=(0.5, 1.5))
     )
     settings = tuned(settings, precision=precision)
-    images = [Pipeline(settings, threads=n).process(noise(settings)).energy for n in (1, 2)]
+    images = [Pipeline(settings, threads=n).process(noise(settings)).amplitude for n in (1, 2)]
     assert images[0].tobytes() == images[1].tobytes()
 
 
@@ -144,7 +144,7 @@ def test_devices_agree(name, precision, bound_db):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     compiled = Pipeline(settings, device="cpu")
     plain = Pipeline(compiled.settings, device="numpy")  # by the same plan
-    images = [pipeline.process(noise(settings)).energy for pipeline in (compiled, plain)]
+    images = [pipeline.process(noise(settings)).amplitude for pipeline in (compiled, plain)]
     assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
 
@@ -153,7 +153,7 @@ def test_replay_of_a_file_gives_the_same_hash(tmp_path):
     measurements = [replace(noise(SHORT, seed), stamp=Stamp(sequence=seed)) for seed in range(3)]
 
     def digest(images):
-        return hashlib.sha256(b"".join(image.energy.tobytes() for image in images)).hexdigest()
+        return hashlib.sha256(b"".join(image.amplitude.tobytes() for image in images)).hexdigest()
 
     def replay(path):
         with open_recording(path) as recording:

@@ -50,11 +50,11 @@ def require_exact(array, precision):
     if precision == "int16" and not kernels.load().tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     pipeline, measurement = Pipeline(settings), noise(settings)
-    assert measurement.words.dtype.itemsize * 8 == array.word_bits
-    energy = pipeline.process(measurement).energy
+    assert measurement.data.dtype.itemsize * 8 == array.word_bits
+    amplitude = pipeline.process(measurement).amplitude
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
-    wanted = reference.exact(measurement.words, settings, directions, pipeline.range_m)
-    assert reference.error_db(energy, wanted) < -42
+    wanted = reference.exact(measurement.data, settings, directions, pipeline.range_m)
+    assert reference.error_db(amplitude, wanted) < -42
 
 
 # ---- through the simulator -------------------------------------------------------------------------
@@ -69,7 +69,7 @@ def test_1024_microphones():
     measurement = simulator.render()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert measurement.words.shape == (40_000, 16)
+    assert measurement.data.shape == (40_000, 16)
     assert peak < 250e6  # the signals alone would take 330 MB
-    ones = np.unpackbits(measurement.words[::16].view(np.uint8), axis=1).mean(axis=0)
+    ones = np.unpackbits(measurement.data[::16].view(np.uint8), axis=1).mean(axis=0)
     assert np.all(np.abs(ones - 0.5) < 0.1)

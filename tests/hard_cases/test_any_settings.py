@@ -10,15 +10,15 @@ import pytest
 from hypothesis import HealthCheck, Phase, event, given, settings
 from hypothesis import strategies as st
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
-from ertis_numba.stages.detect import find_peaks
 from tests.hard_cases.tuned import tuned
 
 EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "300"))
-MOST_SAMPLES = 500_000
+MAX_SAMPLES = 500_000
 LOUDEST = 100.0  # of an image whose full scale is 1, before calibrated gains
 DATA = ("noise", "zeros", "ones", "alternating", "sparse", "stuck")
 
@@ -90,15 +90,15 @@ TUNING = {
     "delay_taps": st.sampled_from([None, None, 1, 2, 4, 8]),
     "beam_taps": st.sampled_from([None, 0, 2, 4, 6]),
     "beam_density": st.floats(1.1, 8),
-    "stop_band_db": st.floats(40, 140),
-    "zones": st.integers(1, 4),
+    "stopband_attenuation_db": st.floats(40, 140),
+    "focal_zones": st.integers(1, 4),
 }
 COMBINING = {
     "wavefront": st.sampled_from(["plane", "spherical"]),
     "beamformer": st.sampled_from(["delay_and_sum", "delay_and_sum", "coherence_factor", "dmas", "capon"]),
     "dmas_order": st.integers(2, 8),
     "snapshots": st.integers(1, 32),
-    "loading": st.floats(1e-6, 1e6),
+    "diagonal_loading": st.floats(1e-6, 1e6),
 }
 
 
@@ -115,7 +115,7 @@ def any_settings(draw):
     array = draw(arrays())
     tuning = draw(some_of(TUNING))
     # All phases and microphones of the 10 ms that an image needs at the most: few, so that examples are quick.
-    finest = max(1, min(64, int(MOST_SAMPLES * step * divisor / (10e-3 * rate_hz * count_of(array)))))
+    finest = max(1, min(64, int(MAX_SAMPLES * step * divisor / (10e-3 * rate_hz * count_of(array)))))
     tuning["oversampling"] = min(finest, tuning.get("oversampling", finest))
     air = Air(
         temperature_c=draw(st.floats(-40, 60)),
@@ -193,12 +193,12 @@ def test_any_settings_and_any_data_give_an_image_or_one_line(made, kind, seed, d
         return
     event(f"an image of {kind}")
     image = pipeline.process(Measurement(words_for(pipeline, kind, seed), made))
-    assert image.energy.shape == (len(pipeline.grid), len(pipeline.range_m))
-    assert np.isfinite(image.energy).all()
+    assert image.amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
+    assert np.isfinite(image.amplitude).all()
     if made.processing.method == "fast":  # the paper's envelope is low-passed by a recursive filter, which undershoots
-        assert image.energy.min() >= 0
+        assert image.amplitude.min() >= 0
     if made.processing.beamformer == "delay_and_sum":
-        assert image.energy.max() < LOUDEST / min(made.array.gain or (1.0,))
+        assert image.amplitude.max() < LOUDEST / min(made.array.gain or (1.0,))
     for peak in find_peaks(image, top=3):
         assert np.isfinite([peak.azimuth_deg, peak.elevation_deg, peak.range_m, peak.level_db]).all()
         assert peak.level_db <= 0

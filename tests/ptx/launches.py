@@ -14,8 +14,8 @@ PLANS = {
     # accuracy, processing
     "default": ({}, {}),
     "own beams": ({"beam_taps": 0, "precision": "float32"}, {}),
-    "few directions": ({"stop_band_db": 40.0}, {"directions": "90"}),  # taps of 16 bits
-    "deep stop band": ({"stop_band_db": 100.0, "precision": "float32"}, {}),  # taps of 32 bits
+    "few directions": ({"stopband_attenuation_db": 40.0}, {"directions": "90"}),  # taps of 16 bits
+    "deep stop band": ({"stopband_attenuation_db": 100.0, "precision": "float32"}, {}),  # taps of 32 bits
     "int16": ({"precision": "int16", "beam_taps": 0, "delay_taps": 2}, {}),
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
     "near": ({}, {"range_m": (0.3, 1.0)}),  # several zones

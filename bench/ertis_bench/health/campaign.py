@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench.health.faults import FAULTS, Fault
+from ertis_bench.health.faults import FAULTS, ArrayFault
 from ertis_bench.health.scenes import base, healthy
-from ertis_numba.stages.health import Health, health
+from ertis_numba.analysis.health import Health, health
 
 __all__ = ["MIN_SHARE", "false_alarms", "named", "run"]
 
@@ -33,7 +33,7 @@ def named(name: str, seed: int) -> tuple[bool, Health]:
     return _is_named(fault, channels, report), report
 
 
-def _is_named(fault: Fault, channels: tuple[int, ...], report: Health) -> bool:
+def _is_named(fault: ArrayFault, channels: tuple[int, ...], report: Health) -> bool:
     found = {
         channel
         for name, those in report.faults.items()

@@ -13,7 +13,7 @@ from ertis_numba.geometry import load_layout, microphones
 from ertis_numba.settings import Array
 from ertis_numba.simulation.modulator import Modulator
 
-__all__ = ["FAULTS", "Fault"]
+__all__ = ["FAULTS", "ArrayFault"]
 
 _ONE = Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)
 _APART_S = 25e-6
@@ -23,7 +23,7 @@ _Change = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class ArrayFault:
     """A fault that can be put into a recording.
 
     Attributes
@@ -52,11 +52,11 @@ class Fault:
     def put_into(self, base: Base, rng: np.random.Generator) -> tuple[Measurement, tuple[int, ...]]:
         """Return the faulty recording and its faulty channels."""
         words, channels = self.inject(base, rng)
-        return replace(base.measurement, words=np.ascontiguousarray(words)), channels
+        return replace(base.measurement, data=np.ascontiguousarray(words)), channels
 
 
 def _column(base: Base, channel: int) -> NDArray[Any]:
-    words = base.measurement.words
+    words = base.measurement.data
     if base.sensor.recording.is_pdm:
         return np.asarray(words >> np.uint32(channel) & np.uint32(1)).astype(np.uint8)
     return words[:, channel].copy()
@@ -64,7 +64,7 @@ def _column(base: Base, channel: int) -> NDArray[Any]:
 
 def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
     """Return the words with other samples in some channels."""
-    words = (base.measurement.words if words is None else words).copy()
+    words = (base.measurement.data if words is None else words).copy()
     for channel, column in columns.items():
         if base.sensor.recording.is_pdm:
             bit = np.uint32(1 << channel)
@@ -126,7 +126,7 @@ def _rows(change: _Change) -> _Injection:
     """Return the injection that changes all words alike."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
-        return change(base.measurement.words, rng), ()
+        return change(base.measurement.data, rng), ()
 
     return inject
 
@@ -229,7 +229,7 @@ def _dropped(words: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
 
 def _shifted(base: Base, rng: np.random.Generator) -> _Injected:
     shift = round(5000 / 4.5e6 * base.sensor.recording.sample_rate_hz)
-    return np.roll(base.measurement.words, shift if rng.random() < 0.5 else -shift, axis=0), ()
+    return np.roll(base.measurement.data, shift if rng.random() < 0.5 else -shift, axis=0), ()
 
 
 def _crosstalk(base: Base, rng: np.random.Generator) -> _Injected:
@@ -243,7 +243,7 @@ def _copied(base: Base, rng: np.random.Generator) -> _Injected:
 
 
 def _half_missing(base: Base, _: np.random.Generator) -> _Injected:
-    silent = np.zeros(len(base.measurement.words), np.uint8)
+    silent = np.zeros(len(base.measurement.data), np.uint8)
     return _with(base, dict.fromkeys(range(16), silent)), tuple(range(16))
 
 
@@ -260,58 +260,58 @@ _BITS = (True,)
 _TWISTED = np.arange(32).reshape(4, 8)
 
 FAULTS = {
-    "stuck at 0": Fault(_stuck(0), ("stuck at",)),
-    "stuck at 1": Fault(_stuck(1), ("stuck at",)),
-    "alternating bits": Fault(_samples(_alternating), ("stuck in a pattern",), encodings=_BITS),
-    "stuck half of the time": Fault(_samples(_half_stuck), ("stuck at times",)),
-    "intermittent contact": Fault(_samples(_intermittent), ("stuck at times",)),
-    "white bits, unconnected": Fault(_samples(_white), ("white bits", "noisy")),
-    "noise +20 dB": Fault(_noisier(20.0), ("noisy", "white bits", "flipped bits")),
-    "noise +10 dB": Fault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
-    "gain +10 dB": Fault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
-    "gain -10 dB": Fault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
-    "gain +6 dB": Fault(_amplified(6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
-    "gain -6 dB": Fault(_amplified(-6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
-    "inverted polarity": Fault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
-    "two channels swapped": Fault(
+    "stuck at 0": ArrayFault(_stuck(0), ("stuck at",)),
+    "stuck at 1": ArrayFault(_stuck(1), ("stuck at",)),
+    "alternating bits": ArrayFault(_samples(_alternating), ("stuck in a pattern",), encodings=_BITS),
+    "stuck half of the time": ArrayFault(_samples(_half_stuck), ("stuck at times",)),
+    "intermittent contact": ArrayFault(_samples(_intermittent), ("stuck at times",)),
+    "white bits, unconnected": ArrayFault(_samples(_white), ("white bits", "noisy")),
+    "noise +20 dB": ArrayFault(_noisier(20.0), ("noisy", "white bits", "flipped bits")),
+    "noise +10 dB": ArrayFault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
+    "gain +10 dB": ArrayFault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
+    "gain -10 dB": ArrayFault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
+    "gain +6 dB": ArrayFault(_amplified(6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "gain -6 dB": ArrayFault(_amplified(-6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "inverted polarity": ArrayFault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
+    "two channels swapped": ArrayFault(
         _swapped(apart=True), ("swapped",), why="an echo that reaches them 25 µs apart or more"
     ),
-    "two channels swapped of nearly equal delay": Fault(
+    "two channels swapped of nearly equal delay": ArrayFault(
         _swapped(apart=False), ("swapped",), observable=False, why="delays differ by less than microphones may"
     ),
-    "order reversed": Fault(_ordered(np.arange(32)[::-1]), ("order of channels",), why=_ECHO),
-    "bits reversed in each byte": Fault(_ordered(_TWISTED[:, ::-1].ravel()), ("order of channels",), why=_ECHO),
-    "bytes reversed": Fault(_ordered(_TWISTED[::-1].ravel()), ("order of channels",), why=_ECHO),
-    "order of another layout": Fault(_of_layout, ("order of channels",), why=_ECHO),
-    "two channels identical": Fault(_copied, ("duplicate",)),
-    "1 % of bits flipped": Fault(_flipped(0.01), ("flipped bits", "noisy"), encodings=_BITS),
-    "0.1 % of bits flipped": Fault(_flipped(0.001), ("flipped bits", "noisy"), encodings=_BITS),
-    "1 % of bits flipped in every channel": Fault(
+    "order reversed": ArrayFault(_ordered(np.arange(32)[::-1]), ("order of channels",), why=_ECHO),
+    "bits reversed in each byte": ArrayFault(_ordered(_TWISTED[:, ::-1].ravel()), ("order of channels",), why=_ECHO),
+    "bytes reversed": ArrayFault(_ordered(_TWISTED[::-1].ravel()), ("order of channels",), why=_ECHO),
+    "order of another layout": ArrayFault(_of_layout, ("order of channels",), why=_ECHO),
+    "two channels identical": ArrayFault(_copied, ("duplicate",)),
+    "1 % of bits flipped": ArrayFault(_flipped(0.01), ("flipped bits", "noisy"), encodings=_BITS),
+    "0.1 % of bits flipped": ArrayFault(_flipped(0.001), ("flipped bits", "noisy"), encodings=_BITS),
+    "1 % of bits flipped in every channel": ArrayFault(
         _rows(lambda w, rng: w ^ np.packbits(rng.random((len(w), 32)) < 0.01, axis=1).view("<u4")[:, 0]),
         ("flipped bits",),
         encodings=_BITS,
     ),
-    "repeated block": Fault(_rows(_repeated), ("repeated blocks",)),
-    "50 words dropped": Fault(
+    "repeated block": ArrayFault(_rows(_repeated), ("repeated blocks",)),
+    "50 words dropped": ArrayFault(
         _rows(_dropped), ("shifted record",), observable=False, why="all channels alike; echoes merely come sooner"
     ),
-    "shifted by 1.1 ms": Fault(_shifted, ("shifted record",), scene="direct sound", why="a direct sound"),
-    "overload": Fault(_signal(lambda x, t: x + 1.5 * np.sin(2.5e5 * t) * (t < 4e-3)), ("saturated",)),
-    "DC offset": Fault(_signal(lambda x, _: x + 0.1), ("offset",)),
-    "hum": Fault(_signal(lambda x, t: x + 0.1 * np.sin(2 * np.pi * 100 * t)), ("low-frequency hum", "offset")),
-    "idle tone": Fault(_signal(lambda x, t: x + 0.02 * np.sin(2 * np.pi * 31e3 * t)), ("idle tone",)),
-    "half of the channels missing": Fault(_half_missing, ("stuck at",)),
-    "late by 50 µs": Fault(_late(50e-6), ("late",), why="a compact arrival"),
-    "late by 1 sample of PDM": Fault(
+    "shifted by 1.1 ms": ArrayFault(_shifted, ("shifted record",), scene="direct sound", why="a direct sound"),
+    "overload": ArrayFault(_signal(lambda x, t: x + 1.5 * np.sin(2.5e5 * t) * (t < 4e-3)), ("saturated",)),
+    "DC offset": ArrayFault(_signal(lambda x, _: x + 0.1), ("offset",)),
+    "hum": ArrayFault(_signal(lambda x, t: x + 0.1 * np.sin(2 * np.pi * 100 * t)), ("low-frequency hum", "offset")),
+    "idle tone": ArrayFault(_signal(lambda x, t: x + 0.02 * np.sin(2 * np.pi * 31e3 * t)), ("idle tone",)),
+    "half of the channels missing": ArrayFault(_half_missing, ("stuck at",)),
+    "late by 50 µs": ArrayFault(_late(50e-6), ("late",), why="a compact arrival"),
+    "late by 1 sample of PDM": ArrayFault(
         _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, less than microphones differ"
     ),
-    "late by 10 samples of PDM": Fault(
+    "late by 10 samples of PDM": ArrayFault(
         _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, less than microphones differ"
     ),
-    "bytes of numbers swapped": Fault(
+    "bytes of numbers swapped": ArrayFault(
         _rows(lambda w, _: w.byteswap()), ("order of bytes",), encodings=(False,), why="any scene of 16-bit numbers"
     ),
-    "crosstalk of -6 dB": Fault(
+    "crosstalk of -6 dB": ArrayFault(
         _crosstalk, ("late", "gain"), observable=False, why="a sound of two arrivals looks the same"
     ),
 }

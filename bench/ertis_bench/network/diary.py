@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 from ertis_numba.frames import Measurement
 
-__all__ = ["Diary", "Key", "Row"]
+__all__ = ["Diary", "DiaryKey", "Row"]
 
 
-class Key(NamedTuple):
+class DiaryKey(NamedTuple):
     """Which measurement."""
 
     sensor: str
-    epoch: int
+    session_id: int
     sequence: int
 
 
@@ -30,7 +30,7 @@ class Row(NamedTuple):
     def of(cls, measurement: Measurement) -> "Row":
         """Return that of a measurement, whose CRC-32 is made here."""
         stamp = measurement.stamp
-        return cls(zlib.crc32(measurement.words.data), stamp.sync_count, stamp.timestamp_ns)
+        return cls(zlib.crc32(measurement.data.data), stamp.sync_count, stamp.timestamp_ns)
 
 
 class Diary:
@@ -45,21 +45,21 @@ class Diary:
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
 
-    def offered(self, key: Key, row: Row, monotonic_ns: int) -> None:
+    def offered(self, key: DiaryKey, row: Row, monotonic_ns: int) -> None:
         """Write that a measurement is going to be handed over."""
         self._write("offered", *key, *row, monotonic_ns)
 
-    def kept(self, key: Key) -> None:
+    def kept(self, key: DiaryKey) -> None:
         """Write that it was accepted."""
         self._write("kept", *key)
 
-    def settled(self, sensor: str, epoch: int, settled: int, status: str, monotonic_ns: int) -> None:
+    def acked_through(self, sensor: str, session_id: int, acked_through: int, status: str, monotonic_ns: int) -> None:
         """Write what the sender was told."""
-        self._write("settled", sensor, epoch, settled, status, monotonic_ns)
+        self._write("acked_through", sensor, session_id, acked_through, status, monotonic_ns)
 
-    def dropped(self, sensor: str, epoch: int, sequence: int, reason: str) -> None:
+    def dropped(self, sensor: str, session_id: int, sequence: int, reason: str) -> None:
         """Write that the sender was told of one that was thrown away."""
-        self._write("dropped", sensor, epoch, sequence, reason)
+        self._write("dropped", sensor, session_id, sequence, reason)
 
     def _write(self, *words: object) -> None:
         os.write(self._file, f"{json.dumps(words)}\n".encode())  # at once and in one piece

@@ -20,11 +20,11 @@ from ertis_bench.network import (
 from ertis_bench.reliability import small_disk
 from ertis_bench.trials import Parts, try_parts
 
-__all__ = ["LONG", "PARTS", "SHORT", "Extent", "run"]
+__all__ = ["LONG", "PARTS", "SHORT", "NetworkFaultCounts", "run"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Extent:
+class NetworkFaultCounts:
     """How much is tried.
 
     Attributes
@@ -76,12 +76,12 @@ class Extent:
     n_gone: int
 
 
-SHORT = Extent(
+SHORT = NetworkFaultCounts(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
     n_hostile=200, n_fuzzed=10_000, n_hellos=60, n_files=60, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
     n_flips=30, n_gone=5,
 )  # fmt: skip
-LONG = Extent(
+LONG = NetworkFaultCounts(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,
     n_captures=50, n_hostile=1_000, n_fuzzed=1_000_000, n_hellos=1_000, n_files=1_000, overload_s=600.0,
     slow_s=240.0, n_pulses=400, n_power_cuts=4_500, n_flips=1_000, n_gone=200,
@@ -95,14 +95,14 @@ def run(
     return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only, say_found=True)
 
 
-def _disk_full(_: Extent, folder: Path, seed: int) -> dict[str, Any] | None:
+def _disk_full(_: NetworkFaultCounts, folder: Path, seed: int) -> dict[str, Any] | None:
     disk = folder / "disk"
     disk.mkdir()
     with small_disk(disk) as mounted:
         return None if mounted is None else faults_links.disk_full(folder, mounted, seed=seed)
 
 
-PARTS: Parts[Extent] = {
+PARTS: Parts[NetworkFaultCounts] = {
     "centrals": (
         "{n_kills} central nodes killed",
         lambda extent, folder, seed: faults_kills.centrals(

@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from ertis_bench.captures import emulated, sent_by_emulators
 from ertis_bench.network.cable import Weather, cable
-from ertis_bench.network.faults_kills import Record, judged, tracebacks
+from ertis_bench.network.faults_kills import RestartedRecorder, judged, tracebacks
 from ertis_bench.network.oracle import read_diaries, read_folder
-from ertis_bench.network.processes import ERTIS, Process, survivors, until
-from ertis_bench.network.sender import Job
+from ertis_bench.network.processes import ERTIS, JsonLinesProcess, survivors, until
+from ertis_bench.network.sender import SenderJob
 from ertis_bench.reliability import ONE_SENSOR
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import KeyPair
@@ -31,7 +31,7 @@ def captures(folder: Path, *, seed: int, count: int) -> Found:
     What the emulators log is the truth, what captures say to be kept is the promise.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     spool = folder / "spool"
     kept: dict[tuple[str, int, int], int] = {}
     mark = secrets.token_hex(8)
@@ -43,8 +43,8 @@ def captures(folder: Path, *, seed: int, count: int) -> Found:
             last = number == count
             if not node.running:
                 node = stack.enter_context(record.start())
-            with Process(
-                [*command, *(["-n", "10"] if last else [])], said=folder / "capture.txt", mark=mark
+            with JsonLinesProcess(
+                [*command, *(["-n", "10"] if last else [])], stated=folder / "capture.txt", mark=mark
             ) as capture:
                 capture.wait_for("kept")
                 time.sleep(rng.uniform(0.0, 1.0))
@@ -56,7 +56,7 @@ def captures(folder: Path, *, seed: int, count: int) -> Found:
                     time.sleep(rng.uniform(0.0, 0.5))
                 capture.kill()
             kept |= {
-                (each["sensor"], each["epoch"], each["sequence"]): each["crc32"]
+                (each["sensor"], each["session_id"], each["sequence"]): each["crc32"]
                 for each in capture.events
                 if each.get("event") == "kept"
             }
@@ -102,13 +102,13 @@ def hosts(folder: Path, *, seed: int, duration_s: float) -> Found | None:
         address = f"tcp://{made.addresses[1]}:{_PORT}"
         options = ["--listen", address, "-o", str(archive), "--key", secret["central"], "--allow", str(allowed)]
         command = made.inside(1, [*ERTIS, "record", *options, "--json", "--quiet"])
-        node = stack.enter_context(Process(command, said=folder / "central.txt"))
+        node = stack.enter_context(JsonLinesProcess(command, stated=folder / "central.txt"))
         node.wait_for("listening")
-        job = Job(
+        job = SenderJob(
             address=address, diary=str(diary), rate_hz=20.0, seed=seed, keys=(secret["front"], pairs["central"].public)
         )
         job = job.replace(ring_bytes=500_000_000, patience_s=120.0)
-        sender = stack.enter_context(Process(made.inside(0, job.command()), said=folder / "sender.txt"))
+        sender = stack.enter_context(JsonLinesProcess(made.inside(0, job.command()), stated=folder / "sender.txt"))
         until(lambda: diary.exists() and bool(read_diaries([diary]).acked()))
         end_s, cuts, back_s = time.monotonic() + duration_s, 0, 0.0
         while time.monotonic() < end_s:

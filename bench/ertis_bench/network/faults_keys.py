@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network.diary import Diary, Key, Row
+from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.faults_kills import judged
 from ertis_bench.network.faults_links import state_of
 from ertis_bench.network.processes import central, until
 from ertis_bench.network.sender import SMALL
-from ertis_bench.network.zmtp import Peer
+from ertis_bench.network.zmtp import ZmtpPeer
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
@@ -39,22 +39,26 @@ class _Try:
     node: SensorNode
     sensor: str
     diary: Diary
-    epoch: int
+    session_id: int
     sent: int = 0
-    settled: int = -1
-    settled_s: float = 0.0
+    acked_through: int = -1
+    acked_s: float = 0.0
     notes: list[str] = field(default_factory=list)
 
-    def note_settled(self, message: Any) -> None:
+    def note_acked(self, message: Any) -> None:
         """Note what is settled, and when."""
-        self.settled, self.settled_s = max(self.settled, message.settled), time.monotonic()
-        self.diary.settled(message.sensor, message.epoch, message.settled, message.status, time.monotonic_ns())
+        self.acked_through, self.acked_s = max(self.acked_through, message.acked_through), time.monotonic()
+        self.diary.acked_through(
+            message.sensor, message.session_id, message.acked_through, message.status, time.monotonic_ns()
+        )
 
     def send(self) -> None:
         """Hand over one measurement."""
-        words = np.random.default_rng([self.epoch, self.sent]).integers(0, 2**32, 32_768, dtype=np.uint32)
-        measurement = Measurement(words, SMALL, Stamp(sensor=self.sensor, sequence=self.sent, epoch=self.epoch))
-        now_ns, key = time.monotonic_ns(), Key(self.sensor, self.epoch, self.sent)
+        words = np.random.default_rng([self.session_id, self.sent]).integers(0, 2**32, 32_768, dtype=np.uint32)
+        measurement = Measurement(
+            words, SMALL, Stamp(sensor=self.sensor, sequence=self.sent, session_id=self.session_id)
+        )
+        now_ns, key = time.monotonic_ns(), DiaryKey(self.sensor, self.session_id, self.sent)
         self.diary.offered(key, Row.of(measurement), now_ns)
         self.node.append([Entry(measurement, monotonic_ns=now_ns)])
         self.diary.kept(key)
@@ -68,7 +72,7 @@ def keys(folder: Path, *, seed: int) -> Found:
     -------
     dict
         ``let in``, names of those who got something in or out; ``refused``, as the central node counts them by reason;
-        ``notes``, what the refused nodes were told; ``removed``, seconds from the removal of a key to the last ack to
+        ``notes``, what the refused nodes were reported; ``removed``, seconds from the removal of a key to the last ack to
         its owner; and what is in the recordings, of the listed sensor only.
     """
     archive, allowed = folder / "recordings", folder / "allow.toml"
@@ -103,7 +107,7 @@ def keys(folder: Path, *, seed: int) -> Found:
         }
         diaries = {name: folder / f"{number}.ndjson" for number, name in enumerate(cases)}
         tries = {
-            name: _begin(stack, address, sensor, given, diaries[name], epoch=seed + number)
+            name: _begin(stack, address, sensor, given, diaries[name], session_id=seed + number)
             for number, (name, (sensor, given)) in enumerate(cases.items())
         }
         _send(list(tries.values()), _TRIED_S)
@@ -119,12 +123,12 @@ def keys(folder: Path, *, seed: int) -> Found:
         allowed_list.save(allowed)
         _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
         leaver = tries.pop("a listed sensor, until it is removed")
-        after_s = leaver.settled_s - removed_s
+        after_s = leaver.acked_s - removed_s
         raw = _speaks_without_keys(address) + _speaks_without_keys(listening["publish"])
         boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
         status = state_of(address, *boss)
-        until(lambda: tries["the listed sensor"].settled >= tries["the listed sensor"].sent - 1)
-        let_in += [name for name, each in tries.items() if each.settled >= 0]
+        until(lambda: tries["the listed sensor"].acked_through >= tries["the listed sensor"].sent - 1)
+        let_in += [name for name, each in tries.items() if each.acked_through >= 0]
         notes = sorted({note for name, each in tries.items() if name not in let_in for note in each.notes})
         node.stop()
     wanted = [diaries["the listed sensor"]]
@@ -135,23 +139,25 @@ def keys(folder: Path, *, seed: int) -> Found:
         "raw": raw,
         "refused": status["refused"],
         "notes": notes,
-        "unsettled when removed": leaver.sent - 1 - leaver.settled,
+        "unsettled when removed": leaver.sent - 1 - leaver.acked_through,
         "removed, s": round(max(0.0, after_s), 2),
     } | found
 
 
-def _begin(stack: ExitStack, address: str, sensor: str, given: ClientKeys | None, diary: Path, *, epoch: int) -> _Try:
+def _begin(
+    stack: ExitStack, address: str, sensor: str, given: ClientKeys | None, diary: Path, *, session_id: int
+) -> _Try:
     """Start a sensor node."""
     notes: list[str] = []
     node = stack.enter_context(
         SensorNode(
             address,
             keys=given,
-            on_settled=lambda message: made.note_settled(message),  # noqa: PLW0108  it is made below
+            on_acked=lambda message: made.note_acked(message),  # noqa: PLW0108  it is made below
             on_note=lambda *texts: notes.append(": ".join(texts)),
         )
     )
-    made = _Try(node=node, sensor=sensor, diary=Diary(diary), epoch=epoch, notes=notes)
+    made = _Try(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
     node.add_sensor(sensor, SMALL)
     return made
 
@@ -185,6 +191,6 @@ def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Tr
 
 def _speaks_without_keys(address: str) -> int:
     """Return 1 if an address shakes hands with a peer of no keys at all."""
-    with contextlib.suppress(OSError), Peer(address, timeout_s=1.0):
+    with contextlib.suppress(OSError), ZmtpPeer(address, timeout_s=1.0):
         return 1
     return 0

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.network.oracle import Sent, compare, read_diaries, read_folder
-from ertis_bench.network.processes import Process, central, free_address, survivors, until
-from ertis_bench.network.sender import Job
+from ertis_bench.network.processes import JsonLinesProcess, central, free_address, survivors, until
+from ertis_bench.network.sender import SenderJob
 from ertis_numba.errors import DataError
 
-__all__ = ["Record", "centrals", "judged", "nodes", "sealings", "tracebacks"]
+__all__ = ["RestartedRecorder", "centrals", "judged", "nodes", "sealings", "tracebacks"]
 
 _GONE_S: Final = 30.0  # for what a killed process has started
 _ROTATE_MB: Final = 16
@@ -26,7 +26,7 @@ _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
 
 
-class Record:
+class RestartedRecorder:
     """``ertis record`` that is started again and again, at one address, into one folder.
 
     Parameters
@@ -49,33 +49,33 @@ class Record:
         self.archive.mkdir(exist_ok=True)
         self.address, self.mark = free_address(), secrets.token_hex(8)
 
-    def start(self, *, most_lines: int | None = None, busy: bool = False) -> Process:
+    def start(self, *, max_lines: int | None = None, busy: bool = False) -> JsonLinesProcess:
         """Start it, to be killed after some lines of its code, or to be held by SIGUSR1; it need not listen yet."""
         options = ("-o", str(self.archive), *self._options)
         common: dict[str, Any] = {"listen": self.address, "mark": self.mark}
-        return central("record", self.folder, *options, **common, most_lines=most_lines, busy=busy)
+        return central("record", self.folder, *options, **common, max_lines=max_lines, busy=busy)
 
-    def finish(self, senders: list[Process], *, timeout_s: float = 120.0) -> Found:
+    def finish(self, senders: list[JsonLinesProcess], *, timeout_s: float = 120.0) -> Found:
         """Start it once more, let senders end, which brings all that they still have, and let it seal.
 
         Returns
         -------
         dict
-            ``unsettled``, senders that did not get rid of all; ``orphans``, processes that ought to have ended.
+            ``unacked``, senders that did not get rid of all; ``orphans``, processes that ought to have ended.
         """
-        unsettled = 0
+        unacked = 0
         with self.start() as last:
             last.wait_for("listening")
             for sender in senders:
                 sender.signal(signal.SIGTERM)
             for sender in senders:
-                unsettled += not sender.wait_for("sent", timeout_s=timeout_s)["flushed"]
+                unacked += not sender.wait_for("sent", timeout_s=timeout_s)["flushed"]
                 sender.wait()
             code = last.stop(timeout_s=timeout_s)
             if code:
                 raise DataError(f"ertis record ended with {code}; {last.last_words()}")
         until(lambda: not survivors(self.mark), timeout_s=_GONE_S)
-        return {"unsettled": unsettled, "orphans": len(survivors(self.mark))}
+        return {"unacked": unacked, "orphans": len(survivors(self.mark))}
 
 
 def tracebacks(folder: Path) -> int:
@@ -111,15 +111,15 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
     central node must go while there is one: in the long run, sensors are slower.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
-    record = Record(folder, "--rotate-size", str(_ROTATE_MB))
+    record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
     diary, by_line = folder / "sender.ndjson", 0
-    job = Job(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=rate_hz, seed=seed)
+    job = SenderJob(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=rate_hz, seed=seed)
     with job.replace(ring_bytes=_RING_BYTES, patience_s=60.0).start() as sender:
         sender.wait_for("begun")
         for _ in range(count):
-            most_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
-            with record.start(most_lines=most_lines) as node:
-                if most_lines is not None:
+            max_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
+            with record.start(max_lines=max_lines) as node:
+                if max_lines is not None:
                     by_line += until(lambda node=node: _killed_itself(node), timeout_s=_LIFE_S)  # type: ignore[misc]
                 else:
                     if rng.random() < 0.8:  # others are killed while they start
@@ -130,7 +130,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
     return {"kills": count, "before a line": by_line} | ended | judged(folder, record.archive, [diary])
 
 
-def _killed_itself(node: Process) -> bool:
+def _killed_itself(node: JsonLinesProcess) -> bool:
     """Whether a central node has been killed before a line: it has ended, or was started again."""
     return not node.running or node.restarts > 0
 
@@ -146,10 +146,12 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
     Half of the kills come at a random moment, the others before a random line of code.
     """
     rng = random.Random(seed)  # noqa: S311  as above
-    record = Record(folder, "--rotate-size", str(_ROTATE_MB))
+    record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
     diaries = {name: folder / f"{name}.ndjson" for name in ("spool", "memory")}
     jobs = {
-        name: Job(address=record.address, diary=str(diary), sensors=(name,), rate_hz=100.0, seed=seed, patience_s=60.0)
+        name: SenderJob(
+            address=record.address, diary=str(diary), sensors=(name,), rate_hz=100.0, seed=seed, patience_s=60.0
+        )
         for name, diary in diaries.items()
     }
     jobs["spool"] = jobs["spool"].replace(spool=str(folder / "spool"))
@@ -160,7 +162,7 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
         for _ in range((count + 1) // 2):
             with ExitStack() as stack:
                 lines = _some_lines(rng, _LINES_TO_BEGIN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
-                senders = [stack.enter_context(job.replace(most_lines=lines).start()) for job in jobs.values()]
+                senders = [stack.enter_context(job.replace(max_lines=lines).start()) for job in jobs.values()]
                 for sender in rng.sample(senders, 2):
                     if lines is not None:
                         by_line += sender.ends_within(_LIFE_S)
@@ -184,9 +186,9 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
 def sealings(folder: Path, *, seed: int, count: int) -> Found:
     """Kill what seals recordings while the central node goes on, and now and then the central node with it."""
     rng = random.Random(seed)  # noqa: S311  as above
-    record = Record(folder, "--rotate-size", "2")
+    record = RestartedRecorder(folder, "--rotate-size", "2")
     diary = folder / "sender.ndjson"
-    job = Job(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
+    job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
     killed = with_central = 0
     with ExitStack() as stack:
         sender = stack.enter_context(job.replace(patience_s=60.0).start())

@@ -10,11 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.faults_kills import RestartedRecorder, judged
 from ertis_bench.network.meddler import ACKS, Meddler
 from ertis_bench.network.oracle import read_diaries
-from ertis_bench.network.processes import Process, ask, until
-from ertis_bench.network.sender import Job
+from ertis_bench.network.processes import JsonLinesProcess, ask, until
+from ertis_bench.network.sender import SenderJob
 from ertis_numba.errors import DataError
 
 __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
@@ -51,16 +51,18 @@ def disk_full(folder: Path, disk: Path, *, seed: int) -> Found:
         ballast.unlink()
 
     ballast.write_bytes(bytes(9_000_000))
-    return _faulty(folder, Record(folder, archive=archive), free, seed=seed, count=25)
+    return _faulty(folder, RestartedRecorder(folder, archive=archive), free, seed=seed, count=25)
 
 
 def disk_fails(folder: Path, *, seed: int) -> Found:
     """Let each write beyond a place in a file fail, as by EIO, allow it again, and see the same."""
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     return _faulty(folder, record, None, seed=seed, count=60)
 
 
-def _faulty(folder: Path, record: Record, free: Callable[[], None] | None, *, seed: int, count: int) -> Found:
+def _faulty(
+    folder: Path, record: RestartedRecorder, free: Callable[[], None] | None, *, seed: int, count: int
+) -> Found:
     """Send until the disk fails, mend it, and send the rest.
 
     Parameters
@@ -70,7 +72,7 @@ def _faulty(folder: Path, record: Record, free: Callable[[], None] | None, *, se
         mends that is to let it again.
     """
     diary = folder / "sender.ndjson"
-    job = Job(address=record.address, diary=str(diary), rate_hz=20.0, count=count, seed=seed, patience_s=60.0)
+    job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, count=count, seed=seed, patience_s=60.0)
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
         node.wait_for("listening")
@@ -103,9 +105,9 @@ def _faulty(folder: Path, record: Record, free: Callable[[], None] | None, *, se
     }
 
 
-def _limit(process: Process, most_bytes: int) -> None:
+def _limit(process: JsonLinesProcess, max_bytes: int) -> None:
     """Let writes beyond a place in any file fail: with EFBIG, which SQLite takes for a fault of the disk."""
-    resource.prlimit(process.node_pid, resource.RLIMIT_FSIZE, (most_bytes, resource.RLIM_INFINITY))
+    resource.prlimit(process.node_pid, resource.RLIMIT_FSIZE, (max_bytes, resource.RLIM_INFINITY))
 
 
 def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
@@ -116,10 +118,10 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
     how : {"killed", "stopped"}
         Whether its process is ended, or stands still and keeps its connections.
     """
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
     rate_hz = 0.7 * _RING_BYTES / (131_072 * (away_s + _START_S))
-    job = Job(address=record.address, diary=str(diary), seed=seed, ring_bytes=_RING_BYTES, patience_s=60.0)
+    job = SenderJob(address=record.address, diary=str(diary), seed=seed, ring_bytes=_RING_BYTES, patience_s=60.0)
     found: Found = {"away_s": away_s}
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
@@ -165,13 +167,13 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
 
 def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
     """Lose, repeat and delay acks, drop connections, and pull the cable without a word to either end."""
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
         node.wait_for("listening")
         cable = stack.enter_context(Meddler(record.address, seed=seed, odds=ACKS))
-        job = Job(address=cable.address, diary=str(diary), rate_hz=40.0, seed=seed, ring_bytes=10 * _RING_BYTES)
+        job = SenderJob(address=cable.address, diary=str(diary), rate_hz=40.0, seed=seed, ring_bytes=10 * _RING_BYTES)
         sender = stack.enter_context(job.replace(sensors=("left", "right"), patience_s=60.0).start())
         sender.wait_for("begun")
         end_s = time.monotonic() + duration_s

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from ertis_bench.network.faults_kills import tracebacks
 from ertis_bench.network.oracle import read_diaries
-from ertis_bench.network.processes import Process, until
-from ertis_bench.network.receiver import Look, read_received
-from ertis_bench.network.sender import SMALL, Job
+from ertis_bench.network.processes import JsonLinesProcess, until
+from ertis_bench.network.receiver import ReceiverJob, read_received
+from ertis_bench.network.sender import SMALL, SenderJob
 from ertis_bench.network.serving import Serve, accounts, percentile, some_words
 
 __all__ = ["overload", "subscribers"]
@@ -24,19 +24,19 @@ Found = dict[str, Any]
 def overload(folder: Path, *, seed: int, duration_s: float) -> Found:
     """Send twice as much as can be processed, after finding out how much that is."""
     words = some_words(SMALL, folder / "words.npy", seed=seed)
-    job = Job(address="", diary="", sensors=("a", "b", "c", "d"), seed=seed, words=str(words))
+    job = SenderJob(address="", diary="", sensors=("a", "b", "c", "d"), seed=seed, words=str(words))
     rate_hz = _published(folder / "calibration", job.replace(rate_hz=100.0), duration_s=5.0)["images per s"]
     found = _published(folder / "overload", job.replace(rate_hz=2.0 * rate_hz / 4), duration_s=duration_s)
     return {"capacity per s": rate_hz} | found
 
 
-def _published(folder: Path, job: Job, *, duration_s: float) -> Found:
+def _published(folder: Path, job: SenderJob, *, duration_s: float) -> Found:
     """Send for a while, and add up what became of it."""
     folder.mkdir()
     diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, *_PAPER, "--range", "0.3:1.0"))
-        receiver = stack.enter_context(Look(address=serve.publish, diary=str(images), credit=8).start())
+        receiver = stack.enter_context(ReceiverJob(address=serve.publish, diary=str(images), credit=8).start())
         receiver.wait_for("subscribed")
         with job.replace(address=serve.listen, diary=str(warm), rate_hz=1.0, count=2).start() as first:
             first.wait_for("sent")  # pipelines are made before it counts
@@ -52,7 +52,7 @@ def _published(folder: Path, job: Job, *, duration_s: float) -> Found:
         sender.signal(signal.SIGTERM)
         sender.wait_for("sent")
         sent = read_diaries([warm, diary])
-        settled = serve.settle(len(sent.kept))
+        acked_through = serve.settle(len(sent.kept))
         time.sleep(0.5)
         receiver.signal(signal.SIGTERM)
         receiver.wait()
@@ -61,7 +61,7 @@ def _published(folder: Path, job: Job, *, duration_s: float) -> Found:
         serve.node.stop()
     measured = read_diaries([diary]).offered
     times_ms = [time_ms for key, time_ms in received.times_ms.items() if key in measured]
-    return {"settled": settled, "images per s": round(per_s, 1)} | found | {
+    return {"acked_through": acked_through, "images per s": round(per_s, 1)} | found | {
         "p50, ms": percentile(times_ms, 0.5),
         "p99, ms": percentile(times_ms, 0.99),
         "slowest, ms": percentile(times_ms, 1.0),
@@ -79,14 +79,16 @@ def subscribers(folder: Path, *, seed: int, duration_s: float) -> Found:
     times_ms: dict[bool, list[float]] = {False: [], True: []}
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, "--directions", "90", "--range", "0.3:1.0"))
-        look = Look(address=serve.publish, diary=str(folder / "images.ndjson"))
+        look = ReceiverJob(address=serve.publish, diary=str(folder / "images.ndjson"))
         receiver = stack.enter_context(look.start())
         receiver.wait_for("subscribed")
-        job = Job(address=serve.listen, diary=str(folder / "sender.ndjson"), sensors=("left", "right"), rate_hz=20.0)
+        job = SenderJob(
+            address=serve.listen, diary=str(folder / "sender.ndjson"), sensors=("left", "right"), rate_hz=20.0
+        )
         sender = stack.enter_context(job.replace(words=str(words), seed=seed).start())
         until(lambda: bool(read_received(folder / "images.ndjson").numbers))
         time.sleep(1.0)
-        slow: list[Process] = []
+        slow: list[JsonLinesProcess] = []
         for turn in range(8):
             if turn % 2:
                 for name, waits_s in (("slow", 0.5), ("dead", 0.0)):
@@ -105,14 +107,14 @@ def subscribers(folder: Path, *, seed: int, duration_s: float) -> Found:
         sender.signal(signal.SIGTERM)
         sender.wait_for("sent")
         sent = read_diaries([folder / "sender.ndjson"])
-        settled = serve.settle(len(sent.kept))
+        acked_through = serve.settle(len(sent.kept))
         time.sleep(0.5)
         receiver.signal(signal.SIGTERM)
         receiver.wait()
         found = accounts(serve, sent, read_received(folder / "images.ndjson"))
         serve.node.stop()
     alone, beside = (percentile(times_ms[each], 0.99) for each in (False, True))
-    return {"settled": settled, "p99 alone, ms": alone, "p99 beside, ms": beside} | found | {
+    return {"acked_through": acked_through, "p99 alone, ms": alone, "p99 beside, ms": beside} | found | {
         "grew, %": round(100 * (beside / alone - 1), 1) if alone else 0.0,
         "tracebacks": tracebacks(folder),
     }  # fmt: skip

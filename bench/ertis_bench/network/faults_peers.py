@@ -12,13 +12,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.faults_kills import RestartedRecorder, judged
 from ertis_bench.network.faults_links import state_of
 from ertis_bench.network.fuzz import inputs
 from ertis_bench.network.oracle import read_diaries
-from ertis_bench.network.processes import Process, central, until
-from ertis_bench.network.sender import Job
-from ertis_bench.network.zmtp import GREETING, Peer, greeting, host_and_port, message, ready
+from ertis_bench.network.processes import JsonLinesProcess, central, until
+from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.zmtp import GREETING, ZmtpPeer, greeting, host_and_port, message, ready
 
 __all__ = ["fuzzed", "hostile"]
 
@@ -44,13 +44,13 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
         options = ("--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1")
         node = stack.enter_context(central("serve", folder, *options))
         listening = node.wait_for("listening")
-        job = Job(address=listening["address"], diary=str(diary), rate_hz=10.0, seed=seed)
+        job = SenderJob(address=listening["address"], diary=str(diary), rate_hz=10.0, seed=seed)
         sender = stack.enter_context(job.start())
         until(lambda: diary.exists() and bool(read_diaries([diary]).acked()))
         before = node.memory_bytes
         rng = random.Random(seed)  # noqa: S311  a seed is to give the same inputs again
         _send_all(listening["address"], rng, count - count // 5, found)
-        _send_all(listening["publish"], rng, count // 5, found, most_bytes=_HEADER_BYTES)
+        _send_all(listening["publish"], rng, count // 5, found, max_bytes=_HEADER_BYTES)
         found["memory grew, MB"] = round((node.memory_bytes - before) / 1e6, 1)
         status = state_of(listening["address"])
         processing = status["processing"]
@@ -62,13 +62,13 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
     return found | judged(folder, archive, [diary])
 
 
-def _send_all(address: str, rng: random.Random, count: int, found: Found, *, most_bytes: int | None = None) -> None:
+def _send_all(address: str, rng: random.Random, count: int, found: Found, *, max_bytes: int | None = None) -> None:
     """Send inputs, whose frames are cut where they are too long for the other side to listen any further."""
     for batch in inputs(rng, count, _BATCH):
         for attempt in range(3):
             try:
-                with Peer(address) as peer:
-                    peer.send(*([frame[:most_bytes] for frame in frames] for frames in batch))
+                with ZmtpPeer(address) as peer:
+                    peer.send(*([frame[:max_bytes] for frame in frames] for frames in batch))
                     peer.send([b"nothing at all"])
                     peer.socket.settimeout(0.02 if attempt else 0.3)
                     with contextlib.suppress(TimeoutError):
@@ -86,13 +86,13 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
     Returns
     -------
     dict
-        ``connections``, most of them ``at once``; the slowest ack and how much memory grew; and what became of the
+        ``connections``, largest of them ``at once``; the slowest ack and how much memory grew; and what became of the
         sensor's measurements.
     """
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
-    job = Job(address=record.address, diary=str(diary), rate_hz=rate_hz, seed=seed, small=False)
-    most_memory = 0
+    job = SenderJob(address=record.address, diary=str(diary), rate_hz=rate_hz, seed=seed, small=False)
+    max_memory = 0
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
         node.wait_for("listening")
@@ -103,7 +103,7 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
             end_s = time.monotonic() + max(4.0, count / 50)  # slow handshakes are given up after three seconds
             while time.monotonic() < end_s:
                 crowd.whisper()
-                most_memory = max(most_memory, node.memory_bytes)
+                max_memory = max(max_memory, node.memory_bytes)
                 time.sleep(0.1)
             opened = crowd.opened
         sender.signal(signal.SIGTERM)
@@ -116,14 +116,14 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
             "connections": opened,
             "flushed": flushed,
             "slowest ack, ms": round(times_ms[-1], 1),
-            "memory grew, MB": round((most_memory - before) / 1e6, 1),
+            "memory grew, MB": round((max_memory - before) / 1e6, 1),
         }
         | ended
         | judged(folder, record.archive, [diary])
     )
 
 
-def record_ended(node: Process, record: Record) -> Found:
+def record_ended(node: JsonLinesProcess, record: RestartedRecorder) -> Found:
     """Let a central node end, and look for what it has left."""
     return {"exit code": node.stop()} | record.finish([])
 

@@ -13,8 +13,8 @@ import numpy as np
 from ertis_bench.network.faults_kills import judged, tracebacks
 from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import survivors, until
-from ertis_bench.network.receiver import Look, read_received
-from ertis_bench.network.sender import SMALL, Job
+from ertis_bench.network.receiver import ReceiverJob, read_received
+from ertis_bench.network.sender import SMALL, SenderJob
 from ertis_bench.network.serving import Serve, accounts, expected_of, some_words
 from ertis_numba.network.messages import Group
 from ertis_numba.network.subscriber import Subscriber
@@ -38,9 +38,13 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
     options = ("--record", str(archive), "--directions", _DIRECTIONS, "--range", "0.3:1.0", "--workers", "2")
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, *options))
-        receiver = stack.enter_context(Look(address=serve.publish, diary=str(images), expected=str(expected)).start())
+        receiver = stack.enter_context(
+            ReceiverJob(address=serve.publish, diary=str(images), expected=str(expected)).start()
+        )
         receiver.wait_for("subscribed")
-        job = Job(address=serve.listen, diary=str(diary), sensors=("left", "right"), rate_hz=25.0, words=str(words))
+        job = SenderJob(
+            address=serve.listen, diary=str(diary), sensors=("left", "right"), rate_hz=25.0, words=str(words)
+        )
         sender = stack.enter_context(job.start())
         until(lambda: images.exists() and bool(read_received(images).numbers))
         seen: set[int] = set()
@@ -60,7 +64,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         sender.signal(signal.SIGTERM)
         flushed = sender.wait_for("sent")["flushed"]
         sent = read_diaries([diary])
-        settled = serve.settle(len(sent.kept))
+        acked_through = serve.settle(len(sent.kept))
         time.sleep(0.5)  # for the last image to be written down
         receiver.signal(signal.SIGTERM)
         receiver.wait()
@@ -72,7 +76,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         until(lambda: not survivors(serve.mark))
     stored = judged(folder, archive, [diary])
     return (
-        {"kills": killed, "flushed": flushed, "settled": settled, "orphans": len(survivors(serve.mark))}
+        {"kills": killed, "flushed": flushed, "acked_through": acked_through, "orphans": len(survivors(serve.mark))}
         | found
         | {name: stored[name] for name in ("stored", "lost", "missing", "silent", "left_over", "tracebacks")}
         | {"wrong": found["wrong"] + stored["wrong"], "twice": found["twice"] + stored["twice"]}
@@ -84,7 +88,7 @@ def groups(folder: Path, *, seed: int, count: int) -> Found:
     """Let a sensor miss a pulse, another see one twice, and the clock of a third be an hour wrong from a pulse on."""
     at = {"lost": count // 4, "double": count // 2, "clock": 3 * count // 4}
     begins_ns, start_s = time.time_ns(), time.monotonic() + 4.0
-    job = Job(address="", diary="", rate_hz=10.0, count=count, seed=seed, begins_ns=begins_ns)
+    job = SenderJob(address="", diary="", rate_hz=10.0, count=count, seed=seed, begins_ns=begins_ns)
     jobs = {
         "steady": job.replace(first_pulse=1000),
         "loses": job.replace(first_pulse=5, lost_pulse=at["lost"]),

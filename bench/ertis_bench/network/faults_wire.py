@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.network.busy import BUSY_S
-from ertis_bench.network.faults_kills import Record, judged
+from ertis_bench.network.faults_kills import RestartedRecorder, judged
 from ertis_bench.network.faults_links import state_of
 from ertis_bench.network.meddler import Direction, Meddler
 from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import central, until
-from ertis_bench.network.sender import Job
+from ertis_bench.network.sender import SenderJob
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.asking import Asking
 from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.status_client import Asking
 from ertis_numba.network.subscriber import Subscriber
 
 __all__ = ["flips", "gone"]
@@ -66,7 +66,9 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
                 clients.enter_context(Meddler(listening[name], seed=rng.randrange(2**32)))
                 for name in ("address", "publish") * _CABLES
             ]
-            job = Job(address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES)
+            job = SenderJob(
+                address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
+            )
             sender = clients.enter_context(
                 job.replace(keys=(str(folder / "keys" / "front.secret.toml"), server)).start()
             )
@@ -176,9 +178,9 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
         ``kills``, ``restarts`` of the central node and ``sockets left``; and what became of the measurements of
         a node that is left alone, and of those that were killed.
     """
-    record = Record(folder)
+    record = RestartedRecorder(folder)
     steady = folder / "steady.ndjson"
-    job = Job(
+    job = SenderJob(
         address=record.address, diary=str(steady), rate_hz=10.0, seed=seed, patience_s=60.0, ring_bytes=_RING_BYTES
     )
     diaries = [steady]
@@ -192,7 +194,7 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
             victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _VICTIMS))]
             diaries += victims
             _kill_while_behind(node.node_pid, job, victims)
-        until(lambda: _all_acked(steady, at_least=1))
+        until(lambda: _all_acked(steady, at_minimum=1))
         restarts = node.restarts
         sender.signal(signal.SIGTERM)
         flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
@@ -205,7 +207,7 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
     return found | {"exit code": code} | ended | judged(folder, record.archive, diaries, kept=[steady])
 
 
-def _kill_while_behind(pid: int, job: Job, diaries: list[Path]) -> None:
+def _kill_while_behind(pid: int, job: SenderJob, diaries: list[Path]) -> None:
     """Hold the loop of the central node, have nodes send all that they may, and kill them."""
     with ExitStack() as stack:
         victims = [
@@ -214,7 +216,7 @@ def _kill_while_behind(pid: int, job: Job, diaries: list[Path]) -> None:
             )
             for diary in diaries
         ]
-        until(lambda: all(_all_acked(diary, at_least=1) for diary in diaries))
+        until(lambda: all(_all_acked(diary, at_minimum=1) for diary in diaries))
         begun_s = time.monotonic()
         os.kill(pid, signal.SIGUSR1)
         until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_UNDER_WAY_S)
@@ -229,5 +231,5 @@ def _n_waiting(diary: Path) -> int:
     return len(sent.kept - sent.acked())
 
 
-def _all_acked(diary: Path, *, at_least: int) -> bool:
-    return diary.exists() and len(read_diaries([diary]).acked()) >= at_least
+def _all_acked(diary: Path, *, at_minimum: int) -> bool:
+    return diary.exists() and len(read_diaries([diary]).acked()) >= at_minimum

@@ -12,9 +12,9 @@ import numpy as np
 from ertis_bench import machine
 from ertis_bench.network.faults_kills import judged
 from ertis_bench.network.oracle import read_diaries
-from ertis_bench.network.processes import Process, central, survivors, until
-from ertis_bench.network.receiver import Look, read_received
-from ertis_bench.network.sender import SETTINGS, Job
+from ertis_bench.network.processes import JsonLinesProcess, central, survivors, until
+from ertis_bench.network.receiver import ReceiverJob, read_received
+from ertis_bench.network.sender import SETTINGS, SenderJob
 from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
 from ertis_numba import cluster
 from ertis_numba.errors import DataError
@@ -99,7 +99,7 @@ class _Load:
 
 
 def _cpu_s(pids: Sequence[int]) -> float:
-    return sum(Process.cpu_s_of(pid) for pid in pids)
+    return sum(JsonLinesProcess.cpu_s_of(pid) for pid in pids)
 
 
 def storage(
@@ -115,7 +115,7 @@ def storage(
         node = stack.enter_context(central("record", folder, "-o", str(archive), *options, mark=mark))
         address = node.wait_for("listening")["address"]
         jobs = [
-            Job(
+            SenderJob(
                 address=address,
                 diary=str(folder / f"sender-{number}.ndjson"),
                 sensors=share,
@@ -183,10 +183,12 @@ def processing(
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, "--directions", directions, *options, keys=boss))
         boss_keys = (str(folder / "keys" / "boss.secret.toml"), boss.server)
-        look = Look(address=serve.publish, diary=str(images), expected=str(expected), keys=boss_keys, credit=credit)
+        look = ReceiverJob(
+            address=serve.publish, diary=str(images), expected=str(expected), keys=boss_keys, credit=credit
+        )
         receiver = stack.enter_context(look.start())
         receiver.wait_for("subscribed")
-        job = Job(address=serve.listen, diary=str(warm), sensors=tuple(sensors), rate_hz=5.0, words=str(words))
+        job = SenderJob(address=serve.listen, diary=str(warm), sensors=tuple(sensors), rate_hz=5.0, words=str(words))
         job = job.replace(small=False, keys=given, seed=seed)
         with job.replace(count=round(5.0 * _WARM_UP_S)).start() as first:  # pipelines are made before it counts
             first.wait_for("sent", timeout_s=120.0)
@@ -257,8 +259,8 @@ def _overload(folder: Path, duration_s: float, seed: int) -> Found:
     (folder / "overload").mkdir()
     goal = "received = published + dropped; latency bounded"
     options: dict[str, Any] = {"directions": "3000", "n_sensors": 4, "goal": goal, "part": "overload 2×", "credit": 8}
-    most = processing(folder / "calibration", _CALIBRATION_S, seed, rate_hz=40.0, **options)
-    rate_hz = round(2 * 40.0 * most["published"] / max(1, most["sent"]), 1)
+    largest = processing(folder / "calibration", _CALIBRATION_S, seed, rate_hz=40.0, **options)
+    rate_hz = round(2 * 40.0 * largest["published"] / max(1, largest["sent"]), 1)
     return processing(folder / "overload", duration_s, seed, rate_hz=rate_hz, **options)
 
 
@@ -270,7 +272,7 @@ def _cluster(folder: Path, duration_s: float, seed: int) -> Found:
     options: dict[str, Any] = {"directions": "90", "n_sensors": 4, "goal": "its added latency and rate are told"}
     options["part"] = f"a dask cluster on this machine, {_CLUSTER_WORKERS} workers"
     found: dict[str, Found] = {}
-    with cluster.local(_CLUSTER_WORKERS) as scheduler:  # idle, while others work
+    with cluster.local_cluster(_CLUSTER_WORKERS) as scheduler:  # idle, while others work
         for name, where in (("here", None), ("there", scheduler)):
             for pace, lasts_s, rate_hz in (("paced", duration_s, 10.0), ("most", _CALIBRATION_S, 40.0)):
                 place = folder / f"{name}-{pace}"

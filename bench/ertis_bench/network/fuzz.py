@@ -13,7 +13,7 @@ from ertis_numba.settings import Recording, Settings
 __all__ = ["VALID", "inputs"]
 
 _MAGIC: Final = b"eRTN\x01"
-_SENSOR: Final = {"sensor": "fuzz", "epoch": 1}
+_SENSOR: Final = {"sensor": "fuzz", "session_id": 1}
 _BYTES: Final = 4 * 4096
 _SETTINGS: Final = Settings(recording=Recording(n_samples=_BYTES // 4)).to_toml().encode()
 _PRODUCTS: Final = ("energyscape", "points", "raw", "group", "status")
@@ -25,8 +25,8 @@ _FIELDS: Final[dict[str, dict[str, object]]] = {
     "gap": _SENSOR | {"first": 0, "last": 3, "reason": "fuzz"},
     "ping": {},
     "bye": {},
-    "ack": _SENSOR | {"settled": 5, "status": "stored"},
-    "welcome": _SENSOR | {"state": "storage", "acks": "stored", "window": 16, "settled": 3},
+    "ack": _SENSOR | {"acked_through": 5, "status": "stored"},
+    "welcome": _SENSOR | {"state": "storage", "acks": "stored", "window": 16, "acked_through": 3},
     "subscribe": {"products": ["energyscape", "status"], "consumed": 0, "credit": 2},
     "askstatus": {},
     "refused": {"code": "hello", "reason": "fuzz"},
@@ -93,7 +93,7 @@ def _plausible(rng: random.Random) -> list[bytes]:
     """Return a message that is well-formed, of a run that a node may know, and makes no sense."""
     number = rng.choice((0, 1, 2, 7, rng.randrange(1000), 2**31, 2**62, 2**63 - 1))
     other = rng.choice((0, number, number + 1, 2**63 - 1)) % 2**63
-    fields = {"sensor": rng.choice(("fuzz", "fuzz2")), "epoch": rng.choice((1, 1, 1, 2, 2**63 - 1))}
+    fields = {"sensor": rng.choice(("fuzz", "fuzz2")), "session_id": rng.choice((1, 1, 1, 2, 2**63 - 1))}
     match rng.randrange(6):
         case 0:
             return [_header("hello", _FIELDS["hello"] | fields | {"next_sequence": number}), _SETTINGS]

@@ -14,9 +14,9 @@ from typing import Any, Final
 from ertis_bench.network.faults_kills import judged
 from ertis_bench.network.hostile_hellos import HostileHello, hostile_hellos
 from ertis_bench.network.oracle import read_diaries
-from ertis_bench.network.processes import Process, central, until
-from ertis_bench.network.sender import Job
-from ertis_bench.network.zmtp import Peer
+from ertis_bench.network.processes import JsonLinesProcess, central, until
+from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.zmtp import ZmtpPeer
 from ertis_numba.errors import DataError
 from ertis_numba.network import messages
 
@@ -52,7 +52,7 @@ def hellos(folder: Path, *, seed: int, count: int | None = None, alone_s: float 
         options = ("--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1")
         node = stack.enter_context(central("serve", folder, *options))
         listening = node.wait_for("listening")
-        job = Job(address=listening["address"], diary=str(diary), rate_hz=rate_hz, seed=seed)
+        job = SenderJob(address=listening["address"], diary=str(diary), rate_hz=rate_hz, seed=seed)
         sender = stack.enter_context(job.start())
         until(lambda: diary.exists() and len(read_diaries([diary]).acked()) > rate_hz)
         alone_ns = time.monotonic_ns()
@@ -87,7 +87,7 @@ def _spread(given: list[HostileHello], count: int | None) -> list[HostileHello]:
 def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
     """Send hellos, one after the other, and return what became of each."""
     found: list[Found] = []
-    with Peer(address, timeout_s=_WAIT_S) as peer:
+    with ZmtpPeer(address, timeout_s=_WAIT_S) as peer:
         for hello in given:
             begun_s = time.monotonic()
             peer.send([hello.header, *hello.payload])
@@ -111,7 +111,7 @@ def _slowest_ms(diary: Path, begin_ns: int, end_ns: int) -> float:
     return round(max(times_ns, default=0) / 1e6, 1)
 
 
-def _peak_bytes(node: Process, *, reset: bool = False) -> int:
+def _peak_bytes(node: JsonLinesProcess, *, reset: bool = False) -> int:
     """Return the peak of the memory of a process and its children, since it was reset; 0 where that cannot be told."""
     total = 0
     for pid in (node.pid, *_children(node.pid)):

@@ -22,9 +22,9 @@ _SETTINGS: Final = Settings(
     recording=Recording(n_samples=32_768), processing=Processing(directions="2d:9", range_m=(0.3, 1.0))
 )
 _READ: Final = (
-    "time", "time_uncertainty", "sequence", "sync_count", "epoch", "crc32", "temperature", "humidity", "pressure",
+    "time", "time_uncertainty", "sequence", "sync_count", "session_id", "crc32", "temperature", "humidity", "pressure",
     "pdm", "settings", "microphone", "microphone_position", "microphone_enabled", "calibration_gain",
-    "calibration_delay", "call", "gap_first", "gap_last", "gap_reason", "gap_epoch",
+    "calibration_delay", "call", "gap_first", "gap_last", "gap_reason", "gap_session_id",
 )  # fmt: skip
 _ROWS: Final = 10**8
 
@@ -139,7 +139,7 @@ def _elsewhere(name: str) -> Iterator[HostileFile]:
         values = file[f"{_GROUP}/{name}"][()]
         _replace(file, name, values, chunks=np.shape(values), compression="gzip", shuffle=True)
 
-    if name not in ("settings", "gap_first", "gap_last", "gap_reason", "gap_epoch"):
+    if name not in ("settings", "gap_first", "gap_last", "gap_reason", "gap_session_id"):
         yield HostileFile(f"elsewhere: {name} is virtual", virtual)
         yield HostileFile(f"compressed: {name}", squeezed)
     if not name.startswith("gap_"):

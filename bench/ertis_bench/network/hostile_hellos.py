@@ -15,13 +15,21 @@ _MAGIC: Final = b"eRTN\x01"
 _GOOD: Final = Settings(
     recording=Recording(n_samples=32_768), processing=Processing(directions="2d:9", range_m=(0.3, 1.0))
 )
-_MOST: Final = 262_144
+_MAX: Final = 262_144
 _NUMBERS: Final = {
     "call": ("start_frequency_hz", "stop_frequency_hz", "duration_s", "sample_rate_hz", "ramp_fraction"),
     "recording": ("sample_rate_hz", "n_samples"),
     "air": ("temperature_c", "humidity_percent", "pressure_pa"),
-    "processing": ("range_decimation", "decimation", "dmas_order", "snapshots", "loading"),
-    "accuracy": ("max_error_db", "oversampling", "delay_taps", "beam_taps", "beam_density", "stop_band_db", "zones"),
+    "processing": ("range_decimation", "decimation", "dmas_order", "snapshots", "diagonal_loading"),
+    "accuracy": (
+        "max_error_db",
+        "oversampling",
+        "delay_taps",
+        "beam_taps",
+        "beam_density",
+        "stopband_attenuation_db",
+        "focal_zones",
+    ),
 }
 _EXTREMES: Final = ("nan", "inf", "-1e300", "1e300", "9" * 4000, "0x" + "f" * 4000, "9223372036854775808", "1979-05-27")
 _DIRECTIONS: Final = (
@@ -57,7 +65,7 @@ class HostileHello:
 
 def hello_header(text: bytes, **changes: Any) -> bytes:
     """Return the header of a hello whose settings are ``text``."""
-    fields = {"sensor": "bad", "epoch": 1, "next_sequence": 0, "settings_crc32": zlib.crc32(text)} | changes
+    fields = {"sensor": "bad", "session_id": 1, "next_sequence": 0, "settings_crc32": zlib.crc32(text)} | changes
     return _MAGIC + msgspec.msgpack.encode({"kind": "hello"} | fields)
 
 
@@ -70,8 +78,8 @@ def hostile_hellos() -> Iterator[HostileHello]:
         "header: name with a slash": {"sensor": "../bad"},
         "header: name of 65 characters": {"sensor": "b" * 65},
         "header: name that ends in a newline": {"sensor": "bad\n"},
-        "header: epoch below 0": {"epoch": -1},
-        "header: epoch of 64 bits": {"epoch": 2**64 - 1},
+        "header: epoch below 0": {"session_id": -1},
+        "header: epoch of 64 bits": {"session_id": 2**64 - 1},
         "header: next number of 2^63": {"next_sequence": 2**63},
         "header: translation of NaN": {"translation_m": [float("nan"), 0.0, 0.0]},
         "header: translation of infinity": {"translation_m": [float("inf"), 0.0, 0.0]},
@@ -131,7 +139,7 @@ def _texts() -> Iterator[tuple[str, str]]:
 def _shapes() -> Iterator[tuple[str, str]]:
     """Yield texts whose length, lines, depth or keys keep a parser busy."""
     end = "bogus = 1\n"
-    for count in (1_000, 25_000, _MOST - 20):
+    for count in (1_000, 25_000, _MAX - 20):
         yield f"lines: {count} blank ones", "\n" * count + end
         yield f"lines: {count} spaces", " " * count + end
         yield f"lines: {count // 2} comments", "#\n" * (count // 2) + end

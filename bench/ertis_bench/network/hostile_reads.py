@@ -22,9 +22,9 @@ __all__ = ["main"]
 
 _LOADED: Final = (
     "ertis_cli.main", "ertis_cli.verify", "ertis_cli.info", "ertis_cli.process", "ertis_numba.pipeline",
-    "ertis_numba.storage", "ertis_numba.stages.points", "ertis_numba.network.messages", "scipy.signal",
+    "ertis_numba.storage", "ertis_numba.analysis.points", "ertis_numba.network.messages", "scipy.signal",
 )  # fmt: skip
-_MOST_S: Final = 20
+_MAX_S: Final = 20
 
 
 class _Read(NamedTuple):
@@ -32,7 +32,7 @@ class _Read(NamedTuple):
     took_s: float
     cpu_s: float
     peak_bytes: int
-    said: str
+    stated: str
 
 
 def main() -> None:
@@ -60,7 +60,7 @@ def _warm(good: Path, folder: Path) -> None:
     for command in ("verify", "info"):
         read = _read(command, good, folder)
         if read.code:
-            raise SystemExit(f"ertis {command} of the file that is sound ended with {read.code}: {read.said}")
+            raise SystemExit(f"ertis {command} of the file that is sound ended with {read.code}: {read.stated}")
 
 
 def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read]) -> list[dict[str, Any]]:
@@ -68,7 +68,7 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
     path.unlink(missing_ok=True)
     each.make(good, path)
     found = []
-    for command, least in floor.items():
+    for command, smallest in floor.items():
         if command in each.harmless_to:
             continue
         read = _read(command, path, folder)
@@ -76,10 +76,10 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
             {
                 "name": f"{command}: {each.name}",
                 "code": read.code,
-                "took_s": max(0.0, read.took_s - least.took_s),
-                "cpu_s": max(0.0, read.cpu_s - least.cpu_s),
-                "grew_mb": max(0.0, (read.peak_bytes - least.peak_bytes) / 1e6),
-                "said": read.said,
+                "took_s": max(0.0, read.took_s - smallest.took_s),
+                "cpu_s": max(0.0, read.cpu_s - smallest.cpu_s),
+                "grew_mb": max(0.0, (read.peak_bytes - smallest.peak_bytes) / 1e6),
+                "said": read.stated,
             }
         )
     return found
@@ -87,16 +87,16 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
 
 def _read(command: str, path: Path, folder: Path) -> _Read:
     """Run a command on a file in a process of its own."""
-    said, out = folder / "said.txt", folder / "image.h5"
+    stated, out = folder / "said.txt", folder / "image.h5"
     out.unlink(missing_ok=True)
     arguments = ["ertis", command, str(path), *(["-o", str(out), "--quiet"] if command == "process" else [])]
     begun_s = time.monotonic()
     pid = os.fork()
     if not pid:
-        _become(arguments, said)
+        _become(arguments, stated)
     _, status, usage = os.wait4(pid, 0)
     took_s = time.monotonic() - begun_s
-    lines = said.read_text(errors="replace").strip().splitlines()
+    lines = stated.read_text(errors="replace").strip().splitlines()
     traceback = any(line.startswith("Traceback (most") for line in lines)
     last = lines[-1] if lines else ""
     return _Read(
@@ -108,14 +108,14 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
     )
 
 
-def _become(arguments: list[str], said: Path) -> None:
+def _become(arguments: list[str], stated: Path) -> None:
     """Run a command in this process, and end it."""
     code = 70
     try:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(_MOST_S)
+        signal.alarm(_MAX_S)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        descriptor = os.open(said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
+        descriptor = os.open(stated, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
         for stream in (1, 2):
             os.dup2(descriptor, stream)
         sys.argv = arguments
@@ -143,7 +143,7 @@ def _summary(chosen: list[HostileFile], reads: list[dict[str, Any]]) -> dict[str
         "files": len(chosen),
         "reads": len(reads),
         "taken": [read["name"] for read in reads if read["code"] == 0],
-        "failed": [f"{read['name']}: {read['said']}" for read in reads if read["said"].startswith("Traceback")],
+        "failed": [f"{read['name']}: {read['stated']}" for read in reads if read["said"].startswith("Traceback")],
         "crashes": [f"{read['name']}: {read['code']}" for read in reads if read["code"] < 0],
         "slowest, s": round(slowest["took_s"], 3),
         "slowest": slowest["name"],

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, Self
 
-from ertis_bench.network.zmtp import GREETING, Frame, Frames, host_and_port
+from ertis_bench.network.zmtp import GREETING, ZmtpFrame, ZmtpFrameParser, host_and_port
 
 __all__ = ["ACKS", "Direction", "Meddler", "Odds"]
 
@@ -21,12 +21,12 @@ _SHARE_OF_HEAD: Final = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Odds:
-    """What becomes of a kind of message: the share that is lost, repeated, and delayed, by up to ``most_s``."""
+    """What becomes of a kind of message: the share that is lost, repeated, and delayed, by up to ``max_s``."""
 
     lose: float = 0.0
     repeat: float = 0.0
     delay: float = 0.0
-    most_s: float = 0.3
+    max_s: float = 0.3
 
 
 ACKS: Final = {"ack": Odds(lose=0.25, repeat=0.25, delay=0.25), "welcome": Odds(lose=0.1, repeat=0.1)}
@@ -109,7 +109,7 @@ class Meddler:
 
     def _relay(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
         """Pass on one direction of a connection until it ends."""
-        frames, greeted, body, turn = Frames(), 0, list[Frame](), threading.Lock()
+        frames, greeted, body, turn = ZmtpFrameParser(), 0, list[ZmtpFrame](), threading.Lock()
         with contextlib.suppress(OSError):
             while data := source.recv(_READ_BYTES):
                 self._plugged.wait()
@@ -128,7 +128,7 @@ class Meddler:
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
 
-    def _pass(self, sink: socket.socket, body: list[Frame], turn: threading.Lock, direction: Direction) -> None:
+    def _pass(self, sink: socket.socket, body: list[ZmtpFrame], turn: threading.Lock, direction: Direction) -> None:
         data = b"".join(frame.encode() for frame in body)
         if self._flips[direction] > 0:
             self._flips[direction] -= 1
@@ -147,7 +147,7 @@ class Meddler:
             if what == "lose":
                 return
             if what == "delay":
-                _later(self._random.uniform(0.0, odds.most_s), sink, data, turn)
+                _later(self._random.uniform(0.0, odds.max_s), sink, data, turn)
                 return
             _send(sink, data, turn)
         _send(sink, data, turn)

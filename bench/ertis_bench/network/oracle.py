@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from ertis_bench.network.diary import Key, Row
+from ertis_bench.network.diary import DiaryKey, Row
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement
-from ertis_numba.storage import Gap, open_recording, sensor_names
+from ertis_numba.storage import RecordingGap, open_recording, sensor_names
 
 __all__ = ["Archived", "Sent", "compare", "note", "read_diaries", "read_folder"]
 
@@ -35,7 +35,7 @@ class Sent:
         When all of it was there, at the sender.
     kept : set of Key
         What was accepted.
-    settled : dict of (sensor, epoch) to int
+    acked_through : dict of (sensor, epoch) to int
         The highest number that was acked, and all before it.
     acked_ns : dict of Key to int
         When the first ack that covers it came.
@@ -44,17 +44,17 @@ class Sent:
     dropped : dict of Key to str
     """
 
-    offered: dict[Key, Row] = field(default_factory=dict)
-    arrived_ns: dict[Key, int] = field(default_factory=dict)
-    kept: set[Key] = field(default_factory=set)
-    settled: dict[tuple[str, int], int] = field(default_factory=dict)
-    acked_ns: dict[Key, int] = field(default_factory=dict)
+    offered: dict[DiaryKey, Row] = field(default_factory=dict)
+    arrived_ns: dict[DiaryKey, int] = field(default_factory=dict)
+    kept: set[DiaryKey] = field(default_factory=set)
+    acked_through: dict[tuple[str, int], int] = field(default_factory=dict)
+    acked_ns: dict[DiaryKey, int] = field(default_factory=dict)
     statuses: Counter[str] = field(default_factory=Counter)
-    dropped: dict[Key, str] = field(default_factory=dict)
+    dropped: dict[DiaryKey, str] = field(default_factory=dict)
 
-    def acked(self) -> set[Key]:
+    def acked(self) -> set[DiaryKey]:
         """Return the measurements that were acked."""
-        return {key for key in self.kept if key.sequence <= self.settled.get((key.sensor, key.epoch), -1)}
+        return {key for key in self.kept if key.sequence <= self.acked_through.get((key.sensor, key.session_id), -1)}
 
     def ack_times_ms(self) -> list[float]:
         """Return how long each ack took, from the arrival of the measurement at the sender."""
@@ -71,22 +71,22 @@ def read_diaries(paths: Iterable[Path]) -> Sent:
     return sent
 
 
-def note(sent: Sent, what: str, sensor: str, epoch: int, number: int, *rest: int | str) -> None:
+def note(sent: Sent, what: str, sensor: str, session_id: int, number: int, *rest: int | str) -> None:
     """Take note of one line of a diary."""
-    key = Key(sensor, epoch, number)
+    key = DiaryKey(sensor, session_id, number)
     match what, rest:
         case "offered", (int(crc32), int(sync_count), int(timestamp_ns), int(monotonic_ns)):
             sent.offered[key] = Row(crc32, sync_count, timestamp_ns)
             sent.arrived_ns[key] = monotonic_ns
         case "kept", ():
             sent.kept.add(key)
-        case "settled", (str(status), int(monotonic_ns)):
-            before = sent.settled.get((sensor, epoch), -1)
+        case "acked_through", (str(status), int(monotonic_ns)):
+            before = sent.acked_through.get((sensor, session_id), -1)
             for sequence in range(before + 1, number + 1):
-                acked = Key(sensor, epoch, sequence)
+                acked = DiaryKey(sensor, session_id, sequence)
                 if acked in sent.arrived_ns:
                     sent.acked_ns[acked] = monotonic_ns
-            sent.settled[sensor, epoch] = max(before, number)
+            sent.acked_through[sensor, session_id] = max(before, number)
             sent.statuses[status] += 1
         case "dropped", (str(reason),):
             sent.dropped[key] = reason
@@ -105,16 +105,18 @@ class Archived:
         Names of files: those that were read; those that could not be; those that ought to be gone.
     """
 
-    rows: dict[Key, list[Row]] = field(default_factory=lambda: defaultdict(list))
-    gaps: dict[tuple[str, int], list[Gap]] = field(default_factory=lambda: defaultdict(list))
+    rows: dict[DiaryKey, list[Row]] = field(default_factory=lambda: defaultdict(list))
+    gaps: dict[tuple[str, int], list[RecordingGap]] = field(default_factory=lambda: defaultdict(list))
     recordings: list[str] = field(default_factory=list)
     broken: list[str] = field(default_factory=list)
     left_over: list[str] = field(default_factory=list)
 
-    def reason(self, key: Key) -> str | None:
+    def reason(self, key: DiaryKey) -> str | None:
         """Return why a measurement is missing, None where no recording tells."""
         reasons = [
-            gap.reason for gap in self.gaps.get((key.sensor, key.epoch), ()) if gap.first <= key.sequence <= gap.last
+            gap.reason
+            for gap in self.gaps.get((key.sensor, key.session_id), ())
+            if gap.first <= key.sequence <= gap.last
         ]
         return next((reason for reason in reasons if reason != _UNTOLD), None)
 
@@ -130,7 +132,7 @@ def read_folder(folder: Path) -> Archived:
         try:
             for sensor, measurement in _measurements(path, found):
                 stamp = measurement.stamp
-                found.rows[Key(sensor, stamp.epoch, stamp.sequence)].append(Row.of(measurement))
+                found.rows[DiaryKey(sensor, stamp.session_id, stamp.sequence)].append(Row.of(measurement))
         except (ErtisError, OSError) as error:
             found.broken.append(f"{path.name}: {error}")
         else:
@@ -142,12 +144,12 @@ def _measurements(path: Path, found: Archived) -> Iterator[tuple[str, Measuremen
     for sensor in sensor_names(path):
         with open_recording(path, sensor=sensor) as recording:
             for gap in recording.gaps:
-                found.gaps[sensor, gap.epoch].append(gap)
+                found.gaps[sensor, gap.session_id].append(gap)
             for measurement in recording:
                 yield sensor, measurement
 
 
-def compare(sent: Sent, archived: Archived, promised: AbstractSet[Key]) -> dict[str, int]:
+def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> dict[str, int]:
     """Say what is wrong.
 
     Parameters
@@ -161,7 +163,7 @@ def compare(sent: Sent, archived: Archived, promised: AbstractSet[Key]) -> dict[
     -------
     dict of str to int
         ``promised`` and ``stored``. Then what ought to be 0: of what was promised, ``lost`` without a word, and
-        ``missing`` with a reason told; ``wrong``, with other words or another time than were sent; ``twice``;
+        ``missing`` with a reason reported; ``wrong``, with other words or another time than were sent; ``twice``;
         ``unexpected``, never sent; ``silent``, numbers below the highest of a run that neither are there nor told to
         be missing; ``broken`` recordings; files ``left_over``.
     """
@@ -169,9 +171,9 @@ def compare(sent: Sent, archived: Archived, promised: AbstractSet[Key]) -> dict[
     absent = {key: archived.reason(key) for key in promised if key not in rows}
     highest: dict[tuple[str, int], int] = {}
     for key in rows:
-        run = (key.sensor, key.epoch)
+        run = (key.sensor, key.session_id)
         highest[run] = max(highest.get(run, -1), key.sequence)
-    numbers = (Key(*run, sequence) for run, last in highest.items() for sequence in range(last))
+    numbers = (DiaryKey(*run, sequence) for run, last in highest.items() for sequence in range(last))
     return {
         "promised": len(promised),
         "stored": len(rows),

@@ -17,7 +17,7 @@ from typing import Any, Final, Self
 
 from ertis_numba.errors import DataError
 
-__all__ = ["ERTIS", "Process", "ask", "central", "free_address", "survivors", "until"]
+__all__ = ["ERTIS", "JsonLinesProcess", "ask", "central", "free_address", "survivors", "until"]
 
 ERTIS: Final = (sys.executable, "-m", "ertis_cli")
 _WAIT_S: Final = 60.0  # for anything that ought to happen by itself
@@ -27,13 +27,13 @@ _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 10
 Event = dict[str, Any]
 
 
-class Process:
+class JsonLinesProcess:
     """A process that tells what happens by lines of JSON on stdout; use it in a ``with`` statement.
 
     Parameters
     ----------
     command : sequence of str
-    said : Path
+    stated : Path
         Where what it says on stderr is appended.
     mark : str
         By which `survivors` finds it, and what it has started.
@@ -44,13 +44,13 @@ class Process:
         What it has told so far.
     """
 
-    def __init__(self, command: Sequence[str], *, said: Path, mark: str = "") -> None:
+    def __init__(self, command: Sequence[str], *, stated: Path, mark: str = "") -> None:
         paths = os.pathsep.join(filter(None, sys.path))
         environment = os.environ | {"PYTHONPATH": paths, _MARK: mark or secrets.token_hex(4)}
         self.events: list[Event] = []
-        self._said = said
+        self._reported_names = stated
         self._news = threading.Condition()
-        with said.open("ab") as stderr:
+        with stated.open("ab") as stderr:
             self._process = subprocess.Popen(  # noqa: S603  this very package
                 list(command),
                 stdin=subprocess.DEVNULL,
@@ -94,7 +94,7 @@ class Process:
                 if ended or not self._news.wait(min(0.5, max(0.0, end_s - time.monotonic()))):
                     if not ended and time.monotonic() < end_s:
                         continue
-                    raise DataError(f"no event {name!r} came of {self._said.stem}; {self.last_words()}")
+                    raise DataError(f"no event {name!r} came of {self._reported_names.stem}; {self.last_words()}")
 
     def last_words(self) -> str:
         """Return how it is, and the last line that it has said."""
@@ -102,8 +102,8 @@ class Process:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
         code = self._process.poll()
-        said = self._said.read_text(errors="replace").strip().splitlines()
-        return f"it {'runs' if code is None else f'ended with {code}'}, saying {said[-1] if said else 'nothing'!r}"
+        stated = self._reported_names.read_text(errors="replace").strip().splitlines()
+        return f"it {'runs' if code is None else f'ended with {code}'}, saying {stated[-1] if stated else 'nothing'!r}"
 
     def ends_within(self, time_s: float) -> bool:
         """Wait for some time, and return whether it has ended."""
@@ -138,7 +138,7 @@ class Process:
         try:
             code = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
-            raise DataError(f"{self._said.stem} does not end within {timeout_s:g} s") from error
+            raise DataError(f"{self._reported_names.stem} does not end within {timeout_s:g} s") from error
         self._listener.join(timeout_s)
         return code
 
@@ -197,9 +197,9 @@ def central(
     *options: str,
     listen: str = "tcp://127.0.0.1:*",
     mark: str = "",
-    most_lines: int | None = None,
+    max_lines: int | None = None,
     busy: bool = False,
-) -> Process:
+) -> JsonLinesProcess:
     """Start ``ertis record`` or ``ertis serve``, which says on ``central.txt`` in a folder what is wrong.
 
     Parameters
@@ -210,16 +210,16 @@ def central(
     *options : str
     listen : str
     mark : str
-    most_lines : int, optional
+    max_lines : int, optional
         Of its code, after which it is killed.
     busy : bool
         SIGUSR1 holds its loop, see `ertis_bench.network.busy`.
     """
-    ertis = ERTIS if most_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(most_lines))
+    ertis = ERTIS if max_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(max_lines))
     if busy:
         ertis = (sys.executable, "-m", "ertis_bench.network.busy")
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
-    return Process(line, said=folder / "central.txt", mark=mark)
+    return JsonLinesProcess(line, stated=folder / "central.txt", mark=mark)
 
 
 def free_address() -> str:

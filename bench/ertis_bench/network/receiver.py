@@ -12,14 +12,14 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network.diary import Key
-from ertis_bench.network.processes import Process
+from ertis_bench.network.diary import DiaryKey
+from ertis_bench.network.processes import JsonLinesProcess
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Product
 from ertis_numba.network.subscriber import Subscriber
 
-__all__ = ["STEP", "Look", "Received", "read_received"]
+__all__ = ["STEP", "Received", "ReceiverJob", "read_received"]
 
 STEP: Final = 61
 """Every so manieth value of an image is compared with the right one, in all of its rows and columns in turn."""
@@ -28,7 +28,7 @@ _TOLERANCE: Final = 0.1  # of the largest value: each process chooses its own pl
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class ReceiverJob:
     """What a receiver is to do.
 
     Attributes
@@ -55,10 +55,10 @@ class Look:
         """Return a copy with some fields changed."""
         return replace(self, **changes)
 
-    def start(self, *, mark: str = "") -> Process:
+    def start(self, *, mark: str = "") -> JsonLinesProcess:
         """Start it; what it says on stderr stands beside its diary."""
         command = [sys.executable, "-m", "ertis_bench.network.receiver", json.dumps(asdict(self))]
-        return Process(command, said=Path(self.diary).with_suffix(".txt"), mark=mark)
+        return JsonLinesProcess(command, stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
 @dataclass(slots=True)
@@ -77,7 +77,7 @@ class Received:
         As the publisher told with the last one.
     """
 
-    times_ms: dict[Key, float] = field(default_factory=dict)
+    times_ms: dict[DiaryKey, float] = field(default_factory=dict)
     twice: int = 0
     disordered: int = 0
     wrong: int = 0
@@ -85,7 +85,7 @@ class Received:
     dropped: int = 0
 
     @property
-    def untold(self) -> int:
+    def unrecorded(self) -> int:
         """Numbers that were left out and not told to be dropped, or the other way round."""
         return abs(max(self.numbers, default=-1) + 1 - len(self.numbers) - self.dropped)
 
@@ -96,8 +96,8 @@ def read_received(path: Path) -> Received:
     for line in path.read_bytes().splitlines(keepends=True) if path.exists() else ():
         if not line.endswith(b"\n"):
             continue
-        sensor, epoch, sequence, number, dropped, time_ns, wrong = json.loads(line)
-        key = Key(sensor, epoch, sequence)
+        sensor, session_id, sequence, number, dropped, time_ns, wrong = json.loads(line)
+        key = DiaryKey(sensor, session_id, sequence)
         found.twice += key in found.times_ms
         found.disordered += bool(found.numbers) and number <= found.numbers[-1]
         found.wrong += wrong
@@ -119,15 +119,15 @@ class _Expected:
 
     def spoilt(self, image: Energyscape) -> bool:
         """Whether an image is not that of its measurement."""
-        if image.energy.shape != self.shape:
+        if image.amplitude.shape != self.shape:
             return True
         number = image.stamp.sequence % len(self.values)
         wanted = self.values[number]
-        came = image.energy.reshape(-1)[number % STEP :: STEP][: len(wanted)]
+        came = image.amplitude.reshape(-1)[number % STEP :: STEP][: len(wanted)]
         return bool(np.abs(came - wanted).max() > _TOLERANCE * np.abs(wanted).max())
 
 
-def main(look: Look) -> None:
+def main(look: ReceiverJob) -> None:
     """Receive until SIGTERM comes, or for ever."""
     keys = None if look.keys is None else ClientKeys(pair=KeyPair.load(Path(look.keys[0])), server=look.keys[1])
     expected = None if look.expected is None else _Expected.load(look.expected)
@@ -137,10 +137,10 @@ def main(look: Look) -> None:
         products=look.products,
         keys=keys,
         credit=look.credit,
-        on_note=lambda text: _tell(event="note", text=text),
+        on_note=lambda text: _emit_event(event="note", text=text),
     )
     signal.signal(signal.SIGTERM, lambda *_: subscriber.close())
-    _tell(event="subscribed", pid=os.getpid())
+    _emit_event(event="subscribed", pid=os.getpid())
     with subscriber:
         for item in subscriber:
             now_ns = time.monotonic_ns()
@@ -150,18 +150,18 @@ def main(look: Look) -> None:
             stamp = item.stamp
             wrong = expected is not None and isinstance(item, Energyscape) and expected.spoilt(item)
             line = [
-                stamp.sensor, stamp.epoch, stamp.sequence, header.number, header.dropped,
+                stamp.sensor, stamp.session_id, stamp.sequence, header.number, header.dropped,
                 now_ns - header.monotonic_ns, wrong,
             ]  # fmt: skip
             os.write(diary, f"{json.dumps(line)}\n".encode())
             if look.waits_s:
                 time.sleep(look.waits_s)
-    _tell(event="received", **asdict(subscriber.counts))
+    _emit_event(event="received", **asdict(subscriber.counts))
 
 
-def _tell(**event: object) -> None:
+def _emit_event(**event: object) -> None:
     os.write(1, f"{json.dumps(event)}\n".encode())
 
 
 if __name__ == "__main__":
-    main(Look(**json.loads(sys.argv[1])))
+    main(ReceiverJob(**json.loads(sys.argv[1])))

@@ -20,8 +20,8 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network.diary import Diary, Key, Row
-from ertis_bench.network.processes import Process
+from ertis_bench.network.diary import Diary, DiaryKey, Row
+from ertis_bench.network.processes import JsonLinesProcess
 from ertis_bench.network.trap import set_trap
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import Entry
@@ -29,7 +29,7 @@ from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Processing, Recording, Settings
 
-__all__ = ["SETTINGS", "SMALL", "Job", "words_of"]
+__all__ = ["SETTINGS", "SMALL", "SenderJob", "words_of"]
 
 SETTINGS: Final = Settings()
 SMALL: Final = Settings(
@@ -41,7 +41,7 @@ _SYNC_OF_FIRST: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class SenderJob:
     """What a sender is to do.
 
     Attributes
@@ -70,7 +70,7 @@ class Job:
         they count twice, so that a number is left out.
     clock_step : (number, seconds), optional
         From which pulse on the clock is wrong, and by how much.
-    most_lines : int, optional
+    max_lines : int, optional
         Of code of nodes and journals, after which it is killed.
     start_s : float, optional
         When to begin, by `time.monotonic`.
@@ -94,7 +94,7 @@ class Job:
     lost_pulse: int | None = None
     double_pulse: int | None = None
     clock_step: tuple[int, float] | None = None
-    most_lines: int | None = None
+    max_lines: int | None = None
     start_s: float | None = None
 
     def replace(self, **changes: Any) -> Self:
@@ -110,46 +110,46 @@ class Job:
         """Return what runs it."""
         return [sys.executable, "-m", "ertis_bench.network.sender", json.dumps(asdict(self))]
 
-    def start(self, *, mark: str = "") -> Process:
+    def start(self, *, mark: str = "") -> JsonLinesProcess:
         """Start it; what it says on stderr stands beside its diary."""
-        return Process(self.command(), said=Path(self.diary).with_suffix(".txt"), mark=mark)
+        return JsonLinesProcess(self.command(), stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
-def words_of(base: NDArray[np.uint32], epoch: int, sequence: int) -> NDArray[np.uint32]:
+def words_of(base: NDArray[np.uint32], session_id: int, sequence: int) -> NDArray[np.uint32]:
     """Return words that no other measurement has."""
     words = base.copy()
-    words[:4] = sequence & 0xFFFFFFFF, sequence >> 32, epoch & 0xFFFFFFFF, epoch >> 32
+    words[:4] = sequence & 0xFFFFFFFF, sequence >> 32, session_id & 0xFFFFFFFF, session_id >> 32
     return words
 
 
 @dataclass(slots=True)
 class _Sender:
-    job: Job
+    job: SenderJob
     settings: Settings
     diary: Diary
-    epoch: int = field(default_factory=lambda: secrets.randbits(62))
+    session_id: int = field(default_factory=lambda: secrets.randbits(62))
     stopped: bool = False
-    seen_dropped: set[Key] = field(default_factory=set)
-    told: Counter[str] = field(default_factory=Counter)
+    seen_dropped: set[DiaryKey] = field(default_factory=set)
+    reported: Counter[str] = field(default_factory=Counter)
 
-    def settled(self, message: Any) -> None:
+    def acked_through(self, message: Any) -> None:
         """Note what the node tells to be settled."""
         now_ns = time.monotonic_ns()
-        self.diary.settled(message.sensor, message.epoch, message.settled, message.status, now_ns)
+        self.diary.acked_through(message.sensor, message.session_id, message.acked_through, message.status, now_ns)
         for sequence, reason in message.dropped:
-            self.diary.dropped(message.sensor, message.epoch, sequence, reason)
-            self.told[reason] += 1
+            self.diary.dropped(message.sensor, message.session_id, sequence, reason)
+            self.reported[reason] += 1
 
     def note(self, *texts: str) -> None:
         """Tell what the node tells."""
-        _tell(event="note", text=": ".join(texts))
+        _emit_event(event="note", text=": ".join(texts))
 
     def run(self, node: SensorNode) -> int:
         """Send, and return how many pulses that took."""
         job = self.job
         for sensor in job.sensors:
             node.add_sensor(sensor, self.settings, firmware="bench")
-        _tell(event="begun", epoch=self.epoch, pid=os.getpid())
+        _emit_event(event="begun", session_id=self.session_id, pid=os.getpid())
         rng = np.random.default_rng(job.seed)
         n_samples = self.settings.recording.n_samples
         given = np.load(job.words) if job.words else None
@@ -170,7 +170,9 @@ class _Sender:
             entries = [
                 self._entry(
                     replace(stamp, sensor=sensor),
-                    words_of(bases[sensor], self.epoch, sequence) if given is None else given[sequence % len(given)],
+                    words_of(bases[sensor], self.session_id, sequence)
+                    if given is None
+                    else given[sequence % len(given)],
                 )
                 for sensor in job.sensors
             ]
@@ -188,7 +190,7 @@ class _Sender:
         return Stamp(
             sequence=sequence,
             sync_count=job.first_pulse + sequence,
-            epoch=self.epoch,
+            session_id=self.session_id,
             timestamp_ns=start_ns + round(1e9 * pulse / job.rate_hz) + step_ns,
             timestamp_uncertainty_ns=100_000,
         )
@@ -202,12 +204,12 @@ class _Sender:
         return entry
 
 
-def _key(entry: Entry) -> Key:
+def _key(entry: Entry) -> DiaryKey:
     stamp = entry.measurement.stamp
-    return Key(stamp.sensor, stamp.epoch, stamp.sequence)
+    return DiaryKey(stamp.sensor, stamp.session_id, stamp.sequence)
 
 
-def _tell(**event: object) -> None:
+def _emit_event(**event: object) -> None:
     os.write(1, f"{json.dumps(event)}\n".encode())
 
 
@@ -215,7 +217,7 @@ def _stop(sender: _Sender, _number: int, _frame: FrameType | None) -> None:
     sender.stopped = True
 
 
-def main(job: Job) -> None:
+def main(job: SenderJob) -> None:
     """Send until the count is reached or SIGTERM comes, then wait until all is settled."""
     options: dict[str, Any] = {
         name: value for name in ("ring_bytes", "spool_bytes") if (value := getattr(job, name)) is not None
@@ -223,21 +225,21 @@ def main(job: Job) -> None:
     keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
     sender = _Sender(job, SMALL if job.small else SETTINGS, Diary(Path(job.diary)))
     signal.signal(signal.SIGTERM, partial(_stop, sender))
-    if job.most_lines is not None:
-        set_trap(job.most_lines)
+    if job.max_lines is not None:
+        set_trap(job.max_lines)
     with SensorNode(
         job.address,
         keys=keys,
         spool=None if job.spool is None else Path(job.spool),
-        on_settled=sender.settled,
+        on_acked=sender.acked_through,
         on_note=sender.note,
         **options,
     ) as node:
         sent = sender.run(node)
-        _tell(event="done", sent=sent)
+        _emit_event(event="done", sent=sent)
         flushed = node.flush(job.patience_s)
-        _tell(event="sent", sent=sent, flushed=flushed, dropped=dict(sender.told))
+        _emit_event(event="sent", sent=sent, flushed=flushed, dropped=dict(sender.reported))
 
 
 if __name__ == "__main__":
-    main(Job(**json.loads(sys.argv[1])))
+    main(SenderJob(**json.loads(sys.argv[1])))

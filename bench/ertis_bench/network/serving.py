@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench.network.oracle import Sent
-from ertis_bench.network.processes import Process, central
+from ertis_bench.network.processes import JsonLinesProcess, central
 from ertis_bench.network.receiver import STEP, Received
 from ertis_numba.frames import Measurement
 from ertis_numba.network.keys import ClientKeys
@@ -38,7 +38,7 @@ def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
 def expected_of(settings: Settings, words: NDArray[np.uint32], path: Path) -> Path:
     """Write some values of the image of each measurement into a file, computed here and now."""
     pipeline = Pipeline(settings)
-    images = [pipeline.process(Measurement(each, settings)).energy for each in words]
+    images = [pipeline.process(Measurement(each, settings)).amplitude for each in words]
     n_values = images[0].size // STEP - 1
     values = np.stack([image.reshape(-1)[number % STEP :: STEP][:n_values] for number, image in enumerate(images)])
     np.savez(path, values=values, shape=images[0].shape)
@@ -65,7 +65,7 @@ class Serve:
     latest : Status or None
     """
 
-    node: Process
+    node: JsonLinesProcess
     listen: str
     publish: str
     mark: str
@@ -114,7 +114,7 @@ def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
     dict
         ``received``, ``published`` and ``dropped`` as the central node says; ``images`` that an application has, and
         those that were ``skipped`` for it. Then what ought to be 0: ``unbalanced``, see `Serve`; ``uncounted``,
-        measurements that the central node does not count; ``untold``, images that neither came nor were told to be
+        measurements that the central node does not count; ``unrecorded``, images that neither came nor were told to be
         skipped; and images that came ``twice``, ``disordered`` or ``wrong``, or of what was never sent (``foreign``).
     """
     sensors = [] if serve.latest is None else list(serve.latest.sensors.values())
@@ -132,7 +132,7 @@ def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
         "skipped": received.dropped,
         "unbalanced": serve.unbalanced + (n_received != published + sum(dropped.values())),
         "uncounted": abs(len(sent.kept) - n_received),
-        "untold": abs(published - len(received.numbers) - received.dropped) + received.untold,
+        "untold": abs(published - len(received.numbers) - received.dropped) + received.unrecorded,
         "twice": received.twice,
         "disordered": received.disordered,
         "wrong": received.wrong,

@@ -219,7 +219,7 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
     if "most_hz" in row:
         found += (
             f"; beside workers of its own in the same run p50 {row['added_p50_ms']:+.1f} ms, p99 "
-            f"{row['added_p99_ms']:+.1f} ms; {row['most_hz']:.0f} images/s of {row['offered_hz']:.0f} that were "
+            f"{row['added_p99_ms']:+.1f} ms; {row['max_hz']:.0f} images/s of {row['offered_hz']:.0f} that were "
             f"offered, {row['most_here_hz']:.0f} by workers of its own"
         )
         cpu += "; the cluster's scheduler and workers are not counted"

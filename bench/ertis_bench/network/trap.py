@@ -21,14 +21,14 @@ _PACKAGE: Final = Path(ertis_numba.__file__).parent
 _OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "atomic.py"))
 
 
-def set_trap(most_lines: int) -> None:
+def set_trap(max_lines: int) -> None:
     """Kill this process when so many lines of nodes and journals have run, in this thread and those to come."""
     count = 0
 
     def line(_frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
         nonlocal count
         count += event == "line"
-        if count > most_lines:
+        if count > max_lines:
             os.kill(os.getpid(), signal.SIGKILL)
         return line
 
@@ -40,9 +40,9 @@ def set_trap(most_lines: int) -> None:
 
 
 def _main() -> None:
-    most_lines = int(sys.argv[1])
+    max_lines = int(sys.argv[1])
     sys.argv[:2] = ["ertis"]
-    set_trap(most_lines)
+    set_trap(max_lines)
     runpy.run_module("ertis_cli", run_name="__main__")
 
 

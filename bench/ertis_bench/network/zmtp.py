@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, Self
 
-__all__ = ["GREETING", "Frame", "Frames", "Peer", "greeting", "host_and_port", "message", "ready"]
+__all__ = ["GREETING", "ZmtpFrame", "ZmtpFrameParser", "ZmtpPeer", "greeting", "host_and_port", "message", "ready"]
 
 _MORE, _LONG, _COMMAND = 1, 2, 4
 _SIGNATURE: Final = b"\xff" + bytes(8) + b"\x7f"
@@ -23,7 +23,7 @@ def greeting(mechanism: bytes = b"NULL", *, as_server: bool = False) -> bytes:
 GREETING: Final = greeting()
 
 
-class Frame(NamedTuple):
+class ZmtpFrame(NamedTuple):
     """A frame as it was on the wire."""
 
     flags: int
@@ -48,12 +48,12 @@ class Frame(NamedTuple):
 
 
 @dataclass(slots=True)
-class Frames:
+class ZmtpFrameParser:
     """Takes bytes as they come, and gives the frames in them."""
 
     _data: bytearray = field(default_factory=bytearray)
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[ZmtpFrame]:
         """Return the frames that are complete now."""
         self._data += data
         found, place = [], 0
@@ -65,7 +65,7 @@ class Frames:
             size = struct.unpack_from(">Q", self._data, place + 1)[0] if flags & _LONG else self._data[place + 1]
             if len(self._data) - place < head + size:
                 break
-            found.append(Frame(flags, bytes(self._data[place + head : place + head + size])))
+            found.append(ZmtpFrame(flags, bytes(self._data[place + head : place + head + size])))
             place += head + size
         del self._data[:place]
         return found
@@ -74,7 +74,7 @@ class Frames:
 def message(frames: Sequence[bytes]) -> bytes:
     """Return the bytes of a message."""
     last = len(frames) - 1
-    return b"".join(Frame(_MORE * (number < last), body).encode() for number, body in enumerate(frames))
+    return b"".join(ZmtpFrame(_MORE * (number < last), body).encode() for number, body in enumerate(frames))
 
 
 def ready(socket_type: bytes = b"DEALER", identity: bytes = b"", extra: Iterable[tuple[bytes, bytes]] = ()) -> bytes:
@@ -83,7 +83,7 @@ def ready(socket_type: bytes = b"DEALER", identity: bytes = b"", extra: Iterable
     body = b"\x05READY" + b"".join(
         bytes([len(name)]) + name + struct.pack(">I", len(value)) + value for name, value in pairs
     )
-    return Frame(_COMMAND, body).encode()
+    return ZmtpFrame(_COMMAND, body).encode()
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -92,7 +92,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     return host, int(port)
 
 
-class Peer:
+class ZmtpPeer:
     """A socket that has shaken hands as a DEALER without keys; use it in a ``with`` statement.
 
     Parameters
@@ -110,8 +110,8 @@ class Peer:
     """
 
     def __init__(self, address: str, *, identity: bytes = b"", timeout_s: float = 10.0) -> None:
-        self._frames = Frames()
-        self._came: list[Frame] = []
+        self._frames = ZmtpFrameParser()
+        self._came: list[ZmtpFrame] = []
         self.socket = socket.create_connection(host_and_port(address), timeout=timeout_s)
         try:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -126,8 +126,8 @@ class Peer:
             self.socket.close()
             raise
 
-    def _read(self, most: int = 65_536) -> bytes:
-        data = self.socket.recv(most)
+    def _read(self, largest: int = 65_536) -> bytes:
+        data = self.socket.recv(largest)
         if not data:
             raise ConnectionResetError("the other side has closed the connection")
         return data
@@ -150,9 +150,9 @@ class Peer:
                     return body
             self._came = self._frames.feed(self._read())
 
-    def _answer(self, frame: Frame) -> None:
+    def _answer(self, frame: ZmtpFrame) -> None:
         if frame.body.startswith(b"\x04PING"):
-            self.socket.sendall(Frame(_COMMAND, b"\x04PONG" + frame.body[7:]).encode())
+            self.socket.sendall(ZmtpFrame(_COMMAND, b"\x04PONG" + frame.body[7:]).encode())
 
     def __enter__(self) -> Self:
         return self

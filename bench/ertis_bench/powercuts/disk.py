@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
-from ertis_bench.powercuts.log import Kind, Record
+from ertis_bench.powercuts.log import DiskOperation, DiskRecord
 
 __all__ = ["Disk", "Order"]
 
@@ -23,7 +23,7 @@ _KEEP: Final = (0.0, 0.1, 0.5, 0.9, 1.0)
 
 
 @dataclass(slots=True, eq=False)
-class _File:
+class _FileState:
     durable: bytearray = field(default_factory=bytearray)
     pending: list[tuple[int, int, bytes | None]] = field(default_factory=list)
     """Time, offset and data; without data, a truncation."""
@@ -74,9 +74,9 @@ class _Change:
     time: int
     gone: str
     target: str = ""
-    file: _File | None = None
+    file: _FileState | None = None
 
-    def apply(self, names: dict[str, _File | None]) -> None:
+    def apply(self, names: dict[str, _FileState | None]) -> None:
         if self.gone:
             names.pop(self.gone, None)
         if self.target:
@@ -92,7 +92,7 @@ class _Names:
 
     def __init__(self, order: Order) -> None:
         self._order: Final = order
-        self._durable: dict[str, _File | None] = {}
+        self._durable: dict[str, _FileState | None] = {}
         self._pending: list[_Change] = []
 
     def add(self, change: _Change) -> None:
@@ -110,7 +110,7 @@ class _Names:
                 left.append(change)
         self._pending = left
 
-    def after_cut(self, rng: random.Random) -> dict[str, _File | None]:
+    def after_cut(self, rng: random.Random) -> dict[str, _FileState | None]:
         names = dict(self._durable)
         kept = self._pending
         if self._order == "journal":
@@ -134,37 +134,37 @@ class Disk:
     def __init__(self, folder: Path) -> None:
         self._folder: Final = str(folder.resolve())
         self._time = 0
-        self._files: dict[int, _File] = {}
-        self._live: dict[str, _File | None] = {}
+        self._files: dict[int, _FileState] = {}
+        self._live: dict[str, _FileState | None] = {}
         self._names: Final[dict[Order, _Names]] = {"any": _Names("any"), "journal": _Names("journal")}
         self._syncs: dict[tuple[int, int, str], int] = {}
 
-    def take(self, record: Record) -> None:
+    def take(self, record: DiskRecord) -> None:
         """Let the next record happen."""
         self._time += 1
         path = record.path
         match record.kind:
-            case Kind.CREATE:
-                file = self._files[record.inode] = _File()
+            case DiskOperation.CREATE:
+                file = self._files[record.inode] = _FileState()
                 self._change("", path, file)
-            case Kind.WRITE | Kind.TRUNCATE:
-                data = record.data if record.kind is Kind.WRITE else None
+            case DiskOperation.WRITE | DiskOperation.TRUNCATE:
+                data = record.data if record.kind is DiskOperation.WRITE else None
                 self._file(record.inode).pending.append((self._time, record.offset, data))
-            case Kind.SYNC_BEGIN:
+            case DiskOperation.SYNC_BEGIN:
                 self._syncs[record.pid, record.inode, path] = self._time
-            case Kind.SYNC_END | Kind.SYNC_FAIL:
+            case DiskOperation.SYNC_END | DiskOperation.SYNC_FAIL:
                 before = self._syncs.pop((record.pid, record.inode, path))
                 self._sync(record, before)
-            case Kind.RENAME:
+            case DiskOperation.RENAME:
                 self._change(path, record.data.decode(errors="surrogateescape"), self._live.get(path))
-            case Kind.UNLINK | Kind.RMDIR:
+            case DiskOperation.UNLINK | DiskOperation.RMDIR:
                 self._change(path, "", None)
-            case Kind.MKDIR:
+            case DiskOperation.MKDIR:
                 self._change("", path, None)
 
-    def _sync(self, record: Record, before: int) -> None:
+    def _sync(self, record: DiskRecord, before: int) -> None:
         is_folder = bool(record.offset)
-        if record.kind is Kind.SYNC_FAIL:
+        if record.kind is DiskOperation.SYNC_FAIL:
             if not is_folder:
                 self._file(record.inode).fail(before)
             return
@@ -173,10 +173,10 @@ class Disk:
         for names in self._names.values():
             names.sync(record.path if is_folder else None, before)
 
-    def _file(self, inode: int) -> _File:
-        return self._files.setdefault(inode, _File())
+    def _file(self, inode: int) -> _FileState:
+        return self._files.setdefault(inode, _FileState())
 
-    def _change(self, gone: str, target: str, file: _File | None) -> None:
+    def _change(self, gone: str, target: str, file: _FileState | None) -> None:
         change = _Change(self._time, gone, target, file)
         change.apply(self._live)
         for names in self._names.values():

@@ -12,13 +12,13 @@ from typing import Final, NamedTuple
 
 from ertis_numba.errors import DataError
 
-__all__ = ["Kind", "Record", "build", "environment", "read"]
+__all__ = ["DiskOperation", "DiskRecord", "build", "environment", "read"]
 
 _SOURCE: Final = Path(__file__).with_name("disklog.c")
 _ENTRY: Final = struct.Struct("=IIQQII")
 
 
-class Kind(IntEnum):
+class DiskOperation(IntEnum):
     """Kinds of records; the numbers are those of ``disklog.c``."""
 
     CREATE = 1
@@ -34,7 +34,7 @@ class Kind(IntEnum):
     ACK = 11
 
 
-class Record(NamedTuple):
+class DiskRecord(NamedTuple):
     """One event.
 
     Attributes
@@ -47,7 +47,7 @@ class Record(NamedTuple):
         What was written or acknowledged, or the new name.
     """
 
-    kind: Kind
+    kind: DiskOperation
     pid: int
     inode: int
     offset: int
@@ -102,7 +102,7 @@ def environment(
     return os.environ | chosen
 
 
-def read(log: Path) -> Iterator[Record]:
+def read(log: Path) -> Iterator[DiskRecord]:
     """Yield the records of a log; a last one that was cut short is none."""
     content = log.read_bytes()
     place = 0
@@ -112,7 +112,12 @@ def read(log: Path) -> Iterator[Record]:
         end = place + n_path + n_data
         if end > len(content):
             return
-        yield Record(
-            Kind(kind), pid, inode, offset, os.fsdecode(content[place : place + n_path]), content[place + n_path : end]
+        yield DiskRecord(
+            DiskOperation(kind),
+            pid,
+            inode,
+            offset,
+            os.fsdecode(content[place : place + n_path]),
+            content[place + n_path : end],
         )
         place = end

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
-from ertis_bench.network.diary import Key, Row
+from ertis_bench.network.diary import DiaryKey, Row
 from ertis_bench.network.oracle import Archived, Sent, compare, read_folder
 from ertis_bench.network.processes import ask
 from ertis_numba.errors import ErtisError
 from ertis_numba.journal import SUFFIX
-from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger
-from ertis_numba.network.central_node._shelf import Shelf
+from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.sensor_node._disk import DiskSpool
 from ertis_numba.storage.sealing import seal
 
@@ -41,15 +41,19 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
     folder = disk / "recordings"
     if not folder.is_dir():
         return _found(compare(sent, Archived(), sent.acked()), failed=0)
-    settled: dict[Run, int] = {}
+    acked_through: dict[SensorSession, int] = {}
     if by_command or rng.random() < 0.3:
         failed = _recover(folder, by_command=by_command)
     else:
-        failed, settled = _start(folder)
+        failed, acked_through = _start(folder)
     archived = _read(folder)
     found = compare(sent, archived, sent.acked())
     # A sensor node discards measurements that are reported as stored.
-    claimed = {Key(run.sensor, run.epoch, sequence) for run, last in settled.items() for sequence in range(last + 1)}
+    claimed = {
+        DiaryKey(run.sensor, run.session_id, sequence)
+        for run, last in acked_through.items()
+        for sequence in range(last + 1)
+    }
     lost = sum(key not in archived.rows and archived.reason(key) is None for key in claimed - sent.acked())
     found["lost"] += lost
     return _found(found, failed=failed)
@@ -62,16 +66,16 @@ def _read(folder: Path) -> Archived:
     return archived
 
 
-def _start(folder: Path) -> tuple[int, dict[Run, int]]:
+def _start(folder: Path) -> tuple[int, dict[SensorSession, int]]:
     """Take a folder up as a central node does, and return how many errors there were and what it knows of runs."""
     try:
-        shelf = Shelf(folder, "recording", Ledger(folder), lambda _: None)
-        settled = dict(shelf.settled)
-        journals = shelf.hand_on()
-        shelf.close()
+        journal_store = JournalStore(folder, "recording", Ledger(folder), lambda _: None)
+        acked_through = dict(journal_store.acked_through)
+        journals = journal_store.hand_on()
+        journal_store.close()
     except (ErtisError, OSError):
         return 1, {}
-    return sum(_fails(seal, path) for path in journals), settled
+    return sum(_fails(seal, path) for path in journals), acked_through
 
 
 def _recover(folder: Path, *, by_command: bool) -> int:
@@ -92,7 +96,7 @@ def _fails(act: Callable[[Path], object], path: Path) -> bool:
 def recover_spool(disk: Path, sent: Sent) -> Found:
     """Take a spool up as a sensor node does when it starts, and look for all that the central node does not have."""
     notes: list[str] = []
-    held: dict[Key, list[Row]] = {}
+    held: dict[DiaryKey, list[Row]] = {}
     folder = disk / "spool"
     if folder.is_dir():
         spool = DiskSpool(folder, _SPOOL_RING_BYTES, None, on_note=notes.append)
@@ -102,8 +106,8 @@ def recover_spool(disk: Path, sent: Sent) -> Found:
                 for item in list(run.items):
                     entry = spool.entry(item, run)
                     if entry is not None:
-                        stamp, words = entry.measurement.stamp, entry.measurement.words
-                        key = Key(stamp.sensor, stamp.epoch, stamp.sequence)
+                        stamp, words = entry.measurement.stamp, entry.measurement.data
+                        key = DiaryKey(stamp.sensor, stamp.session_id, stamp.sequence)
                         held.setdefault(key, []).append(
                             Row(zlib.crc32(words.data), stamp.sync_count, stamp.timestamp_ns)
                         )

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench import captures
-from ertis_bench.network.diary import Key, Row
+from ertis_bench.network.diary import DiaryKey, Row
 from ertis_bench.network.oracle import Sent, note
-from ertis_bench.network.processes import ERTIS, Process, free_address
-from ertis_bench.network.sender import Job
-from ertis_bench.powercuts.log import Kind, Record, environment
+from ertis_bench.network.processes import ERTIS, JsonLinesProcess, free_address
+from ertis_bench.network.sender import SenderJob
+from ertis_bench.powercuts.log import DiskOperation, DiskRecord, environment
 from ertis_numba.errors import DataError
 
 __all__ = ["Acknowledged", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
@@ -75,24 +75,24 @@ class Acknowledged:
     sent: Sent = field(default_factory=Sent)
     _lines: dict[int, bytes] = field(default_factory=dict)
 
-    def take(self, record: Record) -> None:
+    def take(self, record: DiskRecord) -> None:
         """Take note of the next record."""
-        if record.kind is not Kind.ACK:
+        if record.kind is not DiskOperation.ACK:
             return
         *lines, self._lines[record.pid] = (self._lines.get(record.pid, b"") + record.data).split(b"\n")
         for line in lines:
             try:
-                told = json.loads(line)
+                reported = json.loads(line)
             except ValueError:
                 continue
-            if isinstance(told, list):
-                note(self.sent, *told)
-            elif told.get("event") == "stored" and "crc32" in told:
-                key = Key(told["sensor"], told["epoch"], told["sequence"])
-                self.sent.offered[key] = Row(told["crc32"], told["sync_count"], told["timestamp_ns"])
+            if isinstance(reported, list):
+                note(self.sent, *reported)
+            elif reported.get("event") == "stored" and "crc32" in reported:
+                key = DiaryKey(reported["sensor"], reported["session_id"], reported["sequence"])
+                self.sent.offered[key] = Row(reported["crc32"], reported["sync_count"], reported["timestamp_ns"])
                 self.sent.kept.add(key)
-            elif told.get("event") == "discarded":  # from now on, what is left of it need not be there
-                self.sent.kept = {key for key in self.sent.kept if key.sequence > told["sequence"]}
+            elif reported.get("event") == "discarded":  # from now on, what is left of it need not be there
+                self.sent.kept = {key for key in self.sent.kept if key.sequence > reported["sequence"]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,8 +136,8 @@ def journal(setting: Setting) -> Trace:
     return Trace(setting=setting)
 
 
-def _process(setting: Setting, command: list[str], name: str = "said") -> Process:
-    return Process(command, said=setting.folder / f"{name}.txt")
+def _process(setting: Setting, command: list[str], name: str = "said") -> JsonLinesProcess:
+    return JsonLinesProcess(command, stated=setting.folder / f"{name}.txt")
 
 
 def central(setting: Setting, command: str) -> Trace:
@@ -163,10 +163,10 @@ def central(setting: Setting, command: str) -> Trace:
     return Trace(setting=setting)
 
 
-def _job(setting: Setting, address: str, diary: Path, **options: Any) -> Job:
+def _job(setting: Setting, address: str, diary: Path, **options: Any) -> SenderJob:
     rate_hz = random.Random(setting.seed).choice((20.0, 50.0, 200.0))  # noqa: S311  nothing is secret
     chosen = {"seed": setting.seed, "count": setting.count, "rate_hz": rate_hz, "patience_s": _PATIENCE_S}
-    return Job(address=address, diary=str(diary), **chosen | options)
+    return SenderJob(address=address, diary=str(diary), **chosen | options)
 
 
 def spool(setting: Setting) -> Trace:

@@ -120,8 +120,8 @@ def _cut(
 ) -> None:
     """Cut the power at moments of a run, recover, and count what is wrong."""
     records = list(logs.read(trace.setting.log))
-    acks = [place for place, record in enumerate(records) if record.kind is logs.Kind.ACK]
-    found["failed_syncs"] += sum(record.kind is logs.Kind.SYNC_FAIL for record in records)
+    acks = [place for place, record in enumerate(records) if record.kind is logs.DiskOperation.ACK]
+    found["failed_syncs"] += sum(record.kind is logs.DiskOperation.SYNC_FAIL for record in records)
     moments: Counter[int] = Counter()
     for _ in range(count):
         after_ack = acks and rng.random() < _AFTER_ACK

@@ -18,7 +18,7 @@ from ertis_numba.journal import SUFFIX, Entry, Journal
 from ertis_numba.settings import Recording, Settings
 
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
-_SENSOR, _EPOCH = "front", 7
+_SENSOR, _SESSION_ID = "front", 7
 _LONG, _SHORT = 34, 3  # measurements of a commit; 34 are more than 4 MB
 
 
@@ -36,7 +36,7 @@ def main(folder: Path, seed: int, n_commits: int) -> None:
             entries = []
             for _ in range(count):
                 words[:2] = sequence, seed & 0xFFFFFFFF
-                stamp = Stamp(sensor=_SENSOR, sequence=sequence, sync_count=sequence, epoch=_EPOCH)
+                stamp = Stamp(sensor=_SENSOR, sequence=sequence, sync_count=sequence, session_id=_SESSION_ID)
                 entries.append(Entry(Measurement(words.copy(), _SETTINGS, stamp), monotonic_ns=sequence))
                 sequence += 1
             _append(journal, entries, rng)
@@ -60,7 +60,7 @@ def _append(journal: Journal, entries: list[Entry], rng: random.Random) -> None:
             {
                 "event": "stored",
                 "sensor": stamp.sensor,
-                "epoch": stamp.epoch,
+                "session_id": stamp.session_id,
                 "sequence": stamp.sequence,
                 **row._asdict(),
             }
@@ -69,9 +69,9 @@ def _append(journal: Journal, entries: list[Entry], rng: random.Random) -> None:
 
 def _discard(journal: Journal, up_to: int) -> None:
     """Discard measurements as a spool does; from now on they may be gone."""
-    _print({"event": "discarded", "sensor": _SENSOR, "epoch": _EPOCH, "sequence": up_to})
+    _print({"event": "discarded", "sensor": _SENSOR, "session_id": _SESSION_ID, "sequence": up_to})
     try:
-        journal.discard(_SENSOR, _EPOCH, up_to)
+        journal.discard(_SENSOR, _SESSION_ID, up_to)
     except DataError:
         return
 

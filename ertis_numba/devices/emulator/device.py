@@ -21,7 +21,7 @@ from ertis_numba.devices.links import HeldLink, require_terminals
 __all__ = ["Emulator"]
 
 _SECOND_NS = 1_000_000_000
-_MOST_UNREAD = 1_000  # answers; then the device takes no more commands
+_MAX_UNREAD = 1_000  # answers; then the device takes no more commands
 _PACE_S = 2e-3  # a slow device sends portions of so long
 _CATCH_UP_NS = 20_000_000  # of what a busy machine has missed
 _PATIENCE_S = 10.0
@@ -108,8 +108,8 @@ class Emulator:
         self._wish_plugged = True
         self._back_ns: int | None = None
         self._closing = self._ended = False
-        self._woken, self._waker = os.pipe()
-        os.set_blocking(self._waker, False)
+        self._woken, self._wakeup_socket = os.pipe()
+        os.set_blocking(self._wakeup_socket, False)
         self._terminal: Terminal | None = None
         self._plug_in()
         self._thread = threading.Thread(target=self._run, name=f"emulated {name}", daemon=True)
@@ -183,7 +183,7 @@ class Emulator:
     def _wake(self) -> None:
         if not self._ended:
             with suppress(BlockingIOError):  # it has been woken often enough
-                os.write(self._waker, b"!")
+                os.write(self._wakeup_socket, b"!")
 
     def _forget(self) -> None:
         self._board = Mainboard(self._measurements, self._accepts)
@@ -202,7 +202,7 @@ class Emulator:
         if self._terminal is None:
             return
         if self._terminal.unread:
-            self._measurements.tell(self._sent, "unplugged")
+            self._measurements.notify(self._sent, "unplugged")
         self._board.lose()
         self._refused += self._board.refused
         self._forget()
@@ -222,7 +222,7 @@ class Emulator:
             self._pull_out()
             self._ended = True
             os.close(self._woken)
-            os.close(self._waker)
+            os.close(self._wakeup_socket)
             self._changed.notify_all()
 
     def _live(self) -> None:
@@ -252,7 +252,7 @@ class Emulator:
         pause_ns = self._pause_ns if board.outputs and not full else None
         due_ns = min((each for each in (board.due_ns, self._back_ns, pause_ns) if each is not None), default=None)
         master = [terminal.master]
-        return came_back, master if len(board.outputs) < _MOST_UNREAD else [], master if full else [], due_ns
+        return came_back, master if len(board.outputs) < _MAX_UNREAD else [], master if full else [], due_ns
 
     def _follow_wish(self, now_ns: int) -> bool:
         """Plug in or pull out, as was asked for; tell whether the device came back."""

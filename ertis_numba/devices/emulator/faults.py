@@ -9,13 +9,13 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.devices.blocks import FRAME_BYTES
 
-__all__ = ["KINDS", "Fault", "Faults", "Spoilt", "Stall", "Unplug"]
+__all__ = ["KINDS", "BlockFault", "Faults", "Spoilt", "Stall", "Unplug"]
 
 KINDS: Final = ("flip", "duplicate", "lose", "add", "swap", "cut", "drop", "stall", "unplug")
 """What may happen to a block, in the order in which it does."""
 
 _SHORT_READS: Final = "short_reads"
-_MOST_BYTES: Final = 4095  # of a piece, a terminal's buffer; and of a loss
+_MAX_BYTES: Final = 4095  # of a piece, a terminal's buffer; and of a loss
 _PARTS: Final = {"header": 0, "counter": 4, "footer": -4}
 _WORD: Final = 4
 
@@ -33,7 +33,7 @@ class Unplug:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class BlockFault:
     """One thing that was done to a block.
 
     Attributes
@@ -71,7 +71,7 @@ class Spoilt:
     """
 
     pieces: tuple[bytes | Stall | Unplug, ...]
-    faults: tuple[Fault, ...]
+    faults: tuple[BlockFault, ...]
 
     @property
     def note(self) -> str:
@@ -118,8 +118,8 @@ class Faults:
             [checks.between(f"probability of {kind}", kinds.get(kind, 0.0), 0.0, 1.0) for kind in KINDS]
         )
         self._longest_stall_s = checks.between("longest_stall_s", longest_stall_s, 0.0, 3600.0)
-        self._random = np.random.default_rng(checks.whole("seed", seed, 0))
-        self._faults: list[Fault] = []
+        self._random = np.random.default_rng(checks.integer("seed", seed, 0))
+        self._faults: list[BlockFault] = []
 
     def spoil(self, block: bytes) -> Spoilt:
         """Return a block as it is to be sent, and what was done to it."""
@@ -148,7 +148,7 @@ class Faults:
         return Spoilt((*pieces, *self._pieces(data[begin:])), tuple(self._faults))
 
     def _note(self, kind: str, place: int, n_bytes: int, detail: str = "") -> int:
-        self._faults.append(Fault(kind, place, n_bytes, detail))
+        self._faults.append(BlockFault(kind, place, n_bytes, detail))
         return place
 
     def _place(self, data: bytearray) -> int:
@@ -156,7 +156,7 @@ class Faults:
 
     def _length(self) -> int:
         """Return a number of bytes: each order of magnitude as often as the others."""
-        return int(_MOST_BYTES ** self._random.random())
+        return int(_MAX_BYTES ** self._random.random())
 
     def _bytes(self, count: int) -> bytes:
         return self._random.bytes(count)
@@ -209,7 +209,7 @@ class Faults:
         """Return pieces that a terminal takes at once."""
         pieces, begin = [], 0
         while begin < len(data):
-            length = int(self._random.integers(1, _MOST_BYTES + 1)) if self._short_reads else _MOST_BYTES
+            length = int(self._random.integers(1, _MAX_BYTES + 1)) if self._short_reads else _MAX_BYTES
             pieces.append(bytes(data[begin : begin + length]))
             begin += length
         return pieces

@@ -55,7 +55,7 @@ class Quirks:
 
 
 @dataclass(slots=True, eq=False)
-class _Recording:
+class _PendingRecording:
     due_ns: int
     index: int
     counter: int
@@ -91,7 +91,7 @@ class Mainboard:
         self._is_new = self._is_loaded = self._is_refused = False  # a configuration, a complete call, the configuration
         self._lines = CommandReader()
         self._left_ns: int | None = None  # when an unfinished line is taken
-        self._recording: _Recording | None = None
+        self._recording: _PendingRecording | None = None
 
     @property
     def due_ns(self) -> int | None:
@@ -128,7 +128,7 @@ class Mainboard:
         registers = self.registers
         counter = registers.counter
         registers.counter = (counter + 1) % COUNTERS
-        self._recording = _Recording(
+        self._recording = _PendingRecording(
             due_ns=at_ns + registers.duration_ns,
             index=counter if index is None else index,
             counter=counter,
@@ -156,10 +156,10 @@ class Mainboard:
             return
         self._recording = None
         if sum(bool(waiting.entry) for waiting in self.outputs) < _BUFFERED:
-            self._measurements.tell(output)
+            self._measurements.notify(output)
             self.outputs.append(output)
         else:
-            self._measurements.tell(output, "dropped")
+            self._measurements.notify(output, "dropped")
 
     def lose(self) -> None:
         """Be pulled out: log what is not going to be sent."""
@@ -167,9 +167,9 @@ class Mainboard:
         if self._recording is not None:
             waiting.append(self._output(self._recording))
         for output in waiting:
-            self._measurements.tell(output, "unplugged")
+            self._measurements.notify(output, "unplugged")
 
-    def _output(self, recording: _Recording) -> Output:
+    def _output(self, recording: _PendingRecording) -> Output:
         """Return what is to be sent of a measurement; it is made once."""
         if recording.output is None:
             recording.output = self._measurements.output(

@@ -49,7 +49,7 @@ class Measurements:
         self._words = {True: words, False: words if passive is None else passive}
         checks.instance("words", words, Sized, "has the words of each measurement")
         for given in self._words.values():
-            checks.whole("number of measurements to emulate", len(given), 1)
+            checks.integer("number of measurements to emulate", len(given), 1)
             if given[0].dtype != np.uint32 or given[0].ndim != 1:
                 raise ArgumentError(
                     f"measurements to emulate are {given[0].ndim}-dimensional {given[0].dtype}; give one uint32 word "
@@ -74,7 +74,7 @@ class Measurements:
         pieces = (memoryview(piece) if isinstance(piece, bytes) else piece for piece in spoilt.pieces)
         return Output(deque(pieces), entry | {"fault": spoilt.note})
 
-    def tell(self, output: Output, fault: str = "") -> None:
+    def notify(self, output: Output, fault: str = "") -> None:
         """Write the line of a measurement into the log, at once, with what else has happened to it."""
         if self._log is None or not output.entry:
             return

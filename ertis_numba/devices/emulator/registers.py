@@ -11,8 +11,8 @@ from ertis_numba.devices.commands import (
     DAC_RATES_HZ,
     DAC_SAMPLES,
     LENGTH_STEP,
-    MOST_NUMBER,
-    MOST_WORDS,
+    MAX_NUMBER,
+    MAX_WORDS,
     PDM_RATES_HZ,
     PINS,
     Command,
@@ -27,11 +27,11 @@ FIRMWARE = 0x00_01_00_00
 
 _DONE = 1
 _NUMBERS = {  # by command: which register takes the first number, and from where to where
-    "G": ("n_bytes", 4 * LENGTH_STEP, 4 * MOST_WORDS),
+    "G": ("n_bytes", 4 * LENGTH_STEP, 4 * MAX_WORDS),
     "F": ("clock", 0, 1),
     "D": ("dac_rate_hz", *DAC_RATES_HZ),
     "E": ("n_codes", *DAC_SAMPLES),
-    "I": ("emissions", 1, MOST_NUMBER),
+    "I": ("emissions", 1, MAX_NUMBER),
     "H": ("active", 0, 1),
     "K": ("amplifier", 0, 1),
     "B": ("counter", 0, COUNTERS - 1),

@@ -23,7 +23,7 @@ class UnpackBits(Protocol):
     Parameters
     ----------
     words : (sample, word) uint8, uint16, uint32 or uint64
-        Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
+        Channel m is bit ``m % word_bits`` (smallest significant first) of word ``m // word_bits``.
     channels : (mic,) int32
         Channel of each microphone.
     out : (mic, sample) float32

@@ -29,7 +29,7 @@ if numba.config.DISABLE_JIT:
     )
 
 
-class _Listener(event.Listener):  # type: ignore[misc]  # Numba is not looked into
+class _CompilationListener(event.Listener):  # type: ignore[misc]  # Numba is not looked into
     """Listener to what Numba compiles; what it loads from its cache is no such event."""
 
     def on_start(self, event: object) -> None:  # noqa: ARG002  as Numba calls it
@@ -40,7 +40,7 @@ class _Listener(event.Listener):  # type: ignore[misc]  # Numba is not looked in
         """Do nothing."""
 
 
-event.register("numba:compile", _Listener())
+event.register("numba:compile", _CompilationListener())
 
 _MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
 _ONE_AT_A_TIME = threading.RLock()
@@ -66,7 +66,7 @@ def threads(count: int) -> Iterator[None]:
     Numba's workqueue layer, which it falls back to without OpenMP and TBB, aborts the process when two
     threads meet in it. There, and until the layer is known, one thread runs at a time.
     """
-    checks.whole("threads", count, 1, _MAX_THREADS)
+    checks.integer("threads", count, 1, _MAX_THREADS)
     before = numba.get_num_threads()
     with contextlib.nullcontext() if _layer_is_reentrant() else _ONE_AT_A_TIME:
         numba.set_num_threads(count)

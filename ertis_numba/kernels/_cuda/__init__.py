@@ -15,7 +15,7 @@ __all__ = ["kernel_set"]
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
     """See `Threads`; one Python thread launches, and the GPU has its own."""
-    checks.whole("threads", count, 1, 1)
+    checks.integer("threads", count, 1, 1)
     yield
 
 

@@ -1,7 +1,7 @@
 """Combine the microphones with weights of least variance; the method and its equations are those of the processor's.
 
 A thread has a window of ranges. Its matrix is in memory, beside those of the other threads, number by number. The image
-is cut into groups of directions, and threads take one window after the other, so that this stays within `_MOST_BYTES`
+is cut into groups of directions, and threads take one window after the other, so that this stays within `_MAX_BYTES`
 for any image.
 """
 
@@ -17,8 +17,8 @@ from ertis_numba.kernels._scalar import imag_of, real_of
 __all__ = ["combine_capon"]
 
 _BLOCK = 64
-_MOST_BYTES = 2**25  # of the lags, and as many of the matrices
-_MOST_BLOCKS = 65_535  # along the last two axes of a grid
+_MAX_BYTES = 2**25  # of the lags, and as many of the matrices
+_MAX_BLOCKS = 65_535  # along the last two axes of a grid
 
 
 @cuda.jit(cache=True)
@@ -118,9 +118,9 @@ def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
     (n_directions, n_mics), n_ranges = offsets.shape, out.shape[1]
     n_snapshots = min(n_snapshots, n_ranges)
     of_direction, of_thread = 16 * n_ranges * (n_snapshots + 1), 16 * n_snapshots * (n_snapshots + 1)
-    group = max(1, min(_MOST_BYTES // of_direction, n_directions, _MOST_BLOCKS))
+    group = max(1, min(_MAX_BYTES // of_direction, n_directions, _MAX_BLOCKS))
     n_windows = group * (n_ranges - n_snapshots + 1)
-    n_blocks = -(-min(_MOST_BYTES // of_thread, n_windows) // _BLOCK)
+    n_blocks = -(-min(_MAX_BYTES // of_thread, n_windows) // _BLOCK)
     beams = workspace("capon's beams", (group, 2, n_ranges), np.float64)
     lags = workspace("capon's lags", (group, n_snapshots, 2, n_ranges), np.float64)
     column = workspace("capon's matrices", (n_snapshots, n_snapshots, 2, n_blocks * _BLOCK), np.float64)

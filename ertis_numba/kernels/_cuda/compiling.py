@@ -213,14 +213,14 @@ def _code(kernel: Any, types: tuple[Any, ...], cc: tuple[int, int]) -> Code:
         source.write_text(ptx, "utf-8")
         done = _run("ptxas", "-v", f"-arch=sm_{cc[0]}{cc[1]}", str(source), "-o", str(cubin))
         code = cubin.read_bytes()
-    told = done.stdout + done.stderr
+    reported = done.stdout + done.stderr
     return Code(
         ptx=ptx,
         cubin=code,
-        registers=_sum(r"Used (\d+) registers", told),
-        shared_bytes=_sum(r"(\d+) bytes smem", told),
-        stack_bytes=_sum(r"(\d+) bytes stack frame", told),
-        spill_bytes=_sum(r"(\d+) bytes spill (?:stores|loads)", told),
+        registers=_sum(r"Used (\d+) registers", reported),
+        shared_bytes=_sum(r"(\d+) bytes smem", reported),
+        stack_bytes=_sum(r"(\d+) bytes stack frame", reported),
+        spill_bytes=_sum(r"(\d+) bytes spill (?:stores|loads)", reported),
     )
 
 

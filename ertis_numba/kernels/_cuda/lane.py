@@ -19,7 +19,7 @@ SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 
 numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image is a small grid: no mistake to be told of
 
-_MOST_BLOCKS = 65_535  # along all axes of a grid but the first
+_MAX_BLOCKS = 65_535  # along all axes of a grid but the first
 
 Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
@@ -129,9 +129,9 @@ def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *argument
     DeviceError
         No grid has so many blocks.
     """
-    if max(grid[1:], default=0) > _MOST_BLOCKS:
+    if max(grid[1:], default=0) > _MAX_BLOCKS:
         raise DeviceError(
-            f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks, and {_MOST_BLOCKS:,} are the most; "
+            f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks, and {_MAX_BLOCKS:,} are the most; "
             "give a shorter processing.range_m or fewer microphones, or use device 'cpu'"
         )
     if all(grid):  # where there is nothing to do a launch would be an error

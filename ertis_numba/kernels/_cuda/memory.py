@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
-from ertis_numba.kernels._images import Images
+from ertis_numba.kernels._images import ImagePool
 from ertis_numba.kernels._memory import Array
 
 __all__ = ["CudaMemory"]
@@ -26,7 +26,7 @@ class CudaMemory:
     def __init__(self, *, graphs: bool = False) -> None:
         self._graphs = graphs
         self._bytes = 0
-        self._images = Images(lambda shape: self._pinned(shape, np.float32))
+        self._images = ImagePool(lambda shape: self._pinned(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """See `Memory.table`."""

@@ -33,7 +33,7 @@ RANGES_PER_THREAD = 4
 TILE = RANGES_PER_THREAD * WARP
 ONE, WARPS_1, WARPS_2, WARPS_3 = np.uint64(1), np.uint64(WARP), np.uint64(2 * WARP), np.uint64(3 * WARP)
 
-_MOST_INDEXED = 2**32 - 1
+_MAX_INDEXED = 2**32 - 1
 
 
 def complexes(array):
@@ -49,9 +49,9 @@ def indexed(array):
     DeviceError
         They are not.
     """
-    if array.size > _MOST_INDEXED:
+    if array.size > _MAX_INDEXED:
         raise DeviceError(
-            f"device 'cuda' would have to index {array.size:,} numbers and can {_MOST_INDEXED:,}; "
+            f"device 'cuda' would have to index {array.size:,} numbers and can {_MAX_INDEXED:,}; "
             "give a shorter record or range, or use device 'cpu'"
         )
     return array

@@ -40,7 +40,7 @@ class Acks:
         """Have a run acked the next time."""
         self._due[stream.run] = stream
 
-    def settled(self, arrived_s: float) -> None:
+    def acked_through(self, arrived_s: float) -> None:
         """Count a measurement that the next ack is the first to tell of."""
         self._arrived_s.append(arrived_s)
 
@@ -50,11 +50,17 @@ class Acks:
 
     def send(self) -> None:
         """Send those that are due."""
-        for (sensor, epoch), stream in self._due.items():
+        for (sensor, session_id), stream in self._due.items():
             if not stream.owner:
                 continue
             dropped = tuple(stream.dropped.popleft() for _ in range(min(_DROPS, len(stream.dropped))))
-            ack = Ack(sensor=sensor, epoch=epoch, settled=stream.settled, status=self._status, dropped=dropped)
+            ack = Ack(
+                sensor=sensor,
+                session_id=session_id,
+                acked_through=stream.acked_through,
+                status=self._status,
+                dropped=dropped,
+            )
             self._send(stream.owner, ack)
         self._due.clear()
         if self._arrived_s:

@@ -8,10 +8,10 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import Entry, Sensor
-from ertis_numba.network.central_node._items import Run
+from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.central_node._streams import Peer, Stream, Track, source_of
+from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
 from ertis_numba.network.central_node._volumes import same
 from ertis_numba.network.messages import Data, Hello
 from ertis_numba.settings import Settings
@@ -24,7 +24,7 @@ _PEERS: Final = 1024
 _PEERS_OF_KEY: Final = 64
 
 
-def source_in(hello: Hello, payload: list[bytes], *, most_bytes: int) -> Sensor:
+def source_in(hello: Hello, payload: list[bytes], *, max_bytes: int) -> JournalSensor:
     """Return the sensor of a greeting, or refuse what is none."""
     if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
         raise Unwanted(
@@ -35,13 +35,17 @@ def source_in(hello: Hello, payload: list[bytes], *, most_bytes: int) -> Sensor:
     if zlib.crc32(payload[0]) != hello.settings_crc32:
         raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
     try:
-        return source_of(hello, payload[0], most_bytes=most_bytes)
+        return source_of(hello, payload[0], max_bytes=max_bytes)
     except (ArgumentError, OSError) as error:
         raise Unwanted("settings", " ".join(str(error).split()), "settings") from error
 
 
 def require_room(
-    peers: Mapping[bytes, Peer], tracks: Mapping[str, Track], peer: Peer | None, run: Run, key: str
+    peers: Mapping[bytes, PeerConnection],
+    tracks: Mapping[str, SensorTrack],
+    peer: PeerConnection | None,
+    run: SensorSession,
+    key: str,
 ) -> None:
     """Refuse what is one too many; ``peer`` is None where it has not greeted, ``key`` empty where there are none."""
     if peer is None and len(peers) >= _PEERS:
@@ -54,7 +58,9 @@ def require_room(
         raise Unwanted("size", f"this central node has {_SENSORS} sensors; use another", "too many")
 
 
-def require_same(peers: Mapping[bytes, Peer], tracks: Mapping[str, Track], peer_id: bytes, source: Sensor) -> None:
+def require_same(
+    peers: Mapping[bytes, PeerConnection], tracks: Mapping[str, SensorTrack], peer_id: bytes, source: JournalSensor
+) -> None:
     """Refuse a sensor that another node sends with other settings: each measurement would begin a recording."""
     track = tracks.get(source.name)
     for other in track.peers - {peer_id} if track is not None else ():

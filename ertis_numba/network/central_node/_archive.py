@@ -12,15 +12,23 @@ from typing import Final
 from msgspec.structs import replace
 
 from ertis_numba import checks
-from ertis_numba.atomic import make_folder
+from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import SUFFIX, Sealed
-from ertis_numba.network.central_node._items import Event, Failed, Fault, Item, Resumed, Run, SealedOne
+from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger, Lock
+from ertis_numba.network.central_node._received_items import (
+    Event,
+    ReceivedItem,
+    Resumed,
+    SealedOne,
+    SealingFailed,
+    SensorSession,
+    StorageFault,
+)
 from ertis_numba.network.central_node._sealing import Sealing
-from ertis_numba.network.central_node._shelf import Shelf
 from ertis_numba.network.status import ArchiveStatus, Latencies
-from ertis_numba.network.waker import Waker
+from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Archive"]
 
@@ -67,14 +75,14 @@ class Archive:
         self._rotate_bytes = checks.between("size of a recording", rotate_bytes, 1e6, 1e15)
         self._rotate_s = checks.between("time of a recording", rotate_s, 1.0, 1e9)
         self._seal = seal
-        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[ReceivedItem | None] = queue.SimpleQueue()
         self._events: collections.deque[Event] = collections.deque()
         self._stop = threading.Event()
         self._lock: Lock | None = None
-        self._shelf: Shelf | None = None
+        self._journal_store: JournalStore | None = None
         self._sealing: Sealing | None = None
         self._thread: threading.Thread | None = None
-        self._waker: Waker | None = None
+        self._wakeup_socket: WakeupSocket | None = None
         self._commits = Latencies()
         self._snapshot = ArchiveStatus(folder=str(folder))
         self._busy_since_s: float | None = None
@@ -98,30 +106,30 @@ class Archive:
             raise DataError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
         self._lock = Lock(self.folder)
         try:
-            self._shelf = Shelf(self.folder, self._name, Ledger(self.folder), self._tell)
+            self._journal_store = JournalStore(self.folder, self._name, Ledger(self.folder), self._emit_event)
         except BaseException:
             self._lock.release()
             raise
-        self._waker = Waker()
+        self._wakeup_socket = WakeupSocket()
         if self._seal:
             self._sealing = Sealing(self._sealed, self._not_sealed)
         self._look()
-        self._thread = threading.Thread(target=self._run, args=(self._shelf,), name="archive", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(self._journal_store,), name="archive", daemon=True)
         self._thread.start()
-        return self._waker.fileno()
+        return self._wakeup_socket.fileno()
 
-    def settled(self, run: Run) -> int:
+    def acked_through(self, run: SensorSession) -> int:
         """Return the number up to which all of a run is stored or known to be missing; -1 if there is none."""
-        return -1 if self._shelf is None else self._shelf.settled.get(run, -1)
+        return -1 if self._journal_store is None else self._journal_store.acked_through.get(run, -1)
 
-    def offer(self, item: Item) -> None:
+    def offer(self, item: ReceivedItem) -> None:
         """Have something stored; returns at once."""
         self._queue.put(item)
 
     def read(self) -> list[Event]:
         """Return what has happened since; returns at once."""
-        if self._waker is not None:
-            self._waker.clear()
+        if self._wakeup_socket is not None:
+            self._wakeup_socket.clear()
         found = []
         while self._events:
             found.append(self._events.popleft())
@@ -168,37 +176,37 @@ class Archive:
         finished = self.finish(30.0)
         if self._sealing is not None and finished:
             self._sealing.close()
-        if self._waker is not None and finished:
-            self._waker.close()
-            self._waker = None
+        if self._wakeup_socket is not None and finished:
+            self._wakeup_socket.close()
+            self._wakeup_socket = None
         if self._lock is not None and finished:
             self._lock.release()
 
-    def _tell(self, event: Event) -> None:
+    def _emit_event(self, event: Event) -> None:
         self._events.append(event)
-        if self._waker is not None:
-            self._waker.wake()
+        if self._wakeup_socket is not None:
+            self._wakeup_socket.wake()
 
     def _sealed(self, sealed: Sealed) -> None:
-        self._tell(SealedOne(sealed))
+        self._emit_event(SealedOne(sealed))
 
     def _not_sealed(self, text: str) -> None:
-        self._tell(Failed(text))
+        self._emit_event(SealingFailed(text))
 
-    def _run(self, shelf: Shelf) -> None:
+    def _run(self, journal_store: JournalStore) -> None:
         while True:
             items, ends = self._next()
-            if items and not self._store(shelf, items):
+            if items and not self._store(journal_store, items):
                 ends = True  # without them: nobody was told that they are stored
-            self._tend(shelf, ends=ends)
+            self._tend(journal_store, ends=ends)
             if ends:
                 break
             self._look()
-        self._attempt(shelf.close)
+        self._attempt(journal_store.close)
 
-    def _next(self) -> tuple[list[Item], bool]:
+    def _next(self) -> tuple[list[ReceivedItem], bool]:
         """Return what to store together, and whether that was the last."""
-        items: list[Item] = []
+        items: list[ReceivedItem] = []
         n_bytes = 0
         try:
             item = self._queue.get(timeout=_LOOK_S)
@@ -212,29 +220,29 @@ class Archive:
             return items, False
         return items, True
 
-    def _store(self, shelf: Shelf, items: list[Item]) -> bool:
+    def _store(self, journal_store: JournalStore, items: list[ReceivedItem]) -> bool:
         """Store items, as often as it takes; False where it was ended before."""
-        while not self._attempt(lambda: shelf.store(items)):
+        while not self._attempt(lambda: journal_store.store(items)):
             if self._stop.wait(_AGAIN_S):
                 return False
             self._look()
         return True
 
-    def _tend(self, shelf: Shelf, *, ends: bool) -> None:
+    def _tend(self, journal_store: JournalStore, *, ends: bool) -> None:
         """Let journals that are full become recordings."""
-        volume = shelf.volume
+        volume = journal_store.volume
         full = volume is not None and (
             volume.n_bytes >= self._rotate_bytes or time.monotonic() - volume.begun_s >= self._rotate_s
         )
-        if full or ends or shelf.to_hand_on:
-            self._attempt(lambda: self._hand_on(shelf, rotate=full or ends, ends=ends))
+        if full or ends or journal_store.to_hand_on:
+            self._attempt(lambda: self._hand_on(journal_store, rotate=full or ends, ends=ends))
 
-    def _hand_on(self, shelf: Shelf, *, rotate: bool, ends: bool) -> None:
+    def _hand_on(self, journal_store: JournalStore, *, rotate: bool, ends: bool) -> None:
         if rotate:
-            shelf.rotate()
+            journal_store.rotate()
             if not ends:  # what comes next begins a journal, for which the ledger is written anyway
                 return
-        for path in shelf.hand_on():
+        for path in journal_store.hand_on():
             if self._sealing is not None:
                 self._sealing.give(path)
 
@@ -247,27 +255,27 @@ class Archive:
             text = " ".join(str(error).split()) or type(error).__name__
             if text != self.fault:
                 self.fault = text
-                self._tell(Fault(text))
+                self._emit_event(StorageFault(text))
             return False
         finally:
             self._busy_since_s = None
         self._commits.add(1e3 * (time.monotonic() - begun_s))
         if self.fault and not self._ends:
             self.fault = ""
-            self._tell(Resumed())
+            self._emit_event(Resumed())
         return True
 
     def _look(self) -> None:
         """Note how much room there is, where that was not just done."""
         now_s = time.monotonic()
-        if now_s < self._next_look_s or self._shelf is None:
+        if now_s < self._next_look_s or self._journal_store is None:
             return
         self._next_look_s = now_s + _LOOK_S
         made = ArchiveStatus(folder=str(self.folder), commit=self._commits.percentiles())
         try:
             made.free_bytes = shutil.disk_usage(self.folder).free
             made.room_bytes = made.free_bytes // 2
-            volume = self._shelf.volume
+            volume = self._journal_store.volume
             if volume is not None:
                 made.recording = volume.path.name.removesuffix(SUFFIX)
                 made.journal_bytes = volume.path.stat().st_size

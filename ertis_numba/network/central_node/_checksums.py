@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from ertis_numba.journal import Journal
-from ertis_numba.network.central_node._items import Run
+from ertis_numba.network.central_node._received_items import SensorSession
 
 __all__ = ["Checksums"]
 
@@ -23,17 +23,17 @@ class Checksums:
         CRC-32 by run and number, from earlier processes.
     """
 
-    def __init__(self, tails: Mapping[Run, Mapping[int, int]]) -> None:
-        self._kept: OrderedDict[tuple[Run, int], int] = OrderedDict()
+    def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:
+        self._kept: OrderedDict[tuple[SensorSession, int], int] = OrderedDict()
         for run, numbers in tails.items():
             for number, crc32 in numbers.items():
                 self._kept[run, number] = crc32
 
-    def find(self, run: Run, number: int) -> int | None:
+    def find(self, run: SensorSession, number: int) -> int | None:
         """Return the CRC-32 of a measurement; None if it is not kept."""
         return self._kept.get((run, number))
 
-    def add(self, run: Run, number: int, crc32: int) -> None:
+    def add(self, run: SensorSession, number: int, crc32: int) -> None:
         """Keep the CRC-32 of a measurement that is stored."""
         self._kept[run, number] = crc32
         if len(self._kept) > _KEPT:
@@ -41,12 +41,12 @@ class Checksums:
 
     def learn(self, journal: Journal) -> None:
         """Keep the CRC-32 of the newest measurements of a journal."""
-        for sensor, epoch, number, crc32 in journal.newest(_LEARNED):
-            self.add(Run(sensor, epoch), number, crc32)
+        for sensor, session_id, number, crc32 in journal.newest(_LEARNED):
+            self.add(SensorSession(sensor, session_id), number, crc32)
 
-    def tails(self, runs: Iterable[Run]) -> dict[Run, dict[int, int]]:
+    def tails(self, runs: Iterable[SensorSession]) -> dict[SensorSession, dict[int, int]]:
         """Return the CRC-32 of the newest measurements of some runs, for the next process."""
-        found: dict[Run, dict[int, int]] = {run: {} for run in runs}
+        found: dict[SensorSession, dict[int, int]] = {run: {} for run in runs}
         for (run, number), crc32 in reversed(self._kept.items()):
             if run in found and len(found[run]) < _TAIL:
                 found[run][number] = crc32

@@ -9,9 +9,9 @@ from typing import Final
 
 from ertis_numba.network import addresses
 from ertis_numba.network.central_node._archive import Archive
-from ertis_numba.network.central_node._door import Door
 from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
+from ertis_numba.network.central_node._server_socket import ServerSocket
 from ertis_numba.network.fields import State
 from ertis_numba.network.status import Status
 
@@ -28,7 +28,7 @@ class Condition:
     ----------
     listen : str
         As it was given.
-    door : Door
+    server_socket : Door
     intake : Intake
     archive : Archive or None
     images : Guarded or None
@@ -45,9 +45,16 @@ class Condition:
     """
 
     def __init__(
-        self, listen: str, door: Door, intake: Intake, *, archive: Archive | None, images: Guarded | None, keys: bool
+        self,
+        listen: str,
+        server_socket: ServerSocket,
+        intake: Intake,
+        *,
+        archive: Archive | None,
+        images: Guarded | None,
+        keys: bool,
     ) -> None:
-        self._listen, self._door, self._intake = listen, door, intake
+        self._listen, self._server, self._intake = listen, server_socket, intake
         self._archive, self._images, self._keys = archive, images, keys
         self._report: tuple[float, bytes] = -1.0, b""
         self.begun_s = 0.0
@@ -57,7 +64,7 @@ class Condition:
     @property
     def address(self) -> str:
         """What it listens at, with its port; empty where it does not listen yet."""
-        return self._door.address and addresses.at_port(self._listen, self._door.address)
+        return self._server.address and addresses.at_port(self._listen, self._server.address)
 
     @property
     def state(self) -> State:
@@ -87,8 +94,8 @@ class Condition:
             memory_bytes=_memory_bytes(),
             peers=len(self._intake.peers),
             keys=self._keys,
-            keys_note=self._door.note,
-            refused=dict(self._door.refused + (Counter() if self._images is None else self._images.refused())),
+            keys_note=self._server.note,
+            refused=dict(self._server.refused + (Counter() if self._images is None else self._images.refused())),
             sensors={name: track.status() for name, track in self._intake.tracks.items()},
         )
         if self._archive is not None:

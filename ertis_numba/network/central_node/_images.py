@@ -11,7 +11,7 @@ from ertis_numba.network.messages import Data, Hello
 from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
 from ertis_numba.settings import Settings
 
-__all__ = ["Guarded", "Images"]
+__all__ = ["Guarded", "ImageProducer"]
 
 _Result = TypeVar("_Result")
 
@@ -26,7 +26,7 @@ class ImageCounts(Protocol):
     latency: Percentiles
 
 
-class Images(Protocol):
+class ImageProducer(Protocol):
     """What makes images, as `ertis_numba.network.processing.Processing` does."""
 
     @property
@@ -36,7 +36,7 @@ class Images(Protocol):
     def start(self, stopping: Callable[[], bool]) -> None:
         """Start; return early once ``stopping`` returns True."""
 
-    def know(self, hello: Hello, settings: Settings) -> None:
+    def register(self, hello: Hello, settings: Settings) -> None:
         """Take note of a sensor."""
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
@@ -77,7 +77,7 @@ class Guarded:
         Called with what was raised.
     """
 
-    def __init__(self, images: Images, on_error: Callable[[Exception], None]) -> None:
+    def __init__(self, images: ImageProducer, on_error: Callable[[Exception], None]) -> None:
         self._images, self._on_error = images, on_error
 
     def _try(self, act: Callable[[], _Result], instead: _Result) -> _Result:
@@ -88,12 +88,12 @@ class Guarded:
             return instead
 
     def start(self, stopping: Callable[[], bool]) -> None:
-        """Start; raise what `Images.start` raises."""
+        """Start; raise what `ImageProducer.start` raises."""
         self._images.start(stopping)
 
-    def know(self, hello: Hello, settings: Settings) -> None:
+    def register(self, hello: Hello, settings: Settings) -> None:
         """Take note of a sensor."""
-        self._try(lambda: self._images.know(hello, settings), None)
+        self._try(lambda: self._images.register(hello, settings), None)
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
         """Take a measurement."""

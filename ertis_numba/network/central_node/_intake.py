@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Sensor
-from ertis_numba.journal import Gap as NotedGap
+from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.journal import JournalGap as NotedGap
 from ertis_numba.network.central_node._acks import Acks
 from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
-from ertis_numba.network.central_node._items import Item, Run, Stored, Twin
+from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, Twin
 from ertis_numba.network.central_node._roles import Store, Unwanted, Viewer
 from ertis_numba.network.central_node._sharing import Sharing
-from ertis_numba.network.central_node._streams import Peer, Stream, Track
+from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream
 from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
 
@@ -36,11 +36,11 @@ class Intake:
     viewer : Viewer or None
     send : callable
         Called with a peer and a message to it.
-    tell : callable
+    notify : callable
         Called with the name of an event and what there is to say about it.
     on_stored : callable
         Called with items that are durable.
-    most_bytes : int
+    max_bytes : int
         Longest measurement.
 
     Attributes
@@ -56,24 +56,26 @@ class Intake:
         store: Store | None,
         viewer: Viewer | None,
         send: Callable[[bytes, Message], None],
-        tell: Callable[..., None],
-        on_stored: Callable[[list[Item]], None] | None,
-        most_bytes: int,
+        notify: Callable[..., None],
+        on_stored: Callable[[list[ReceivedItem]], None] | None,
+        max_bytes: int,
     ) -> None:
-        self._store, self._viewer, self._send, self._tell = store, viewer, send, tell
+        self._store, self._viewer, self._send, self._emit_event = store, viewer, send, notify
         self._on_stored = on_stored
-        self._most_bytes = most_bytes
-        self._streams: dict[Run, Stream] = {}
-        self._left: OrderedDict[Run, int] = OrderedDict()  # what was settled, or shown, where the store does not know
+        self._max_bytes = max_bytes
+        self._streams: dict[SensorSession, Stream] = {}
+        self._left: OrderedDict[SensorSession, int] = (
+            OrderedDict()
+        )  # what was settled, or shown, where the store does not know
         self._waiting_bytes = 0
-        self._sharing = Sharing(tell)
-        self.tracks: dict[str, Track] = {}
-        self.peers: dict[bytes, Peer] = {}
+        self._sharing = Sharing(notify)
+        self.tracks: dict[str, SensorTrack] = {}
+        self.peers: dict[bytes, PeerConnection] = {}
         self.acks = Acks(send, "accepted" if store is None else "stored")
 
     # What comes from nodes
 
-    def read(self, hello: Hello, payload: list[bytes]) -> Sensor:
+    def read(self, hello: Hello, payload: list[bytes]) -> JournalSensor:
         """Return the sensor of a greeting; any thread may call this.
 
         Raises
@@ -81,9 +83,9 @@ class Intake:
         Unwanted
             The greeting cannot be accepted.
         """
-        return source_in(hello, payload, most_bytes=self._most_bytes)
+        return source_in(hello, payload, max_bytes=self._max_bytes)
 
-    def greet(self, peer_id: bytes, hello: Hello, source: Sensor, key: str = "") -> Stream:
+    def greet(self, peer_id: bytes, hello: Hello, source: JournalSensor, key: str = "") -> Stream:
         """Take a greeting, and return the run.
 
         Parameters
@@ -100,12 +102,12 @@ class Intake:
         Unwanted
             It cannot be taken.
         """
-        run = Run(hello.sensor, hello.epoch)
+        run = SensorSession(hello.sensor, hello.session_id)
         peer = self.peers.get(peer_id)
         require_room(self.peers, self.tracks, peer, run, key)
         require_same(self.peers, self.tracks, peer_id, source)
         if peer is None:
-            peer = self.peers[peer_id] = Peer(key=key)
+            peer = self.peers[peer_id] = PeerConnection(key=key)
         stream = self._streams.get(run)
         if stream is None:
             stream = self._streams[run] = self._begin(run, source, hello)
@@ -117,31 +119,38 @@ class Intake:
         peer.heard_s = time.monotonic()
         if run not in peer.streams:
             peer.streams[run] = stream
-            self._tell("joined", sensor=run.sensor, epoch=run.epoch, settled=stream.settled)
+            self._emit_event("joined", sensor=run.sensor, session_id=run.session_id, acked_through=stream.acked_through)
         self._sharing.joins(stream.track, peer_id, peer.heard_s)
-        stream.track.epoch, stream.track.settled = run.epoch, stream.settled
+        stream.track.session_id, stream.track.acked_through = run.session_id, stream.acked_through
         self._reach(stream)
         if self._viewer is not None:
-            self._viewer.know(hello, source.settings)
+            self._viewer.register(hello, source.settings)
         return stream
 
-    def _begin(self, run: Run, source: Sensor, hello: Hello) -> Stream:
+    def _begin(self, run: SensorSession, source: JournalSensor, hello: Hello) -> Stream:
         shown = self._left.pop(run, hello.next_sequence - 1 if self._store is None else -1)
-        settled = shown if self._store is None else self._store.settled(run)
-        track = self.tracks.setdefault(run.sensor, Track())
+        acked_through = shown if self._store is None else self._store.acked_through(run)
+        track = self.tracks.setdefault(run.sensor, SensorTrack())
         return Stream(
-            run, source, track, settled=settled, taken=settled, shown=shown, begins=hello.next_sequence, owner=b""
+            run,
+            source,
+            track,
+            acked_through=acked_through,
+            taken=acked_through,
+            shown=shown,
+            begins=hello.next_sequence,
+            owner=b"",
         )
 
     def _reach(self, stream: Stream) -> None:
         """Note that what the node does not have any more has never come."""
         if stream.begins > stream.taken + 1:
             first, last = stream.taken + 1, stream.begins - 1
-            self._take_gap(stream, NotedGap(stream.run.sensor, first, last, _NEVER, stream.run.epoch))
+            self._take_gap(stream, NotedGap(stream.run.sensor, first, last, _NEVER, stream.run.session_id))
 
     def _stream(self, peer_id: bytes, message: Data | Gap) -> Stream:
         peer = self.peers.get(peer_id)
-        stream = None if peer is None else peer.streams.get(Run(message.sensor, message.epoch))
+        stream = None if peer is None else peer.streams.get(SensorSession(message.sensor, message.session_id))
         if peer is None or stream is None:
             raise Unwanted("hello", f"sensor {message.sensor} is not known here; say hello first", "hello")
         peer.heard_s = time.monotonic()
@@ -157,7 +166,9 @@ class Intake:
         """
         stream = self._stream(peer_id, data)
         entry, source = entry_in(stream, data, payload), stream.source
-        item = Item(stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id, stream.turn)
+        item = ReceivedItem(
+            stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id, stream.turn
+        )
         self._reach(stream)
         if data.sequence <= stream.taken:
             self._again(stream, item, data)
@@ -170,15 +181,15 @@ class Intake:
                 stream.shown = data.sequence
                 stream.track.took(source.n_bytes, item.arrived_s)
                 if self._viewer is not None:
-                    self._viewer.offer(data, entry.measurement.words, arrived_ns)
+                    self._viewer.offer(data, entry.measurement.data, arrived_ns)
 
-    def _has_room(self, peer_id: bytes, item: Item) -> bool:
+    def _has_room(self, peer_id: bytes, item: ReceivedItem) -> bool:
         if self._store is None:
             return True
         bytes_ = self.peers[peer_id].waiting_bytes + item.n_bytes
         return bytes_ <= max(_WAITING_BYTES, item.n_bytes) and self._waiting_bytes <= _ALL_WAITING_BYTES
 
-    def _again(self, stream: Stream, item: Item, data: Data) -> None:
+    def _again(self, stream: Stream, item: ReceivedItem, data: Data) -> None:
         """Take note of a measurement whose number was taken before."""
         known = stream.recent.get(data.sequence)
         if self._store is None or known == data.crc32 or not self._has_room(stream.owner, item):
@@ -186,7 +197,9 @@ class Intake:
             differs = known is not None and known != data.crc32
             if differs and self._store is None:
                 stream.track.conflicts += 1
-                self._tell("conflict", sensor=stream.run.sensor, epoch=stream.run.epoch, sequence=data.sequence)
+                self._emit_event(
+                    "conflict", sensor=stream.run.sensor, session_id=stream.run.session_id, sequence=data.sequence
+                )
             self.acks.owe(stream)
             return
         item.again = True
@@ -206,13 +219,15 @@ class Intake:
             self.acks.owe(stream)
         else:
             try:
-                noted = NotedGap(gap.sensor, stream.taken + 1, gap.last, gap.reason, gap.epoch)
+                noted = NotedGap(gap.sensor, stream.taken + 1, gap.last, gap.reason, gap.session_id)
             except ArgumentError as error:
                 raise Unwanted("message", str(error), "message") from error
             self._take_gap(stream, noted)
 
     def _take_gap(self, stream: Stream, gap: NotedGap) -> None:
-        item = Item(stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner, stream.turn)
+        item = ReceivedItem(
+            stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner, stream.turn
+        )
         if not self._has_room(stream.owner, item):
             self.acks.owe(stream)
             return
@@ -220,16 +235,16 @@ class Intake:
         if self._store is None:
             stream.track.miss(gap.reason, gap.last - gap.first + 1)
 
-    def _take(self, stream: Stream, item: Item) -> None:
+    def _take(self, stream: Stream, item: ReceivedItem) -> None:
         stream.taken = item.last
         if self._store is not None:
             self._wait(item, stream)
             return
-        stream.settled = stream.track.settled = item.last
+        stream.acked_through = stream.track.acked_through = item.last
         self.acks.owe(stream)
-        self.acks.settled(item.arrived_s)
+        self.acks.acked_through(item.arrived_s)
 
-    def _wait(self, item: Item, stream: Stream) -> None:
+    def _wait(self, item: ReceivedItem, stream: Stream) -> None:
         if self._store is None:
             return
         stream.track.waiting += 1
@@ -258,7 +273,7 @@ class Intake:
         for stream in list(peer.streams.values()) if peer is not None else ():
             self._leave(peer_id, peer, stream)
 
-    def _leave(self, peer_id: bytes, peer: Peer | None, stream: Stream) -> None:
+    def _leave(self, peer_id: bytes, peer: PeerConnection | None, stream: Stream) -> None:
         """Forget that a run comes from a peer."""
         if peer is not None:
             peer.streams.pop(stream.run, None)
@@ -266,17 +281,19 @@ class Intake:
             self._sharing.leaves(stream.track, stream.run.sensor, peer_id)
         if stream.owner == peer_id:
             stream.owner = b""
-            self._tell("left", sensor=stream.run.sensor, epoch=stream.run.epoch, settled=stream.settled)
+            self._emit_event(
+                "left", sensor=stream.run.sensor, session_id=stream.run.session_id, acked_through=stream.acked_through
+            )
         self._forget(stream)
 
     def _forget(self, stream: Stream) -> None:
         """Drop what nobody will ask for."""
-        if stream.owner or stream.taken != stream.settled:
+        if stream.owner or stream.taken != stream.acked_through:
             return
         self.acks.forget(stream)
-        known = self._store is not None and stream.shown <= stream.settled
+        known = self._store is not None and stream.shown <= stream.acked_through
         if self._streams.pop(stream.run, None) is not None and not known:
-            self._left[stream.run] = max(stream.settled, stream.shown)
+            self._left[stream.run] = max(stream.acked_through, stream.shown)
             if len(self._left) > _LEFT_KEPT:
                 self._left.popitem(last=False)
         track = stream.track
@@ -295,16 +312,16 @@ class Intake:
         """Take note of what is durable."""
         for item in event.items:
             stream = self._done(item)
-            track = self.tracks.setdefault(item.run.sensor, Track())
+            track = self.tracks.setdefault(item.run.sensor, SensorTrack())
             if isinstance(item.what, Entry):
                 track.stored += 1
-                self.acks.settled(item.arrived_s)
+                self.acks.acked_through(item.arrived_s)
             else:
                 track.miss(item.what.reason, item.last - item.first + 1)
             if stream is not None:
-                stream.settled = max(stream.settled, item.last)
-                stream.taken = max(stream.taken, stream.settled)
-                track.settled = stream.settled
+                stream.acked_through = max(stream.acked_through, item.last)
+                stream.taken = max(stream.taken, stream.acked_through)
+                track.acked_through = stream.acked_through
                 self.acks.owe(stream)
                 self._forget(stream)
         if self._on_stored is not None:
@@ -313,16 +330,16 @@ class Intake:
     def twin(self, event: Twin) -> None:
         """Take note of a number that has come again."""
         stream = self._done(event.item)
-        track = self.tracks.setdefault(event.item.run.sensor, Track())
+        track = self.tracks.setdefault(event.item.run.sensor, SensorTrack())
         track.repeated += 1
         if event.differs:
             track.conflicts += 1
             run = event.item.run
-            self._tell("conflict", sensor=run.sensor, epoch=run.epoch, sequence=event.item.first)
+            self._emit_event("conflict", sensor=run.sensor, session_id=run.session_id, sequence=event.item.first)
         if stream is not None:
             self.acks.owe(stream)
 
-    def forgotten(self, item: Item, reason: str) -> None:
+    def forgotten(self, item: ReceivedItem, reason: str) -> None:
         """Have an item sent again."""
         stream = self._done(item)
         if stream is None:
@@ -332,10 +349,12 @@ class Intake:
         self.acks.owe(stream)
         if reason and stream.owner:
             run, line = item.run, as_line(reason)
-            self._send(stream.owner, Refused(code="settings", reason=line, sensor=run.sensor, epoch=run.epoch))
+            self._send(
+                stream.owner, Refused(code="settings", reason=line, sensor=run.sensor, session_id=run.session_id)
+            )
         self._forget(stream)
 
-    def _done(self, item: Item) -> Stream | None:
+    def _done(self, item: ReceivedItem) -> Stream | None:
         self._waiting_bytes -= item.n_bytes
         peer = self.peers.get(item.owner)
         if peer is not None:
@@ -348,8 +367,8 @@ class Intake:
 
     def dropped(self, drops: Iterable[tuple[str, int, int, str]]) -> None:
         """Take note of what processing has thrown away: sensor, epoch, sequence and why of each."""
-        for sensor, epoch, sequence, reason in drops:
-            stream = self._streams.get(Run(sensor, epoch))
+        for sensor, session_id, sequence, reason in drops:
+            stream = self._streams.get(SensorSession(sensor, session_id))
             if stream is not None:
                 stream.dropped.append((sequence, reason))
 

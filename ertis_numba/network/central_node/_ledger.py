@@ -12,17 +12,17 @@ from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
-from ertis_numba.atomic import replacing
-from ertis_numba.errors import DataError, FormatVersionError, InUseError
-from ertis_numba.journal import Gap
-from ertis_numba.network.central_node._items import Run
+from ertis_numba.atomic_files import atomic_write
+from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
+from ertis_numba.journal import JournalGap
+from ertis_numba.network.central_node._received_items import SensorSession
 
 if sys.platform == "win32":
     import msvcrt
 else:
     import fcntl
 
-__all__ = ["Ledger", "Lock", "look"]
+__all__ = ["Ledger", "Lock", "read_acked_through"]
 
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
@@ -35,9 +35,9 @@ class _Begin(msgspec.Struct, tag="ertis-ledger", array_like=True):
     version: int
 
 
-class _Settled(msgspec.Struct, tag="run", array_like=True):
+class _AckedSession(msgspec.Struct, tag="run", array_like=True):
     sensor: str
-    epoch: int
+    session_id: int
     last: int
 
 
@@ -51,7 +51,7 @@ class _Unsealed(msgspec.Struct, tag="unsealed", array_like=True):
 
 class _Gap(msgspec.Struct, tag="gap", array_like=True):
     sensor: str
-    epoch: int
+    session_id: int
     first: int
     last: int
     reason: str
@@ -59,7 +59,7 @@ class _Gap(msgspec.Struct, tag="gap", array_like=True):
 
 class _Tail(msgspec.Struct, tag="crc32", array_like=True):
     sensor: str
-    epoch: int
+    session_id: int
     numbers: list[tuple[int, int]]
 
 
@@ -67,14 +67,14 @@ class _End(msgspec.Struct, tag="end", array_like=True):
     n_lines: int
 
 
-_Line: TypeAlias = _Begin | _Settled | _Open | _Unsealed | _Gap | _Tail | _End
+_Line: TypeAlias = _Begin | _AckedSession | _Open | _Unsealed | _Gap | _Tail | _End
 
 
 class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Content of versions 1 and 2: one JSON object; numbers by sensor and epoch, which is text."""
 
     version: Annotated[int, msgspec.Meta(ge=1, le=2)] = 2
-    settled: dict[str, dict[str, int]] = {}
+    acked_through: dict[str, dict[str, int]] = msgspec.field(name="settled", default_factory=dict)
     open: list[str] = []
     unsealed: list[str] = []
     gaps: list[tuple[str, str, int, int, str]] = []
@@ -96,10 +96,10 @@ class Ledger:
         There was none.
     damage : str
         Entries that were left out, and the consequence; empty if the file is sound.
-    settled : dict of Run to int
+    acked_through : dict of Run to int
         The run that grew last comes last.
     open, unsealed : list of str
-        Names of journals that may hold more than is in ``settled``, and of those that are to be sealed.
+        Names of journals that may hold more than is in ``acked_through``, and of those that are to be sealed.
     gaps : list of Gap
         What is missing, and no recording tells yet.
     tails : dict of Run to dict of int to int
@@ -117,11 +117,11 @@ class Ledger:
         self._path = folder / _NAME
         self.is_new = not self._path.exists()
         self.damage = ""
-        self.settled: dict[Run, int] = {}
+        self.acked_through: dict[SensorSession, int] = {}
         self.open: list[str] = []
         self.unsealed: list[str] = []
-        self.gaps: list[Gap] = []
-        self.tails: dict[Run, dict[int, int]] = {}
+        self.gaps: list[JournalGap] = []
+        self.tails: dict[SensorSession, dict[int, int]] = {}
         if not self.is_new:
             self._read()
 
@@ -155,9 +155,15 @@ class Ledger:
             self._note_damage("its end is missing")
 
     def _read_old(self, old: _Old) -> None:
-        settled = {Run(name, int(epoch)): last for name, runs in old.settled.items() for epoch, last in runs.items()}
-        self.gaps = [Gap(sensor, first, last, why, int(epoch)) for sensor, epoch, first, last, why in old.gaps]
-        self.settled, self.open, self.unsealed = settled, old.open, old.unsealed
+        acked_through = {
+            SensorSession(name, int(session_id)): last
+            for name, runs in old.acked_through.items()
+            for session_id, last in runs.items()
+        }
+        self.gaps = [
+            JournalGap(sensor, first, last, why, int(session_id)) for sensor, session_id, first, last, why in old.gaps
+        ]
+        self.acked_through, self.open, self.unsealed = acked_through, old.open, old.unsealed
 
     def _add(self, entry: _Line) -> None:
         match entry:
@@ -165,16 +171,16 @@ class Ledger:
                 raise FormatVersionError(
                     f"{self._path} has version {version}, this package reads {_VERSION}; update ertis-numba"
                 )
-            case _Settled(sensor, epoch, last):
-                self.settled[Run(sensor, epoch)] = last
+            case _AckedSession(sensor, session_id, last):
+                self.acked_through[SensorSession(sensor, session_id)] = last
             case _Open(name):
                 self.open.append(name)
             case _Unsealed(name):
                 self.unsealed.append(name)
-            case _Gap(sensor, epoch, first, last, reason):
-                self.gaps.append(Gap(sensor, first, last, reason, epoch))
-            case _Tail(sensor, epoch, numbers):
-                self.tails[Run(sensor, epoch)] = dict(numbers)
+            case _Gap(sensor, session_id, first, last, reason):
+                self.gaps.append(JournalGap(sensor, first, last, reason, session_id))
+            case _Tail(sensor, session_id, numbers):
+                self.tails[SensorSession(sensor, session_id)] = dict(numbers)
 
     def _note_damage(self, what: str) -> None:
         self.damage = (
@@ -184,18 +190,18 @@ class Ledger:
 
     def save(
         self,
-        settled: Mapping[Run, int],
+        acked_through: Mapping[SensorSession, int],
         *,
         open_: Iterable[str],
         unsealed: Iterable[str],
-        gaps: Sequence[Gap] = (),
-        tails: Mapping[Run, Mapping[int, int]] | None = None,
+        gaps: Sequence[JournalGap] = (),
+        tails: Mapping[SensorSession, Mapping[int, int]] | None = None,
     ) -> None:
         """Replace what is in the file; when this returns, it is durable.
 
         Parameters
         ----------
-        settled : mapping of Run to int
+        acked_through : mapping of Run to int
             The run that grew last comes last. Of those that grew first, only the newest of each sensor are kept.
         open_, unsealed : iterable of str
         gaps : sequence of Gap
@@ -207,39 +213,39 @@ class Ledger:
         OSError, DataError
             It cannot be written; the old content stays.
         """
-        kept = _newest(settled)
+        kept = _newest(acked_through)
         opened, left = list(open_), list(unsealed)
         lines: list[_Line] = [
             _Begin(_VERSION),
-            *(_Settled(run.sensor, run.epoch, last) for run, last in kept.items()),
+            *(_AckedSession(run.sensor, run.session_id, last) for run, last in kept.items()),
             *map(_Open, opened),
             *map(_Unsealed, left),
-            *(_Gap(gap.sensor, gap.epoch, gap.first, gap.last, gap.reason) for gap in gaps),
+            *(_Gap(gap.sensor, gap.session_id, gap.first, gap.last, gap.reason) for gap in gaps),
             *(
-                _Tail(run.sensor, run.epoch, list(numbers.items()))
+                _Tail(run.sensor, run.session_id, list(numbers.items()))
                 for run, numbers in (tails or {}).items()
                 if run in kept
             ),
         ]
-        with replacing(self._path, overwrite=True, token="new") as part:  # noqa: S106  who has the lock writes alone
+        with atomic_write(self._path, overwrite=True, token="new") as part:  # noqa: S106  who has the lock writes alone
             part.write_bytes(b"".join(map(_encoded, [*lines, _End(len(lines))])))
-        self.settled, self.open, self.unsealed = kept, opened, left
+        self.acked_through, self.open, self.unsealed = kept, opened, left
         self.gaps, self.tails, self.damage = list(gaps), {run: dict(each) for run, each in (tails or {}).items()}, ""
 
 
-def _newest(settled: Mapping[Run, int]) -> dict[Run, int]:
+def _newest(acked_through: Mapping[SensorSession, int]) -> dict[SensorSession, int]:
     """Return the newest runs of each sensor, in their order.
 
     A run that is forgotten does harm only if its sensor comes back with it after so many others: numbers whose ack it
     has missed are then stored a second time.
     """
     counts: Counter[str] = Counter()
-    kept: list[Run] = []
-    for run in list(settled)[: -_ALL_RUNS_KEPT - 1 : -1]:
+    kept: list[SensorSession] = []
+    for run in list(acked_through)[: -_ALL_RUNS_KEPT - 1 : -1]:
         counts[run.sensor] += 1
         if counts[run.sensor] <= _RUNS_KEPT:
             kept.append(run)
-    return {run: settled[run] for run in reversed(kept)}
+    return {run: acked_through[run] for run in reversed(kept)}
 
 
 def _encoded(line: _Line) -> bytes:
@@ -282,7 +288,7 @@ class Lock:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(self._descriptor)
-            raise InUseError(
+            raise JournalInUseError(
                 f"{folder} is in use by another central node; give a folder of its own to each, or end the other"
             ) from error
 
@@ -294,7 +300,7 @@ class Lock:
             self._descriptor = -1
 
 
-def look(recordings: Iterable[Path]) -> dict[Run, int]:
+def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
     """Return the highest settled number of each run in recordings, read by a process of its own.
 
     Raises
@@ -305,13 +311,13 @@ def look(recordings: Iterable[Path]) -> dict[Run, int]:
     paths = [str(path) for path in recordings]
     if not paths:
         return {}
-    command = [sys.executable, "-P", "-m", "ertis_numba.storage._runs_process", "--", *paths]
+    command = [sys.executable, "-P", "-m", "ertis_numba.storage.sessions_process", "--", *paths]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)  # noqa: S603  our own
     if done.returncode:
-        said = done.stderr.decode(errors="backslashreplace").strip().splitlines() or ["nothing"]
-        raise DataError(f"recordings cannot be looked at ({said[-1]}); move those that are damaged elsewhere")
-    settled: dict[Run, int] = {}
-    for sensor, epoch, last in msgspec.json.decode(done.stdout, type=list[tuple[str, int, int]]):
-        run = Run(sensor, epoch)
-        settled[run] = max(last, settled.get(run, -1))
-    return settled
+        stated = done.stderr.decode(errors="backslashreplace").strip().splitlines() or ["nothing"]
+        raise DataError(f"recordings cannot be looked at ({stated[-1]}); move those that are damaged elsewhere")
+    acked_through: dict[SensorSession, int] = {}
+    for sensor, session_id, last in msgspec.json.decode(done.stdout, type=list[tuple[str, int, int]]):
+        run = SensorSession(sensor, session_id)
+        acked_through[run] = max(last, acked_through.get(run, -1))
+    return acked_through

@@ -16,14 +16,23 @@ from ertis_numba.network.addresses import DEFAULT_LISTEN
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._condition import Condition
-from ertis_numba.network.central_node._door import Door
-from ertis_numba.network.central_node._greetings import Greeting, Greetings
-from ertis_numba.network.central_node._images import Guarded, Images
+from ertis_numba.network.central_node._event_reporting import Telling, text_of
+from ertis_numba.network.central_node._images import Guarded, ImageProducer
 from ertis_numba.network.central_node._intake import Intake
-from ertis_numba.network.central_node._items import Failed, Fault, Forgotten, Remark, Resumed, SealedOne, Stored, Twin
 from ertis_numba.network.central_node._reading import read, require_role
+from ertis_numba.network.central_node._received_items import (
+    Forgotten,
+    Remark,
+    Resumed,
+    SealedOne,
+    SealingFailed,
+    StorageFault,
+    Stored,
+    Twin,
+)
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.central_node._telling import Telling, text_of
+from ertis_numba.network.central_node._server_socket import ServerSocket
+from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.fields import State, as_line
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.messages import (
@@ -43,10 +52,10 @@ from ertis_numba.network.status import Status
 
 __all__ = ["CentralNode"]
 
-MOST_BYTES: Final = 4 * 2**20
+MAX_BYTES: Final = 4 * 2**20
 _TURN: Final = 32  # messages, before something else has its turn
 _TICK_S: Final = 0.1
-_TOLD_S: Final = 1.0  # between two events about what was refused
+_LOG_INTERVAL_S: Final = 1.0  # between two events about what was refused
 _STATUS_S: Final = 1.0
 _FINISH_S: Final = 5.0
 
@@ -64,7 +73,7 @@ class CentralNode:
         What stores measurements; then an ack says that they are.
     processing : Images, optional
         What makes images of them.
-    most_bytes : int
+    max_bytes : int
         Longest measurement that is taken.
     window : int
         Measurements of a run that may be under way.
@@ -89,8 +98,8 @@ class CentralNode:
         *,
         keys: ServerKeys | None = None,
         archive: Archive | None = None,
-        processing: Images | None = None,
-        most_bytes: int = MOST_BYTES,
+        processing: ImageProducer | None = None,
+        max_bytes: int = MAX_BYTES,
         window: int = 16,
         on_event: Callable[[dict[str, Any]], None] = lambda _: None,
         on_stored: Callable[[str, int, int, int], None] | None = None,
@@ -99,25 +108,25 @@ class CentralNode:
             raise ArgumentError("a central node has neither archive nor processing; give at least one")
         self._listen, self._keys, self._archive = listen, keys, archive
         self._images = None if processing is None else Guarded(processing, self._internal)
-        self._window = checks.whole("window", window, 1, 1024)
-        self._most_bytes = checks.whole("most_bytes", most_bytes, 4096, 2**31)
+        self._window = checks.integer("window", window, 1, 1024)
+        self._max_bytes = checks.integer("most_bytes", max_bytes, 4096, 2**31)
         self._telling = Telling(on_event, on_stored)
-        self._door = Door(keys)
+        self._server = ServerSocket(keys)
         self._intake = Intake(
             store=archive,
             viewer=self._images,
-            send=self._door.send,
-            tell=self._telling.tell,
+            send=self._server.send,
+            notify=self._telling.notify,
             on_stored=self._telling.stored,
-            most_bytes=most_bytes,
+            max_bytes=max_bytes,
         )
         self._condition = Condition(
-            listen, self._door, self._intake, archive=archive, images=self._images, keys=keys is not None
+            listen, self._server, self._intake, archive=archive, images=self._images, keys=keys is not None
         )
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = -1
         self._stopping = threading.Event()
-        self._next_tick_s = self._next_told_s = self._next_status_s = 0.0
+        self._next_tick_s = self._next_log_s = self._next_status_s = 0.0
         self.latest = self.status()
 
     # Its life
@@ -139,8 +148,8 @@ class CentralNode:
             if self._stopping.is_set():
                 return
         self._greetings_fd = self._greetings.open()
-        self._door.open(self._listen, most_bytes=self._most_bytes)
-        self._telling.tell("listening", address=self._condition.address, pid=os.getpid())
+        self._server.open(self._listen, max_bytes=self._max_bytes)
+        self._telling.notify("listening", address=self._condition.address, pid=os.getpid())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -160,8 +169,8 @@ class CentralNode:
             if self._images is not None:
                 stack.callback(self._images.close, _FINISH_S)
             stack.callback(self._greetings.close)
-            stack.callback(self._door.close)
-            self._telling.refused(self._door.refused)
+            stack.callback(self._server.close)
+            self._telling.refused(self._server.refused)
 
     def stop(self) -> None:
         """End `run` within a tenth of a second, or the wait for processes at the start of ``with``; from any thread."""
@@ -180,14 +189,14 @@ class CentralNode:
         ArgumentError
             The central node is not open, or the time is not above zero.
         """
-        if not self._door.is_open and not self._stopping.is_set():
+        if not self._server.is_open and not self._stopping.is_set():
             raise ArgumentError("a central node is not open; use it in a with statement")
         end_s = None if duration_s is None else time.monotonic() + checks.positive("duration", duration_s)
         while not self._stopping.is_set() and (end_s is None or time.monotonic() < end_s):
             self._turn()
         self._condition.closing = True
         for peer_id in self._intake.peers:
-            self._door.send(peer_id, Pong(state=self.state))
+            self._server.send(peer_id, Pong(state=self.state))
         if self._archive is not None and not self._archive.fault:
             self._archive.finish(_FINISH_S)
             self._hear()
@@ -198,7 +207,7 @@ class CentralNode:
     def _turn(self) -> None:
         """Wait for something, and do what it asks."""
         poller = zmq.Poller()
-        self._door.register(poller)
+        self._server.register(poller)
         others = set() if self._images is None else set(self._images.fds())
         if self._archive is not None:
             poller.register(self._archive_fd, zmq.POLLIN)
@@ -206,7 +215,7 @@ class CentralNode:
         for fd in others:
             poller.register(fd, zmq.POLLIN)
         ready = dict(poller.poll(max(0, round(1e3 * (self._next_tick_s - time.monotonic())))))
-        called = self._door.serve(ready)
+        called = self._server.serve(ready)
         if self._archive_fd in ready:
             self._hear()
         if self._greetings_fd in ready:
@@ -224,14 +233,14 @@ class CentralNode:
 
     def _receive(self) -> None:
         for _ in range(_TURN):
-            frames = self._door.receive()
+            frames = self._server.receive()
             if frames is None:
                 return
             self._handle(frames)
 
     def _internal(self, error: Exception) -> None:
         """Count a mistake in this package, and tell of it."""
-        self._door.refused["internal"] += 1
+        self._server.refused["internal"] += 1
         self._telling.internal(error)
 
     def _handle(self, frames: list[zmq.Frame]) -> None:
@@ -240,13 +249,13 @@ class CentralNode:
         sender = frames[0].bytes
         message: Message | None = None
         try:
-            who = self._door.who(frames)
+            who = self._server.who(frames)
             if who is None:
                 # The server socket counts messages of keys that are not listed.
                 self._greetings.forget(sender)
                 self._intake.bye(sender)
                 reason = "this key is not listed (any more); have it listed"
-                self._door.send(sender, Refused(code="role", reason=reason))
+                self._server.send(sender, Refused(code="role", reason=reason))
                 return
             message = read(frames)
             require_role(who, message)
@@ -263,15 +272,15 @@ class CentralNode:
             return
         self._internal(error)
         text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
-        self._door.send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
+        self._server.send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
 
     def _note_peer(self, frames: list[zmq.Frame]) -> None:
         if frames[0].bytes in self._intake.peers:
-            self._door.keep_badge(frames)
+            self._server.keep_badge(frames)
 
     def _refuse(self, sender: bytes, error: Unwanted, message: Message | None) -> None:
-        self._door.refused[error.kind] += 1
-        self._door.send(sender, error.answer(message or Bye()))
+        self._server.refused[error.kind] += 1
+        self._server.send(sender, error.answer(message or Bye()))
 
     def _answer_greeting(self, greeting: Greeting) -> None:
         """Accept or refuse a greeting; never raises for a greeting."""
@@ -286,19 +295,19 @@ class CentralNode:
         """Accept or refuse a greeting whose settings were read."""
         if isinstance(greeting.result, Exception):
             raise greeting.result
-        if greeting.result is None or self._door.who(greeting.frames) is None:  # its key was removed meanwhile
+        if greeting.result is None or self._server.who(greeting.frames) is None:  # its key was removed meanwhile
             return
         sender, hello = greeting.peer_id, greeting.hello
         stream = self._intake.greet(sender, hello, greeting.result, greeting.key)
-        self._door.send(
+        self._server.send(
             sender,
             Welcome(
                 sensor=hello.sensor,
-                epoch=hello.epoch,
+                session_id=hello.session_id,
                 state=self.state,
                 acks="accepted" if self._archive is None else "stored",
                 window=self._window,
-                settled=stream.settled,
+                acked_through=stream.acked_through,
             ),
         )
 
@@ -312,7 +321,7 @@ class CentralNode:
             case Ping():
                 self._intake.ping(sender)
                 text = self._condition.trouble or self._intake.remark(sender)
-                self._door.send(sender, Pong(state=self.state, text=as_line(text)))
+                self._server.send(sender, Pong(state=self.state, text=as_line(text)))
             case Hello():
                 key = "" if self._keys is None else who.public
                 self._greetings.offer(Greeting(frames[:2], message, [frame.bytes for frame in frames[2:]], key))
@@ -320,7 +329,7 @@ class CentralNode:
                 self._greetings.forget(sender)
                 self._intake.bye(sender)
             case AskStatus():
-                self._door.send(sender, Report(), self._condition.report())
+                self._server.send(sender, Report(), self._condition.report())
 
     def _hear(self) -> None:
         """Take note of what the archive has done."""
@@ -332,7 +341,7 @@ class CentralNode:
                     self._intake.twin(event)
                 case Forgotten(item, reason):
                     self._intake.forgotten(item, reason)
-                case Fault(text):
+                case StorageFault(text):
                     self._condition.fault = text
                     self._telling.fault(self._condition.trouble)
                 case Resumed():
@@ -340,36 +349,36 @@ class CentralNode:
                     self._telling.fault(self._condition.trouble)
                 case SealedOne(sealed):
                     self._telling.sealed(sealed)
-                case Failed(text):
-                    self._telling.tell("unsealed", text=text)
+                case SealingFailed(text):
+                    self._telling.notify("unsealed", text=text)
                 case Remark(text):
-                    self._telling.tell("damage", text=text)
+                    self._telling.notify("damage", text=text)
 
     def _tick(self) -> None:
         now_s = time.monotonic()
         self._next_tick_s = now_s + _TICK_S
-        for peer_id in self._door.tick(self._intake.peers.keys()):
+        for peer_id in self._server.tick(self._intake.peers.keys()):
             self._intake.bye(peer_id)
         self._intake.tick(now_s)
         if self._images is not None:
             self._images.tick(now_s)
         self._telling.fault(self._condition.trouble)
-        self._telling.keys(self._door.note)
+        self._telling.keys(self._server.note)
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_S
             self._note_status()
             if self._images is not None:
                 self._images.publish_status(self.latest)
-        if now_s >= self._next_told_s:
-            self._next_told_s = now_s + _TOLD_S
-            self._telling.refused(self._door.refused)
+        if now_s >= self._next_log_s:
+            self._next_log_s = now_s + _LOG_INTERVAL_S
+            self._telling.refused(self._server.refused)
 
     # What is told of it
 
     @property
     def address(self) -> str:
         """Where it listens, as nodes of this machine connect to it."""
-        return self._door.address
+        return self._server.address
 
     @property
     def state(self) -> State:

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.network.central_node._items import Item, Run
+from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Hello, Message, Refused
 from ertis_numba.settings import Settings
@@ -32,24 +32,24 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
 
     def answer(self, about: Message) -> Refused:
         """Return what to tell the sender."""
-        sensor, epoch = getattr(about, "sensor", ""), getattr(about, "epoch", 0)
-        return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, epoch=epoch)
+        sensor, session_id = getattr(about, "sensor", ""), getattr(about, "session_id", 0)
+        return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, session_id=session_id)
 
 
 class Store(Protocol):
     """What makes measurements durable."""
 
-    def settled(self, run: Run) -> int:
+    def acked_through(self, run: SensorSession) -> int:
         """Return how far a run is settled."""
 
-    def offer(self, item: Item) -> None:
+    def offer(self, item: ReceivedItem) -> None:
         """Have something stored; returns at once."""
 
 
 class Viewer(Protocol):
     """What is shown measurements that are new."""
 
-    def know(self, hello: Hello, settings: Settings) -> None:
+    def register(self, hello: Hello, settings: Settings) -> None:
         """Take note of a sensor."""
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:

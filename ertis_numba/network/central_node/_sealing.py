@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import InUseError
+from ertis_numba.errors import JournalInUseError
 from ertis_numba.journal import SUFFIX, Sealed, seal_apart
 
 __all__ = ["Sealing"]
@@ -98,7 +98,7 @@ class Sealing:
             if not path.exists() and path.with_name(path.name.removesuffix(SUFFIX)).exists():
                 self._left.discard(path)  # somebody else has made the recording
                 return
-            if isinstance(error, InUseError) and not self._ends:
+            if isinstance(error, JournalInUseError) and not self._ends:
                 waits_s = _AGAIN_S  # who seals it now will be done soon
             else:
                 self.failed += 1

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-from ertis_numba.network.central_node._streams import Peer, Track
+from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack
 
 __all__ = ["Sharing"]
 
@@ -12,28 +12,28 @@ class Sharing:
 
     Parameters
     ----------
-    tell : callable
+    notify : callable
         Called with the name of an event and what there is to say about it.
     """
 
-    def __init__(self, tell: Callable[..., None]) -> None:
-        self._tell = tell
+    def __init__(self, notify: Callable[..., None]) -> None:
+        self._emit_event = notify
         self._sensors: set[str] = set()
 
     @staticmethod
-    def joins(track: Track, peer_id: bytes, now_s: float) -> None:
+    def joins(track: SensorTrack, peer_id: bytes, now_s: float) -> None:
         """Note that a node sends a sensor."""
         if track.peers - {peer_id} and peer_id not in track.peers:
             track.shared_s = now_s
         track.peers.add(peer_id)
 
-    def leaves(self, track: Track, sensor: str, peer_id: bytes) -> None:
+    def leaves(self, track: SensorTrack, sensor: str, peer_id: bytes) -> None:
         """Note that a node sends a sensor no more."""
         track.peers.discard(peer_id)
         if len(track.peers) < 2:
             self._sensors.discard(sensor)
 
-    def tick(self, tracks: Mapping[str, Track], peers: Mapping[bytes, Peer]) -> None:
+    def tick(self, tracks: Mapping[str, SensorTrack], peers: Mapping[bytes, PeerConnection]) -> None:
         """Tell of what is new."""
         for sensor, track in tracks.items():
             # One that has come back may be missed only some seconds later.
@@ -41,9 +41,11 @@ class Sharing:
                 track.shared_s = 0.0
                 if len(track.peers) > 1:
                     self._sensors.add(sensor)
-                    self._tell("shared", sensor=sensor, text="several sensor nodes send it; give each its own name")
+                    self._emit_event(
+                        "shared", sensor=sensor, text="several sensor nodes send it; give each its own name"
+                    )
 
-    def remark(self, peer: Peer | None) -> str:
+    def remark(self, peer: PeerConnection | None) -> str:
         """Return what a node should know, a line; empty where there is nothing."""
         shared = () if peer is None else sorted(self._sensors & {run.sensor for run in peer.streams})
         if not shared:

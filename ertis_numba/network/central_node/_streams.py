@@ -9,13 +9,13 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings
-from ertis_numba.journal import Sensor
-from ertis_numba.network.central_node._items import Run
+from ertis_numba.journal import JournalSensor
+from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.messages import Data, Hello
 from ertis_numba.network.status import SensorStatus
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["Peer", "Stream", "Track", "source_of"]
+__all__ = ["PeerConnection", "SensorTrack", "Stream", "source_of"]
 
 _turns = count()
 _RECENT_S: Final = 3.0
@@ -24,7 +24,7 @@ _REASONS: Final = 32  # that numbers are missing for, of each sensor
 _NUMBERS_KEPT: Final = 512  # whose CRC-32 is remembered, of each run
 
 
-def source_of(hello: Hello, text: bytes, *, most_bytes: int) -> Sensor:
+def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
     """Return the sensor that a node greets for.
 
     Parameters
@@ -32,7 +32,7 @@ def source_of(hello: Hello, text: bytes, *, most_bytes: int) -> Sensor:
     hello : Hello
     text : bytes
         Its settings as TOML.
-    most_bytes : int
+    max_bytes : int
         Longest measurement that is taken.
 
     Raises
@@ -40,7 +40,7 @@ def source_of(hello: Hello, text: bytes, *, most_bytes: int) -> Sensor:
     ArgumentError
         They cannot be used.
     """
-    return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, most_bytes)
+    return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, max_bytes)
 
 
 @lru_cache(maxsize=64)
@@ -50,26 +50,28 @@ def _source(
     firmware: str,
     translation_m: tuple[float, ...] | None,
     rotation_xyzw: tuple[float, ...] | None,
-    most_bytes: int,
-) -> Sensor:
+    max_bytes: int,
+) -> JournalSensor:
     if not firmware.isprintable():
         raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; give printable characters")
     settings = received_settings(text, f"settings of sensor {name}")
-    source = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
-    if source.n_bytes > most_bytes:
+    source = JournalSensor.of(
+        name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
+    )
+    if source.n_bytes > max_bytes:
         raise SettingsError(
-            f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {most_bytes}; record fewer "
+            f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {max_bytes}; record fewer "
             "samples, or let it take more (--most-bytes)"
         )
     return source
 
 
 @dataclass(slots=True)
-class Track:
+class SensorTrack:
     """What became of one sensor's measurements."""
 
-    epoch: int = 0
-    settled: int = -1
+    session_id: int = 0
+    acked_through: int = -1
     received: int = 0
     received_bytes: int = 0
     stored: int = 0
@@ -99,8 +101,8 @@ class Track:
         span_s = recent_s[-1] - recent_s[0] if len(recent_s) > 1 else 0.0
         return SensorStatus(
             connected=bool(self.peers),
-            epoch=self.epoch,
-            settled=self.settled,
+            session_id=self.session_id,
+            acked_through=self.acked_through,
             rate_hz=round((len(recent_s) - 1) / span_s, 3) if span_s else 0.0,
             received=self.received,
             received_bytes=self.received_bytes,
@@ -121,7 +123,7 @@ class Stream:
     run : Run
     source : Sensor
     track : Track
-    settled, taken : int
+    acked_through, taken : int
         The number up to which all is settled, and will be once what waits is stored.
     begins : int
         The oldest number that the node has.
@@ -135,10 +137,10 @@ class Stream:
         Thrown away by processing, which the node has not heard of; the latest.
     """
 
-    run: Run
-    source: Sensor
-    track: Track
-    settled: int
+    run: SensorSession
+    source: JournalSensor
+    track: SensorTrack
+    acked_through: int
     taken: int
     begins: int
     owner: bytes
@@ -172,16 +174,16 @@ class Stream:
 
     def go_back(self) -> None:
         """Take what is not settled again."""
-        self.taken, self.turn = self.settled, next(_turns)
+        self.taken, self.turn = self.acked_through, next(_turns)
 
-    def use(self, source: Sensor) -> None:
+    def use(self, source: JournalSensor) -> None:
         """Take other settings from now on."""
         if source is not self.source:
             self.source, self._air = source, None
 
 
 @dataclass(slots=True, eq=False)
-class Peer:
+class PeerConnection:
     """A connection that has greeted for some sensors.
 
     Attributes
@@ -195,7 +197,7 @@ class Peer:
         That it has shown; empty where there are none.
     """
 
-    streams: dict[Run, Stream] = field(default_factory=dict)
+    streams: dict[SensorSession, Stream] = field(default_factory=dict)
     heard_s: float = 0.0
     waiting_bytes: int = 0
     key: str = ""

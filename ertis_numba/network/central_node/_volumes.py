@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Self
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import SUFFIX, Entry, Gap, Journal, Sensor
-from ertis_numba.network.central_node._items import Item, Run
+from ertis_numba.journal import SUFFIX, Entry, Journal, JournalGap, JournalSensor
+from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
 __all__ = ["Volume", "journal_name", "runs_of", "same"]
 
@@ -28,14 +28,14 @@ def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str]
     return f"{stem}{f'_{last + 1:03}' if last else ''}{end}.h5{SUFFIX}"
 
 
-def runs_of(journal: Journal) -> dict[Run, int]:
+def runs_of(journal: Journal) -> dict[SensorSession, int]:
     """Return the highest number of each run that a journal holds, or says to be missing."""
-    last: dict[Run, int] = {}
+    last: dict[SensorSession, int] = {}
     for key in journal.index():
-        run = Run(key.sensor, key.epoch)
+        run = SensorSession(key.sensor, key.session_id)
         last[run] = max(key.sequence, last.get(run, -1))
     for gap in journal.gaps:
-        run = Run(gap.sensor, gap.epoch)
+        run = SensorSession(gap.sensor, gap.session_id)
         last[run] = max(gap.last, last.get(run, -1))
     return last
 
@@ -60,8 +60,8 @@ class Volume:
 
     def __init__(self, journal: Journal) -> None:
         self.journal = journal
-        self._known: dict[str, Sensor] = dict(journal.sensors)
-        self._counted = {Run(key.sensor, key.epoch): key.sequence for key in journal.index()}
+        self._known: dict[str, JournalSensor] = dict(journal.sensors)
+        self._counted = {SensorSession(key.sensor, key.session_id): key.sequence for key in journal.index()}
         self.n_bytes = sum(journal.sensors[key.sensor].n_bytes for key in journal.index())
         self.acked = runs_of(journal)
         self.begun_s = time.monotonic()
@@ -79,18 +79,18 @@ class Volume:
     def __len__(self) -> int:
         return len(self.journal)
 
-    def fits(self, item: Item) -> bool:
+    def fits(self, item: ReceivedItem) -> bool:
         """Whether an item can go into this journal: its sensor is the same as before, and its number rises."""
         known = self._known.get(item.source.name)
         if known is not None and known is not item.source and not same(known, item.source):
             return False
         return item.first > self._counted.get(item.run, -1)
 
-    def know(self, source: Sensor) -> None:
+    def register(self, source: JournalSensor) -> None:
         """Expect measurements of a sensor."""
         self._known[source.name] = source
 
-    def append(self, items: list[Item]) -> None:
+    def append(self, items: list[ReceivedItem]) -> None:
         """Make measurements durable, or what is missing, all or none; see `Journal.append`.
 
         Parameters
@@ -102,21 +102,21 @@ class Volume:
             self._add(item.source)
         entries = [item.what for item in items if isinstance(item.what, Entry)]
         if not entries:
-            self.note_gaps([item.what for item in items if isinstance(item.what, Gap)])
+            self.note_gaps([item.what for item in items if isinstance(item.what, JournalGap)])
             return
         self.journal.append(entries)
         for item in items:
             self._counted[item.run] = self.acked[item.run] = item.last
             self.n_bytes += item.source.n_bytes
 
-    def note_gaps(self, gaps: list[Gap]) -> None:
+    def note_gaps(self, gaps: list[JournalGap]) -> None:
         """Make durable what is missing; see `Journal.note_gaps`."""
         self.journal.note_gaps(gaps)
         for gap in gaps:
-            run = Run(gap.sensor, gap.epoch)
+            run = SensorSession(gap.sensor, gap.session_id)
             self.acked[run] = max(gap.last, self.acked.get(run, -1))
 
-    def _add(self, source: Sensor) -> None:
+    def _add(self, source: JournalSensor) -> None:
         if source.name not in self.journal.sensors:
             self.journal.add_sensor(
                 source.name,
@@ -125,7 +125,7 @@ class Volume:
                 translation_m=source.translation_m,
                 rotation_xyzw=source.rotation_xyzw,
             )
-        self.know(source)
+        self.register(source)
 
     def crc32_of(self, entry: Entry) -> int | None:
         """Return the CRC-32 of the measurement with the number of this one; None where this journal has none."""
@@ -133,7 +133,7 @@ class Volume:
         if stamp.sensor not in self.journal.sensors:
             return None
         try:
-            key = self.journal.find(stamp.sensor, stamp.epoch, stamp.sequence)
+            key = self.journal.find(stamp.sensor, stamp.session_id, stamp.sequence)
         except DamagedError:  # there is none
             return None
         return self.journal.entry(key).crc32
@@ -143,9 +143,9 @@ class Volume:
         self.journal.close()
 
 
-def same(one: Sensor, other: Sensor) -> bool:
+def same(one: JournalSensor, other: JournalSensor) -> bool:
     """Whether a recording can hold measurements of both under one name."""
-    parts: tuple[Callable[[Sensor], object], ...] = (
+    parts: tuple[Callable[[JournalSensor], object], ...] = (
         lambda sensor: sensor.settings,
         lambda sensor: sensor.firmware,
         lambda sensor: sensor.translation_m,

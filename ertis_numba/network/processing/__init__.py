@@ -1,7 +1,7 @@
 """Processing state: worker processes make images of measurements, a publisher hands them to applications."""
 
-from ertis_numba.network.processing.options import Options
-from ertis_numba.network.processing.processing import Processing
-from ertis_numba.network.processing.queues import Counts
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.processing import ImageProcessing
+from ertis_numba.network.processing.queues import SensorCounts
 
-__all__ = ["Counts", "Options", "Processing"]
+__all__ = ["ImageProcessing", "ProcessingOptions", "SensorCounts"]

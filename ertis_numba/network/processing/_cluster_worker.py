@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.cluster import worker
+from ertis_numba.cluster import current_worker
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.network.processing.slots import POINTS_BYTES
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.chain import Chain
-    from ertis_numba.network.processing.notes import Prepared
+    from ertis_numba.network.processing.chain import SharedPipeline
+    from ertis_numba.network.processing.pipe_messages import Prepared
 
-__all__ = ["Made", "prepare", "process"]
+__all__ = ["ClusterResult", "prepare", "process"]
 
 _KEPT: Final = 8  # pipelines of a worker; the one that was used longest ago goes
 _WORDS = np.dtype("<f4")
 
 _turn = threading.Lock()
-_chains: "OrderedDict[tuple[str, str], Chain]" = OrderedDict()
+_chains: "OrderedDict[tuple[str, str], SharedPipeline]" = OrderedDict()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Made:
+class ClusterResult:
     """What came of a measurement.
 
     Attributes
@@ -57,7 +57,9 @@ def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
     return chain.prepared(kind, took_s, took_s)
 
 
-def process(settings: str, device: str, dtype: str, words: "bytes | memoryview", *, points: bool) -> "Made | str":
+def process(
+    settings: str, device: str, dtype: str, words: "bytes | memoryview", *, points: bool
+) -> "ClusterResult | str":
     """Return what is made of a measurement, or why there is nothing that could be."""
     begun_s = time.perf_counter()
     try:
@@ -66,17 +68,17 @@ def process(settings: str, device: str, dtype: str, words: "bytes | memoryview",
     except DataError as error:
         return str(error)
     found = chain.points(image, POINTS_BYTES // 16) if points else np.empty((0, 4), _WORDS)
-    energy = image.energy if dtype == "float32" else image.energy.astype(np.float16)
-    return Made(energy, found, time.perf_counter() - begun_s, _address())
+    amplitude = image.amplitude if dtype == "float32" else image.amplitude.astype(np.float16)
+    return ClusterResult(amplitude, found, time.perf_counter() - begun_s, _address())
 
 
-def _chain(settings: str, device: str) -> "Chain":
-    from ertis_numba.network.processing.chain import Chain  # noqa: PLC0415  in processes of the cluster alone
+def _chain(settings: str, device: str) -> "SharedPipeline":
+    from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in processes of the cluster alone
 
     key = (settings, device)
     with _turn:
         if key not in _chains:
-            _chains[key] = Chain(settings, device)
+            _chains[key] = SharedPipeline(settings, device)
         _chains.move_to_end(key)
         while len(_chains) > _KEPT:  # who is processing with it has it until that is done
             _chains.popitem(last=False)
@@ -87,9 +89,9 @@ def _threads(device: str) -> int:
     """Return how many threads one measurement may have, where a worker is given several at once."""
     from ertis_numba import kernels  # noqa: PLC0415
 
-    at_once = int(worker().state.nthreads)
+    at_once = int(current_worker().state.nthreads)
     return max(1, kernels.load(device).max_threads // max(1, at_once))
 
 
 def _address() -> str:
-    return str(worker().address)
+    return str(current_worker().address)

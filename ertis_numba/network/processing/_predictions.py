@@ -4,7 +4,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from ertis_numba.network.processing.notes import Predicted
+from ertis_numba.network.processing.pipe_messages import Predicted
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
@@ -50,7 +50,7 @@ class Predictions:
 
     def _report_call(self, sensor: str, measurement: "Measurement") -> None:
         """Report echoes that do not match the call."""
-        from ertis_numba.stages.call_match import call_match  # noqa: PLC0415
+        from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
 
         try:
             match = call_match(measurement)
@@ -63,7 +63,7 @@ class Predictions:
 
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
         self._report_call(sensor, measurement)
-        if image.settings.processing.method == "paper" or not image.energy.any():
+        if image.settings.processing.method == "paper" or not image.amplitude.any():
             return  # the paper's method has no plan, and silence no relative error
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
         from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415

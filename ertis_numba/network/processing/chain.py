@@ -8,15 +8,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.network.processing.notes import Prepared
+from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
-from ertis_numba.stages.points import PointExtractor
-from ertis_numba.words import word_format
 
-__all__ = ["Chain"]
+__all__ = ["SharedPipeline"]
 
 MAX_BYTES: Final = 1_000_000_000
 """Limit on the memory of one pipeline; a sensor's settings determine its size."""
@@ -24,7 +24,7 @@ MAX_BYTES: Final = 1_000_000_000
 _TIMED: Final = 5  # measurements, whose median counts
 
 
-class Chain:
+class SharedPipeline:
     """A pipeline for one kind of measurements, from their bytes to images and points; threads may share it.
 
     Parameters
@@ -43,10 +43,10 @@ class Chain:
     """
 
     def __init__(self, settings: str, device: str) -> None:
-        said = Settings.from_toml(settings, "settings of a sensor", find_line=False)
-        self.pipeline = Pipeline(said, device=device, max_bytes=MAX_BYTES, predict=False)
+        stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)
+        self.pipeline = Pipeline(stated, device=device, max_bytes=MAX_BYTES, predict=False)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
-        self.format = word_format(self.pipeline.settings)
+        self.format = sample_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)
 
     def image(
@@ -61,13 +61,13 @@ class Chain:
         """
         if len(words) != self.format.n_bytes:
             raise DataError(f"a measurement has {len(words)} bytes, which its settings do not say; say Hello again")
-        array = self.format.of_bytes(words)
+        array = self.format.from_bytes(words)
         return self.pipeline.process(Measurement(array, self.pipeline.settings), out, threads=threads)
 
-    def points(self, image: Energyscape, most: int) -> NDArray[np.float32]:
+    def points(self, image: Energyscape, largest: int) -> NDArray[np.float32]:
         """Return the points of an image, ``(point, 4)``: x, y, z in m and the energy; the strongest come first."""
         cloud = self._extractor(image)
-        rows: NDArray[np.float32] = np.column_stack([cloud.position_m, cloud.energy]).astype("<f4")[:most]
+        rows: NDArray[np.float32] = np.column_stack([cloud.position_m, cloud.amplitude]).astype("<f4")[:largest]
         return rows
 
     def times_s(self, threads: int, at_once: int) -> tuple[float, float]:

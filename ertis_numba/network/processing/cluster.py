@@ -10,14 +10,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_numba.cluster import Lines, Raised, connect
+from ertis_numba.cluster import RemoteError, WorkerActors, connect
 from ertis_numba.network.processing import _cluster_worker as there
-from ertis_numba.network.processing.notes import Prepared
-from ertis_numba.network.processing.options import Options
-from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, bytes_of
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.pipe_messages import Prepared
+from ertis_numba.network.processing.runner import (
+    Event,
+    FinishedJob,
+    Job,
+    JobKind,
+    KindFailed,
+    KindReady,
+    Lost,
+    bytes_of,
+)
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.status import WorkerStatus
-from ertis_numba.network.waker import Waker
+from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Cluster"]
 
@@ -79,14 +88,14 @@ class Cluster:
         No scheduler answers.
     """
 
-    def __init__(self, options: Options, log: Callable[[str], None]) -> None:
+    def __init__(self, options: ProcessingOptions, log: Callable[[str], None]) -> None:
         self._options, self._log = options, log
         self._address = options.cluster or ""
         self._client = connect(self._address, timeout_s=_CONNECT_S)
         self._events: deque[tuple[Any, ...]] = deque()
-        self._waker = Waker()
+        self._wakeup_socket = WakeupSocket()
         self._members: dict[str, _Member] = {}
-        self._kinds: dict[int, Kind] = {}
+        self._kinds: dict[int, JobKind] = {}
         self._prepared: dict[int, Prepared] = {}
         self._attempts: set[_Attempt] = set()
         self._free: list[Slot] = []
@@ -102,7 +111,7 @@ class Cluster:
         workers, threads = len(self._members), sum(member.threads for member in self._members.values())
         return f"up to {threads} at a time on {workers} workers of the cluster at {self._address}"
 
-    def prepare(self, kind: Kind) -> None:
+    def prepare(self, kind: JobKind) -> None:
         """See `Runner`."""
         self.forget(kind)
         self._kinds[kind.number] = kind
@@ -117,7 +126,7 @@ class Cluster:
                     call = partial(there.prepare, kind.number, kind.settings, self._options.device)
                     self._ask(member, call, self._options.prepare_s, "prepared", kind, member)
 
-    def forget(self, kind: Kind) -> None:
+    def forget(self, kind: JobKind) -> None:
         """See `Runner`."""
         self._prepared.pop(kind.number, None)
         self._kinds.pop(kind.number, None)
@@ -125,11 +134,11 @@ class Cluster:
             member.asked.discard(kind.number)
             member.ready.discard(kind.number)
 
-    def takes(self, kind: Kind) -> bool:
+    def takes(self, kind: JobKind) -> bool:
         """See `Runner`."""
         return kind.number in self._prepared and self._idle(kind) is not None
 
-    def _idle(self, kind: Kind) -> _Member | None:
+    def _idle(self, kind: JobKind) -> _Member | None:
         """Return the worker with the least to do of those that can take a job of a kind."""
         able = [each for each in self._members.values() if kind.number in each.ready and each.busy < each.threads]
         return min(able, key=lambda member: member.busy / member.threads, default=None)
@@ -161,13 +170,13 @@ class Cluster:
             result, text = None, ""
             try:
                 result = await asyncio.wait_for(member.line.call(call, *sent), within_s)
-                if isinstance(result, there.Made) and slot is not None:
+                if isinstance(result, there.ClusterResult) and slot is not None:
                     result = _kept(result, slot)
             except TimeoutError:
                 text = "it was not done in time"
             except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
                 text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            self._tell(*event, result, text)
+            self._emit_event(*event, result, text)
 
         self._client.loop.add_callback(ask)
 
@@ -186,18 +195,18 @@ class Cluster:
         slot.view.words(words_bytes)[:] = bytes_of(job.words)
         return slot
 
-    def give_back(self, slot: Slot) -> None:
+    def release(self, slot: Slot) -> None:
         """See `Runner`."""
         self._free.append(slot)
 
     def fds(self) -> Iterable[int]:
         """See `Runner`."""
-        return [self._waker.fileno()]
+        return [self._wakeup_socket.fileno()]
 
     def ready(self, fd: int) -> Sequence[Event]:
         """See `Runner`."""
-        if fd == self._waker.fileno():
-            self._waker.clear()
+        if fd == self._wakeup_socket.fileno():
+            self._wakeup_socket.clear()
         return self._heard()
 
     def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  time is the client's matter
@@ -218,27 +227,29 @@ class Cluster:
             slot.close()
         self._free.clear()
         self._attempts.clear()
-        self._waker.close()
+        self._wakeup_socket.close()
 
     def _look(self) -> None:
         """Follow which workers there are; in a thread of its own, as the scheduler may take its time."""
-        lines = Lines(self._client)
+        lines = WorkerActors(self._client)
         while not self._closing.is_set():
             try:
                 threads = {str(address): int(count) for address, count in self._client.nthreads().items()}
-                reached = lines.reached(threads.keys() - set(self._members), timeout_s=_LOOK_S)
+                reached = lines.connected(threads.keys() - set(self._members), timeout_s=_LOOK_S)
             except Exception as error:  # noqa: BLE001  whatever it is, it may pass
                 if not self._closing.is_set():
-                    self._tell("away", f"the scheduler at {self._address} does not answer ({type(error).__name__})")
+                    self._emit_event(
+                        "away", f"the scheduler at {self._address} does not answer ({type(error).__name__})"
+                    )
             else:
                 joined = [_Member(name, line, pid, threads[name]) for name, (line, pid) in reached.items()]
-                self._tell("members", threads, joined)
+                self._emit_event("members", threads, joined)
             self._closing.wait(_LOOK_S)
 
-    def _tell(self, *event: Any) -> None:
+    def _emit_event(self, *event: Any) -> None:
         """Hand something over to the loop; called in other threads."""
         self._events.append(event)
-        self._waker.wake()
+        self._wakeup_socket.wake()
 
     def _heard(self) -> list[Event]:
         found: list[Event] = []
@@ -271,7 +282,7 @@ class Cluster:
             self.respawned += 1
             self._log(f"worker {member.address} is given nothing more: {text}")
 
-    def _became_ready(self, kind: Kind, member: _Member, result: Any, text: str) -> list[Event]:
+    def _became_ready(self, kind: JobKind, member: _Member, result: Any, text: str) -> list[Event]:
         if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
             return []
         is_first = kind.number not in self._prepared
@@ -286,28 +297,28 @@ class Cluster:
         if result is None:
             self._leave(member, text)
         else:
-            told = result.text if isinstance(result, Raised) else result
-            self._log(f"worker {member.address} cannot get ready: {told}")
+            reported = result.text if isinstance(result, RemoteError) else result
+            self._log(f"worker {member.address} cannot get ready: {reported}")
         return []
 
     def _finished(self, attempt: _Attempt, result: Any, text: str) -> Event:
         job, slot, member = attempt.job, attempt.slot, attempt.member
         self._attempts.remove(attempt)
         member.busy -= 1
-        if isinstance(result, there.Made):
+        if isinstance(result, there.ClusterResult):
             job.slot, job.n_points = slot, len(result.points)
             member.done += 1
-            return Done(job, result.took_s)
+            return FinishedJob(job, result.took_s)
         self._free.append(slot)
         if isinstance(result, str):  # of which nothing can be made
             return Lost(job, result, again=False)
-        if isinstance(result, Raised):
+        if isinstance(result, RemoteError):
             return Lost(job, result.text, again=True)
         self._leave(member, text)  # so that the other try is another's
         return Lost(job, text, again=True)
 
 
-def _kept(made: there.Made, slot: Slot) -> there.Made:
+def _kept(made: there.ClusterResult, slot: Slot) -> there.ClusterResult:
     """Put what was made into a slot; in the thread of the client."""
     np.copyto(slot.view.image_as(made.image.shape, made.image.dtype), made.image)
     slot.view.points(made.points.nbytes)[:] = made.points.tobytes()

@@ -12,21 +12,21 @@ __all__ = ["Groups"]
 
 _RUNS: Final = 32  # that can be compared at a time
 _OPEN: Final = 32
-_MOST: Final = 32  # that the header of a group can name
+_MAX: Final = 32  # that the header of a group can name
 _SHORTEST_S: Final = 0.02  # between pulses, while that is not known
-_LEAST_S, _INTERVALS = 1.0, 10.0  # that an incomplete group waits for: that long, or so many intervals
+_MIN_S, _INTERVALS = 1.0, 10.0  # that an incomplete group waits for: that long, or so many intervals
 _RECENT: Final = 256  # closed groups, that are not opened again
 _FUTURE_S: Final = 0.5
 _PACE_S, _PACE = 2.0, 0.1  # a clock that stays behind for so long, but for that share of it, is wrong
 _FAR: Final = 128  # pulses that a count may be away from where time has got: less than `_RECENT`
-_MOST_NS: Final = 2**63 - 1
+_MAX_NS: Final = 2**63 - 1
 _AWAY: Final = 3.0  # as many times that: a sensor that has sent nothing for so long is not waited for
 
 Flag = Literal["incomplete", "clock", "pulse"]
 
 
 @dataclass(slots=True)
-class _Run:
+class _SessionClock:
     """A run: its measurements share a counter, and a clock."""
 
     slot: str
@@ -65,7 +65,7 @@ class Groups:
         slots = [str(number) for number in range(_RUNS)]
         self._pulses: SyncCounts[tuple[Data, int]] = SyncCounts(slots, shortest_s=_SHORTEST_S)
         self._free = slots
-        self._runs: dict[int, _Run] = {}
+        self._runs: dict[int, _SessionClock] = {}
         self._seen_ns: dict[str, int] = {}
         self._groups: dict[int, _Group] = {}
         self._recent: deque[int] = deque(maxlen=_RECENT)
@@ -74,7 +74,7 @@ class Groups:
         self._ahead_ns: int | None = None  # of the clock of all, to the one of this node
         self.closed: Counter[str] = Counter()
 
-    def know(self, sensor: str, now_ns: int) -> None:
+    def register(self, sensor: str, now_ns: int) -> None:
         """Wait for a sensor from now on."""
         if sensor not in self._seen_ns:
             self._joined_ns = now_ns
@@ -93,27 +93,27 @@ class Groups:
             self._place(self._pulses.release(now_ns + self._ahead_ns))
         return self._close(now_ns)
 
-    def _run(self, data: Data, arrived_ns: int) -> _Run:
-        if data.epoch in self._runs:
-            return self._runs[data.epoch]
+    def _run(self, data: Data, arrived_ns: int) -> _SessionClock:
+        if data.session_id in self._runs:
+            return self._runs[data.session_id]
         if not self._free:
-            oldest = min(self._runs, key=lambda epoch: self._runs[epoch].used_ns)
+            oldest = min(self._runs, key=lambda session_id: self._runs[session_id].used_ns)
             slot = self._runs.pop(oldest).slot
             self._place(self._pulses.forget(slot))
             self._free.append(slot)
         return self._begun(self._free.pop(0), data, arrived_ns, data.timestamp_ns)
 
-    def _begun(self, slot: str, data: Data, arrived_ns: int, at_ns: int) -> _Run:
+    def _begun(self, slot: str, data: Data, arrived_ns: int, at_ns: int) -> _SessionClock:
         if self._ahead_ns is None:
             self._ahead_ns = min(at_ns, time.time_ns()) - arrived_ns
         now_ns = arrived_ns + self._ahead_ns
         if at_ns - now_ns > _FUTURE_S * 1e9:
             at_ns = now_ns  # nothing comes before it was measured: that clock is wrong
-        made = _Run(slot, at_ns - data.monotonic_ns, data.sync_count, at_ns, (at_ns, arrived_ns))
-        self._runs[data.epoch] = made
+        made = _SessionClock(slot, at_ns - data.monotonic_ns, data.sync_count, at_ns, (at_ns, arrived_ns))
+        self._runs[data.session_id] = made
         return made
 
-    def _checked(self, run: _Run, data: Data, arrived_ns: int) -> _Run:
+    def _checked(self, run: _SessionClock, data: Data, arrived_ns: int) -> _SessionClock:
         """Return the run as it is to be used: begun anew, if its time or its count cannot be right."""
         at_ns = data.monotonic_ns + run.ahead_ns
         if self._ahead_ns is None:
@@ -122,7 +122,7 @@ class Groups:
             self._ahead_ns = at_ns - arrived_ns  # what came until now was old, and is caught up with
         now_ns = arrived_ns + self._ahead_ns
         since_ns, came_ns = run.paced_ns
-        behind = now_ns - at_ns > _LEAST_S * 1e9
+        behind = now_ns - at_ns > _MIN_S * 1e9
         if behind and arrived_ns - came_ns > _PACE_S * 1e9:
             behind = abs((at_ns - since_ns) - (arrived_ns - came_ns)) > _PACE * (arrived_ns - came_ns)
             at_ns = at_ns if behind else now_ns
@@ -149,10 +149,10 @@ class Groups:
 
     def _close(self, now_ns: int) -> list[Group]:
         """Close groups in order: one closes when it is complete, too old, or followed by too many."""
-        patience_ns = max(_LEAST_S * 1e9, _INTERVALS * self._pulses.interval_ns)
+        patience_ns = max(_MIN_S * 1e9, _INTERVALS * self._pulses.interval_ns)
         sensors = {name for name, seen_ns in self._seen_ns.items() if now_ns - seen_ns < _AWAY * patience_ns}
         # Sensors come one after the other at first: until then, nobody knows who is to be waited for.
-        all_here = self._joined_ns is not None and now_ns - self._joined_ns > _LEAST_S * 1e9
+        all_here = self._joined_ns is not None and now_ns - self._joined_ns > _MIN_S * 1e9
         ready = [
             number
             for number, group in self._groups.items()
@@ -177,8 +177,8 @@ class Groups:
             number=0,
             dropped=0,
             group=number,
-            members=tuple((data.sensor, data.epoch, data.sequence) for data in members[:_MOST]),
-            missing=tuple(missing[:_MOST]),
-            spread_ns=min(spread_ns, _MOST_NS),
+            members=tuple((data.sensor, data.session_id, data.sequence) for data in members[:_MAX]),
+            missing=tuple(missing[:_MAX]),
+            spread_ns=min(spread_ns, _MAX_NS),
             flags=tuple(sorted(group.flags)),
         )

@@ -10,11 +10,11 @@ from ertis_numba.network.addresses import DEFAULT_PUBLISH
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.settings import Settings
 
-__all__ = ["Options"]
+__all__ = ["ProcessingOptions"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ProcessingOptions:
     """What to make of measurements, and with what.
 
     Attributes
@@ -72,7 +72,7 @@ class Options:
         checks.positive("prepare_s", self.prepare_s)
         for name in ("workers", "threads"):
             if (value := getattr(self, name)) is not None:
-                checks.whole(name, value, 1, 256)
+                checks.integer(name, value, 1, 256)
         if self.quarantine is not None and not self.quarantine.is_dir():
             raise ArgumentError(f"quarantine {self.quarantine} is no folder; make it first")
         self.applied(Settings())

@@ -15,7 +15,7 @@ __all__ = ["Pipe"]
 Kind = TypeVar("Kind")
 
 _LENGTH: Final = struct.Struct("<I")
-_MOST_BYTES: Final = 64 * 2**20  # of a message; what is longer has not been sent by a process of ours
+_MAX_BYTES: Final = 64 * 2**20  # of a message; what is longer has not been sent by a process of ours
 _READ_BYTES: Final = 1 << 18
 _FILES: Final = 8  # with one message
 
@@ -103,7 +103,7 @@ class Pipe(Generic[Kind]):
         while size - begin >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._in, begin)
             stop = begin + _LENGTH.size + length
-            if length > _MOST_BYTES:
+            if length > _MAX_BYTES:
                 self.closed = True
                 break
             if size < stop:

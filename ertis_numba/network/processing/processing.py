@@ -7,24 +7,24 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.network.log import Log, logger
+from ertis_numba.network.log import EventLog, logger
 from ertis_numba.network.messages import Data, Group, Hello
-from ertis_numba.network.processing import notes
+from ertis_numba.network.processing import pipe_messages
 from ertis_numba.network.processing.choice import Load
+from ertis_numba.network.processing.circuit_breaker import CircuitBreaker
+from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue, entry_of
 from ertis_numba.network.processing.groups import Groups
-from ertis_numba.network.processing.options import Options
-from ertis_numba.network.processing.order import Order
-from ertis_numba.network.processing.pauses import Pauses
+from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.publisher import Publisher
-from ertis_numba.network.processing.quarantine import Quarantine, entry_of
-from ertis_numba.network.processing.queues import SUPERSEDED, Counts, Queues
-from ertis_numba.network.processing.runner import Done, Event, Job, Kind, KindFailed, KindReady, Lost, Runner
+from ertis_numba.network.processing.queues import SUPERSEDED, Queues, SensorCounts
+from ertis_numba.network.processing.reorder_buffer import ReorderBuffer
+from ertis_numba.network.processing.runner import Event, FinishedJob, Job, JobKind, KindFailed, KindReady, Lost, Runner
 from ertis_numba.network.processing.sensors import Sensors
-from ertis_numba.network.processing.workers import Workers
+from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
 from ertis_numba.settings import Settings
 
-__all__ = ["Processing"]
+__all__ = ["ImageProcessing"]
 
 _TRIES: Final = 2
 _ENDED: Final = "the central node ended"
@@ -38,7 +38,7 @@ _UNDESCRIBED: Final = "nothing describes it"
 _PAUSED: Final = "too many of its sensor have failed"
 
 
-class Processing:
+class ImageProcessing:
     """Makes images of measurements in worker processes and publishes them.
 
     It is a part of the loop of who takes measurements in: poll `fds`, call `ready` for each that can be read, and
@@ -57,22 +57,22 @@ class Processing:
         Where applications subscribe.
     """
 
-    def __init__(self, options: Options, log: Log | None = None) -> None:
+    def __init__(self, options: ProcessingOptions, log: EventLog | None = None) -> None:
         self._options = options
         self._log = log = logger("processing") if log is None else log
         self._queues = Queues()
         self._groups = Groups()
         self._publisher = Publisher(options, log)
         self._runner: Runner | None = None
-        self._quarantine: Quarantine | None = None
+        self._quarantine: DeadLetterQueue | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
         self._predicted: dict[str, int] = {}  # number of the kind whose error was predicted, by sensor
-        self._order = Order()
+        self._order = ReorderBuffer()
         self._load = Load()
         self._took = Latencies()
         self._retried = self._quarantined = 0
-        self._pauses = Pauses()
+        self._pauses = CircuitBreaker()
         self._final: ProcessingStatus | None = None
 
     @property
@@ -104,15 +104,15 @@ class Processing:
             if self._options.expected is not None:
                 self._sensors.expect(self._options.expected)
             if self._options.quarantine is not None:
-                self._quarantine = Quarantine(self._options.quarantine, self._log)
+                self._quarantine = DeadLetterQueue(self._options.quarantine, self._log)
         except BaseException:
             self.close(0.0)
             raise
 
-    def know(self, hello: Hello, settings: Settings) -> None:
+    def register(self, hello: Hello, settings: Settings) -> None:
         """Take what a sensor is, before its first measurement, and whenever it has changed."""
-        if self._sensors.know(hello, settings):
-            self._groups.know(hello.sensor, time.monotonic_ns())
+        if self._sensors.register(hello, settings):
+            self._groups.register(hello.sensor, time.monotonic_ns())
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
         """Take a measurement, which is counted from now on until it is published or dropped.
@@ -128,7 +128,7 @@ class Processing:
         now_s = time.monotonic()
         self._load.add(now_s)
         kind = self._sensors.kind_of(data)
-        self._tell(self._groups.add(data, arrived_ns))
+        self._emit_event(self._groups.add(data, arrived_ns))
         paused = self._pauses.holds(data.sensor, now_s)
         if kind is None or paused:
             self._queues.take_in(data)
@@ -160,14 +160,14 @@ class Processing:
             return
         self._handle(self._runner.tick(now_s, self._load.rate_hz(now_s)))
         self._confirm(*self._publisher.tick(now_s))
-        self._tell(self._groups.tick(time.monotonic_ns()))
+        self._emit_event(self._groups.tick(time.monotonic_ns()))
         self._sensors.tick()
         self._tidy(self._runner)
         for sensor in self._order.sensors:
             self._publish_of(sensor)
         self._dispatch()
 
-    def counts(self, sensor: str) -> Counts:
+    def counts(self, sensor: str) -> SensorCounts:
         """Return what became of a sensor's measurements."""
         return self._queues.counts_of(sensor)
 
@@ -222,7 +222,7 @@ class Processing:
                 counts.dropped[_ENDED] += counts.in_flight
                 counts.in_flight = 0
 
-    def _prepare(self, kind: Kind) -> None:
+    def _prepare(self, kind: JobKind) -> None:
         if self._runner is not None:
             self._runner.prepare(kind)
 
@@ -257,7 +257,7 @@ class Processing:
                 case KindFailed(kind=kind, text=text):
                     self._sensors.failed(kind, text)
                     self._queues.drop_kind(kind, _UNUSABLE)
-                case Done(job=job, took_s=took_s):
+                case FinishedJob(job=job, took_s=took_s):
                     self._took.add(1e3 * took_s)
                     self._order.done(job)
                     self._pauses.succeeded(job.data.sensor)
@@ -269,7 +269,12 @@ class Processing:
 
     def _lost(self, event: Lost) -> None:
         job = event.job
-        about = {"sensor": job.data.sensor, "epoch": job.data.epoch, "sequence": job.data.sequence, "text": event.text}
+        about = {
+            "sensor": job.data.sensor,
+            "session_id": job.data.session_id,
+            "sequence": job.data.sequence,
+            "text": event.text,
+        }
         job.tries += 1
         self._order.leave(job)
         if not event.again:
@@ -312,11 +317,11 @@ class Processing:
         if slot is None or self._runner is None:
             return
         if not self._publisher.serves or sensor.kind is not job.kind:
-            self._runner.give_back(slot)
+            self._runner.release(slot)
             reason = _PUBLISHER_DIED if sensor.kind is job.kind else _CHANGED
             self._queues.drop(job.data, reason)
             return
-        note = notes.Publish(
+        note = pipe_messages.Publish(
             job=job.number,
             slot=slot.number,
             data=job.data,
@@ -329,7 +334,7 @@ class Processing:
             words_bytes=job.words.nbytes,
         )
         if not self._publisher.publish(job, note):
-            self._runner.give_back(slot)
+            self._runner.release(slot)
             self._queues.drop(job.data, _UNDESCRIBED)
 
     def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job] = ()) -> None:
@@ -343,16 +348,16 @@ class Processing:
             self._queues.drop(job.data, _PUBLISHER_DIED)
         for job in (*(job for job, _ in taken), *lost):
             if job.slot is not None and self._runner is not None:
-                self._runner.give_back(job.slot)
+                self._runner.release(job.slot)
 
-    def _tell(self, groups: Iterable[Group]) -> None:
+    def _emit_event(self, groups: Iterable[Group]) -> None:
         for group in groups:
             self._publisher.group(group)
 
 
-def _runner(options: Options, log: Log) -> Runner:
+def _runner(options: ProcessingOptions, log: EventLog) -> Runner:
     if options.cluster is None:
-        return Workers(options, log)
+        return LocalWorkerPool(options, log)
     from ertis_numba.network.processing.cluster import Cluster  # noqa: PLC0415  which needs another package
 
     return Cluster(options, lambda text: log.warning("cluster", text=text))

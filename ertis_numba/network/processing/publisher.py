@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import NetworkError
-from ertis_numba.network.log import Log
+from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Description, Group
-from ertis_numba.network.processing import notes
+from ertis_numba.network.processing import pipe_messages
 from ertis_numba.network.processing.child import Child
-from ertis_numba.network.processing.notes import FromPublisher
-from ertis_numba.network.processing.options import Options
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.pipe_messages import FromPublisher
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.processing.subscribers import DESCRIPTIONS
 from ertis_numba.network.status import Status, SubscriberStatus
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Publisher"]
 
-_MODULE: Final = "ertis_numba.network.processing._publisher"
+_MODULE: Final = "ertis_numba.network.processing.publisher_process"
 # The GNU C library gives the memory of large blocks back to the system and asks for it again, which is a page fault for
 # each 4 KiB: 3600 for an image of 14 MB, and 5 of the 12 ms that the system took for it. Kept, there are 100.
 _KEEP_MEMORY: Final = {
@@ -53,7 +53,7 @@ class Publisher:
         Messages and keys that were refused, by reason.
     """
 
-    def __init__(self, options: Options, log: Log) -> None:
+    def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
         self._options, self._log = options, log
         self.address = options.publish
         self.respawned = 0
@@ -69,7 +69,7 @@ class Publisher:
         self._jobs: dict[int, Job] = {}
         self._slots: dict[int, Slot] = {}
         self._descriptions: dict[str, dict[int, tuple[Description, tuple[bytes, ...]]]] = {}  # by sensor
-        self._told: set[int] = set()
+        self._reported: set[int] = set()
         self._keys_note = ""
         self._reports_sent = self._reports_taken = 0
 
@@ -88,7 +88,7 @@ class Publisher:
                 raise NetworkError(f"{self.address} is not listened at: its process ended or hangs; try again")
             self._child.pipe.wait(0.2)
             for note in self._child.pipe.receive():
-                if isinstance(note, notes.Started) and note.error:
+                if isinstance(note, pipe_messages.Started) and note.error:
                     raise NetworkError(note.error)
                 self._take(note)
 
@@ -111,11 +111,11 @@ class Publisher:
         kept = self._descriptions.setdefault(description.sensor, {})
         kept[description.number] = description, payloads
         while len(kept) > DESCRIPTIONS:
-            self._told.discard(stale := min(kept))
+            self._reported.discard(stale := min(kept))
             del kept[stale]
 
-    def publish(self, job: Job, publish: notes.Publish) -> bool:
-        """Hand over a job that is done; `Taken` tells of it, or its death does. False if nothing describes it."""
+    def publish(self, job: Job, publish: pipe_messages.Publish) -> bool:
+        """Hand over a job that is done; `ProductsQueued` tells of it, or its death does. False if nothing describes it."""
         child, slot = self._child, job.slot
         if child is None or slot is None:
             raise AssertionError("nothing can be published now; ask serves first")
@@ -124,13 +124,15 @@ class Publisher:
             return False
         if self._slots.get(slot.number) is not slot:
             self._slots[slot.number] = slot
-            note = notes.Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
+            note = pipe_messages.SlotMemory(
+                slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes
+            )
             child.pipe.send(note, files=(slot.descriptor,))
         for number in (publish.description, publish.raw_description):
-            if number not in self._told:
-                self._told.add(number)
+            if number not in self._reported:
+                self._reported.add(number)
                 description, payloads = described[number]
-                child.pipe.send(notes.Describe(description=description, payloads=payloads))
+                child.pipe.send(pipe_messages.Describe(description=description, payloads=payloads))
         self._jobs[job.number] = job
         child.pipe.send(publish)
         return True
@@ -138,13 +140,13 @@ class Publisher:
     def group(self, group: Group) -> None:
         """Tell of a group that is closed; it is not told while the process does not listen."""
         if self._child is not None and self._serves and not self._child.pipe.waiting:
-            self._child.pipe.send(notes.Grouped(group=group))
+            self._child.pipe.send(pipe_messages.Grouped(group=group))
 
     def report(self, status: Status) -> None:
         """Tell how the central node is, if what was told before has been taken."""
         if self._child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
             self._reports_sent += 1
-            self._child.pipe.send(notes.Report(status=status.encode()))
+            self._child.pipe.send(pipe_messages.StatusNote(status=status.encode()))
 
     def fds(self) -> Iterable[int]:
         """Return what is to be polled now."""
@@ -196,19 +198,19 @@ class Publisher:
             }
         # At the port that it has had, and the host that was given: where it can be reached may be one of several.
         address = f"{self._options.publish.rpartition(':')[0]}:{self.address.rpartition(':')[2]}"
-        self._child.pipe.send(notes.Begin(address=address, **given))
+        self._child.pipe.send(pipe_messages.Begin(address=address, **given))
 
     def _take(self, note: FromPublisher) -> tuple[Job, int] | None:
         self._heard_s = time.monotonic()
         match note:
-            case notes.Started(address=address, error=error):
+            case pipe_messages.Started(address=address, error=error):
                 if error:
                     self._log.error("publisher_silent", text=error)
                 else:
                     self.address, self._serves = address, True
-            case notes.Wanted(points=points):
+            case pipe_messages.Wanted(points=points):
                 self._points = points
-            case notes.Served():
+            case pipe_messages.Served():
                 self.subscribers, self._deaths = note.subscribers, 0
                 self._reports_taken = note.reports
                 if note.keys_note not in {self._keys_note, ""}:
@@ -216,7 +218,7 @@ class Publisher:
                 self._keys_note = note.keys_note
                 names = {*self._refused_before, *note.refused}
                 self.refused = {name: self._refused_before.get(name, 0) + note.refused.get(name, 0) for name in names}
-            case notes.Taken(job=number, published_ns=published_ns):
+            case pipe_messages.ProductsQueued(job=number, published_ns=published_ns):
                 job = self._jobs.pop(number, None)
                 return None if job is None else (job, published_ns)
         return None
@@ -235,7 +237,7 @@ class Publisher:
         self._refused_before = self.refused
         self._reports_sent = self._reports_taken = 0
         self._slots.clear()
-        self._told.clear()
+        self._reported.clear()
         lost = list(self._jobs.values())
         self._jobs.clear()
         return lost

@@ -9,15 +9,15 @@ from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.status import Latencies, Percentiles
 
-__all__ = ["SUPERSEDED", "Counts", "Queues"]
+__all__ = ["SUPERSEDED", "Queues", "SensorCounts"]
 
 _QUEUE: Final = 2  # measurements of a sensor that wait; the oldest gives way to a new one
-_TOLD: Final = 4096  # of those that were dropped, until somebody asks
+_REPORTED: Final = 4096  # of those that were dropped, until somebody asks
 SUPERSEDED: Final = "superseded"
 
 
 @dataclass(slots=True)
-class Counts:
+class SensorCounts:
     """What became of one sensor's measurements.
 
     ``received = published + sum(dropped.values()) + in_flight`` at any moment.
@@ -60,16 +60,16 @@ class Queues:
     """
 
     def __init__(self) -> None:
-        self.counts: dict[str, Counts] = {}
-        self.dropped: deque[tuple[str, int, int, str]] = deque(maxlen=_TOLD)
+        self.counts: dict[str, SensorCounts] = {}
+        self.dropped: deque[tuple[str, int, int, str]] = deque(maxlen=_REPORTED)
         self._waiting: dict[str, deque[Job]] = {}
         self._again: deque[Job] = deque()  # jobs that get another try, before all others
 
-    def counts_of(self, sensor: str) -> Counts:
+    def counts_of(self, sensor: str) -> SensorCounts:
         """Return the counts of a sensor, which begin with 0."""
-        return self.counts.setdefault(sensor, Counts())
+        return self.counts.setdefault(sensor, SensorCounts())
 
-    def take_in(self, data: Data) -> Counts:
+    def take_in(self, data: Data) -> SensorCounts:
         """Count a measurement that has come; return the counts of its sensor."""
         counts = self.counts_of(data.sensor)
         counts.received += 1
@@ -81,7 +81,7 @@ class Queues:
         counts = self.counts_of(data.sensor)
         counts.dropped[reason] += 1
         counts.in_flight -= 1
-        self.dropped.append((data.sensor, data.epoch, data.sequence, reason))
+        self.dropped.append((data.sensor, data.session_id, data.sequence, reason))
 
     def add(self, job: Job, reason: str = SUPERSEDED) -> None:
         """Let a measurement wait; the oldest of its sensor is dropped, for a reason, if there are too many."""

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.network.messages import Data
-from ertis_numba.network.processing.notes import Prepared
+from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.status import WorkerStatus
 
-__all__ = ["Done", "Event", "Job", "Kind", "KindFailed", "KindReady", "Lost", "Runner", "bytes_of"]
+__all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", "Lost", "Runner", "bytes_of"]
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class JobKind:
     """Measurements that one pipeline can process.
 
     Attributes
@@ -53,13 +53,13 @@ class Job:
     predict : bool
         Predict the error of the image, and log a warning if images may exceed the budget.
     slot : Slot, optional
-        Where words and image are, once it is `Done`; to be given back.
+        Where words and image are, once it is `FinishedJob`; to be given back.
     """
 
     number: int
     data: Data
     words: NDArray[np.unsignedinteger[Any]]
-    kind: Kind
+    kind: JobKind
     arrived_ns: int
     points: bool = False
     tries: int = 0
@@ -69,7 +69,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class FinishedJob:
     """A job's image is in its slot."""
 
     job: Job
@@ -105,7 +105,7 @@ def bytes_of(words: NDArray[np.unsignedinteger[Any]]) -> memoryview:
     return np.ascontiguousarray(words).reshape(-1).view(np.uint8).data
 
 
-Event: TypeAlias = Done | Lost | KindReady | KindFailed
+Event: TypeAlias = FinishedJob | Lost | KindReady | KindFailed
 
 
 class Runner(Protocol):
@@ -124,23 +124,23 @@ class Runner(Protocol):
         """How jobs share the machine, and why, in a line."""
         ...
 
-    def prepare(self, kind: Kind) -> None:
+    def prepare(self, kind: JobKind) -> None:
         """Get ready for a kind of which jobs will come; `KindReady` or `KindFailed` follows."""
         ...
 
-    def forget(self, kind: Kind) -> None:
+    def forget(self, kind: JobKind) -> None:
         """Know that no more jobs of a kind will come."""
         ...
 
-    def takes(self, kind: Kind) -> bool:
+    def takes(self, kind: JobKind) -> bool:
         """Whether a job of a kind can be run now."""
         ...
 
     def submit(self, job: Job) -> None:
-        """Run a job, when `takes` has said so; `Done` or `Lost` follows."""
+        """Run a job, when `takes` has said so; `FinishedJob` or `Lost` follows."""
         ...
 
-    def give_back(self, slot: Slot) -> None:
+    def release(self, slot: Slot) -> None:
         """Take back the slot of a job that was done."""
         ...
 

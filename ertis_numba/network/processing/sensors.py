@@ -8,18 +8,18 @@ from typing import Final, Protocol
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import grid_count, self_contained
-from ertis_numba.network.log import Log
+from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Data, Description, Hello
-from ertis_numba.network.processing.notes import Prepared
-from ertis_numba.network.processing.options import Options
-from ertis_numba.network.processing.runner import Kind
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.pipe_messages import Prepared
+from ertis_numba.network.processing.runner import JobKind
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
-from ertis_numba.words import word_format
 
-__all__ = ["Known", "Sensors"]
+__all__ = ["RegisteredSensor", "Sensors"]
 
 _AIR_STEPS: Final = {"temperature_c": 0.5, "humidity_percent": 5.0, "pressure_pa": 1000.0}
-_MOST_BYTES: Final = 256_000_000  # of an image as float32
+_MAX_BYTES: Final = 256_000_000  # of an image as float32
 _AGAIN_S: Final = 60.0  # after which a pipeline that could not be made is tried again …
 _GREETED_S: Final = 10.0  # … and where its sensor has said Hello
 
@@ -29,13 +29,13 @@ class _Describe(Protocol):
 
 
 @dataclass(slots=True)
-class Known:
+class RegisteredSensor:
     """A sensor.
 
     Attributes
     ----------
     hello : Hello
-    said : Settings
+    stated : Settings
         As it says them.
     settings : Settings
         The same, but with air that is about that of its latest measurement.
@@ -46,9 +46,9 @@ class Known:
     """
 
     hello: Hello
-    said: Settings
+    stated: Settings
     settings: Settings
-    kind: Kind | None
+    kind: JobKind | None
     raw: int = -1
     image: int = -1
 
@@ -66,21 +66,23 @@ class Sensors:
         Called with each new kind.
     """
 
-    def __init__(self, options: Options, log: Log, *, describe: _Describe, prepare: Callable[[Kind], None]) -> None:
-        self._options, self._log, self._tell, self._prepare = options, log, describe, prepare
-        self._known: dict[str, Known] = {}
-        self._kinds: dict[str, Kind] = {}
+    def __init__(
+        self, options: ProcessingOptions, log: EventLog, *, describe: _Describe, prepare: Callable[[JobKind], None]
+    ) -> None:
+        self._options, self._log, self._emit_event, self._prepare = options, log, describe, prepare
+        self._known: dict[str, RegisteredSensor] = {}
+        self._kinds: dict[str, JobKind] = {}
         self._prepared: dict[int, Prepared] = {}
         self._unusable: dict[int, float] = {}  # since when
         self._n_kinds = self._n_descriptions = 0
 
-    def __getitem__(self, sensor: str) -> Known:
+    def __getitem__(self, sensor: str) -> RegisteredSensor:
         return self._known[sensor]
 
-    def know(self, hello: Hello, settings: Settings) -> bool:
+    def register(self, hello: Hello, settings: Settings) -> bool:
         """Take what a sensor is; return whether it is new or has changed."""
         before = self._known.get(hello.sensor)
-        if before is not None and (before.said, _place(before.hello)) == (settings, _place(hello)):
+        if before is not None and (before.stated, _place(before.hello)) == (settings, _place(hello)):
             if before.kind is not None:
                 self._try_again(before.kind, _GREETED_S)
             return False
@@ -91,13 +93,13 @@ class Sensors:
         """Get ready for a sensor that has not come yet."""
         self._kind_of("expected", settings)
 
-    def _take(self, hello: Hello, said: Settings, settings: Settings) -> None:
-        known = Known(hello, said, settings, self._kind_of(hello.sensor, settings))
+    def _take(self, hello: Hello, stated: Settings, settings: Settings) -> None:
+        known = RegisteredSensor(hello, stated, settings, self._kind_of(hello.sensor, settings))
         self._known[hello.sensor] = known
         known.raw = self._described(hello, settings.to_toml(), b"", b"", b"")
         self._describe_images(known)
 
-    def kind_of(self, data: Data) -> Kind | None:
+    def kind_of(self, data: Data) -> JobKind | None:
         """Return the kind of a measurement, None if there can be no image of it.
 
         In other air ranges are others, and so is the kind. It takes 0.5 °C, 5 % or 1 kPa to make another, as a pipeline
@@ -111,11 +113,11 @@ class Sensors:
             return None
         air = _about(came, known.settings.air)
         if air != known.settings.air:
-            self._take(known.hello, known.said, known.settings.replace(air=air))
+            self._take(known.hello, known.stated, known.settings.replace(air=air))
         kind = self._known[data.sensor].kind
         return None if kind is None or kind.number in self._unusable else kind
 
-    def is_ready(self, kind: Kind) -> bool:
+    def is_ready(self, kind: JobKind) -> bool:
         """Whether a worker has been ready for a kind."""
         return kind.number in self._prepared
 
@@ -136,16 +138,16 @@ class Sensors:
         for kind in [kind for kind in self._kinds.values() if kind.number in self._unusable]:
             self._try_again(kind, _AGAIN_S)
 
-    def _try_again(self, kind: Kind, after_s: float) -> None:
+    def _try_again(self, kind: JobKind, after_s: float) -> None:
         if time.monotonic() - self._unusable.get(kind.number, float("inf")) >= after_s:
             del self._unusable[kind.number]
             self._prepare(kind)
 
-    def shape_of(self, kind: Kind) -> tuple[int, int]:
+    def shape_of(self, kind: JobKind) -> tuple[int, int]:
         """Return directions and ranges of the images of a kind that is ready."""
         return self._prepared[kind.number].shape
 
-    def unused(self, under_way: Callable[[Kind], bool]) -> list[Kind]:
+    def unused(self, under_way: Callable[[JobKind], bool]) -> list[JobKind]:
         """Forget kinds that no sensor has any more, and of which nothing is under way; return them."""
         used = {known.kind.number for known in self._known.values() if known.kind is not None}
         if not self._known:  # then there is what was expected, if anything
@@ -157,24 +159,24 @@ class Sensors:
             self._unusable.pop(kind.number, None)
         return found
 
-    def _kind_of(self, sensor: str, settings: Settings) -> Kind | None:
+    def _kind_of(self, sensor: str, settings: Settings) -> JobKind | None:
         try:
             applied = self_contained(self._options.applied(settings)).to_toml()
-            n_bytes = word_format(settings).n_bytes
+            n_bytes = sample_format(settings).n_bytes
             _require_size(self._options.applied(settings))
         except ArgumentError as error:
             self._log.warning("unusable", sensor=sensor, text=str(error))
             return None
         if applied not in self._kinds:
             self._n_kinds += 1
-            self._kinds[applied] = Kind(self._n_kinds, applied, n_bytes)
+            self._kinds[applied] = JobKind(self._n_kinds, applied, n_bytes)
             self._prepare(self._kinds[applied])
         return self._kinds[applied]
 
-    def _of(self, kind: int) -> list[Known]:
+    def _of(self, kind: int) -> list[RegisteredSensor]:
         return [each for each in self._known.values() if each.kind is not None and each.kind.number == kind]
 
-    def _describe_images(self, known: Known) -> None:
+    def _describe_images(self, known: RegisteredSensor) -> None:
         made = None if known.kind is None else self._prepared.get(known.kind.number)
         if made is not None:
             axes = made.azimuth_rad, made.elevation_rad, made.range_m
@@ -188,7 +190,7 @@ class Sensors:
             translation_m=hello.translation_m,
             rotation_xyzw=hello.rotation_xyzw,
         )
-        self._tell(description, (settings.encode(), *axes))
+        self._emit_event(description, (settings.encode(), *axes))
         return self._n_descriptions
 
 
@@ -214,10 +216,10 @@ def _require_size(settings: Settings) -> None:
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
     grid = processing.directions if isinstance(processing.directions, str) else f"{count} directions"
     n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
-    if n_bytes > _MOST_BYTES:
+    if n_bytes > _MAX_BYTES:
         raise ArgumentError(
             f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have {n_bytes / 1e6:.0f} "
-            f"MB; give fewer directions or ranges, {_MOST_BYTES // 1_000_000} MB at most"
+            f"MB; give fewer directions or ranges, {_MAX_BYTES // 1_000_000} MB at most"
         )
 
 

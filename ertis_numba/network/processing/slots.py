@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["POINTS_BYTES", "Slot", "View"]
+__all__ = ["POINTS_BYTES", "Slot", "SlotView"]
 
 POINTS_BYTES: Final = 65_536
 """Room for the points of an image."""
@@ -20,7 +20,7 @@ def _paged(n_bytes: int) -> int:
     return -(-n_bytes // _PAGE) * _PAGE
 
 
-class View:
+class SlotView:
     """What one process sees of a slot: the words of a measurement, its image, its points.
 
     Parameters
@@ -79,7 +79,7 @@ class Slot:
         self.descriptor = _nameless()
         try:
             os.ftruncate(self.descriptor, _paged(words_bytes) + _paged(image_bytes) + POINTS_BYTES)
-            self.view = View(self.descriptor, words_bytes, image_bytes)
+            self.view = SlotView(self.descriptor, words_bytes, image_bytes)
         except BaseException:
             os.close(self.descriptor)
             raise

@@ -13,13 +13,13 @@ import zmq
 from ertis_numba.network.messages import Group, Image, Message, Points, Product, Raw, Report, Subscribe, encode
 from ertis_numba.network.status import SubscriberStatus
 
-__all__ = ["DESCRIPTIONS", "Item", "Subscriber", "Subscribers"]
+__all__ = ["DESCRIPTIONS", "ConnectedSubscriber", "QueuedProduct", "Subscribers"]
 
 DESCRIPTIONS: Final = 4
 """That are kept of each sensor: of its images and of its words, and those of before a change of its settings."""
 
-_MOST: Final = 256
-_MOST_OF_KEY: Final = 16
+_MAX: Final = 256
+_MAX_OF_KEY: Final = 16
 _DESCRIBED: Final = 16  # descriptions of each sensor that an application is taken to have still
 _SILENT_S: Final = 3.0
 _UNDER_WAY_BYTES: Final = 64_000_000  # that an application may have been sent and not yet have taken
@@ -29,7 +29,7 @@ Header: TypeAlias = Image | Points | Raw | Group | Report
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Item:
+class QueuedProduct:
     """Something to be sent, to whoever wants it.
 
     Attributes
@@ -58,7 +58,7 @@ class Item:
 
 
 @dataclass(slots=True, eq=False)
-class Subscriber:
+class ConnectedSubscriber:
     """An application that is connected.
 
     Attributes
@@ -79,7 +79,7 @@ class Subscriber:
     dropped: int = 0
     described: dict[str, deque[int]] = field(default_factory=dict)  # by sensor
     under_way: deque[int] = field(default_factory=deque)  # bytes of each product that it has not consumed yet
-    waiting: dict[tuple[str, str], tuple[int, Item]] = field(default_factory=dict)
+    waiting: dict[tuple[str, str], tuple[int, QueuedProduct]] = field(default_factory=dict)
 
     def asks_for(self, product: str, sensor: str) -> bool:
         """Whether it wants this."""
@@ -101,7 +101,7 @@ class Subscriber:
             del self.waiting[key]
             self.dropped += 1
 
-    def offer(self, item: Item) -> None:
+    def offer(self, item: QueuedProduct) -> None:
         """Give it something that it gets as soon as it has credit, unless something newer comes first."""
         if not self.asks_for(item.product, item.sensor):
             return
@@ -110,7 +110,7 @@ class Subscriber:
         self.waiting[key] = (self.number, item)
         self.number += 1
 
-    def next(self) -> tuple[tuple[str, str], int, Item] | None:
+    def next(self) -> tuple[tuple[str, str], int, QueuedProduct] | None:
         """Return what is to be sent next, if anything."""
         if not self.waiting or not self.has_credit:
             return None
@@ -143,11 +143,11 @@ class Subscribers:
 
     def __init__(self, socket: "zmq.Socket[bytes]", *, with_keys: bool = False) -> None:
         self._socket = socket
-        self._most_of_key = _MOST_OF_KEY if with_keys else _MOST
-        self._all: dict[bytes, Subscriber] = {}
+        self._max_of_key = _MAX_OF_KEY if with_keys else _MAX
+        self._all: dict[bytes, ConnectedSubscriber] = {}
         self._descriptions: dict[str, dict[int, Sequence[bytes]]] = {}
 
-    def __iter__(self) -> Iterator[Subscriber]:
+    def __iter__(self) -> Iterator[ConnectedSubscriber]:
         return (each for each in self._all.values() if each.active)
 
     def hear(self, frames: Sequence[zmq.Frame], name: str, wants: Subscribe) -> bool:
@@ -157,7 +157,7 @@ class Subscribers:
         if known is None:
             if not self._has_room(name):
                 return False
-            known = self._all[routing_id] = Subscriber(frames, name, wants, before=wants.consumed)
+            known = self._all[routing_id] = ConnectedSubscriber(frames, name, wants, before=wants.consumed)
         known.frames, known.heard_s, known.active = frames, now_s, True
         known.consumed(wants)
         self._send(routing_id, known)
@@ -167,10 +167,10 @@ class Subscribers:
         """Whether a key may have another application; those of it that are silent make room."""
         of_key = {routing_id: each for routing_id, each in self._all.items() if each.name == name}
         silent = [routing_id for routing_id, each in of_key.items() if not each.active]
-        if len(of_key) >= self._most_of_key and silent:
+        if len(of_key) >= self._max_of_key and silent:
             self.forget(min(silent, key=lambda routing_id: of_key[routing_id].heard_s))
             return self._has_room(name)
-        return len(of_key) < self._most_of_key and sum(1 for _ in self) < _MOST
+        return len(of_key) < self._max_of_key and sum(1 for _ in self) < _MAX
 
     def forget(self, routing_id: bytes) -> None:
         """Know of an application no more."""
@@ -184,7 +184,7 @@ class Subscribers:
             del kept[min(kept)]
 
     def description(self, sensor: str, number: int) -> tuple[int, Sequence[bytes]] | None:
-        """Return what products of a sensor are about, as an `Item` has it; None if that is not known (any more)."""
+        """Return what products of a sensor are about, as an `QueuedProduct` has it; None if that is not known (any more)."""
         frames = self._descriptions.get(sensor, {}).get(number)
         return None if frames is None else (number, frames)
 
@@ -199,7 +199,7 @@ class Subscribers:
             return None
         return tuple(sorted(set(itertools.chain.from_iterable(sensors or () for sensors in asked))))
 
-    def offer(self, item: Item) -> None:
+    def offer(self, item: QueuedProduct) -> None:
         """Send something to whoever wants it and has credit; the others get it, or something newer, later."""
         for routing_id, each in list(self._all.items()):
             if each.active:
@@ -217,7 +217,7 @@ class Subscribers:
             elif each.active:
                 self._send(routing_id, each)
 
-    def tell(self, message: Message) -> None:
+    def notify(self, message: Message) -> None:
         """Send a message that is no product to everybody."""
         header = encode(message)
         for routing_id in [routing_id for routing_id, each in self._all.items() if each.active]:
@@ -236,7 +236,7 @@ class Subscribers:
             for each in self
         )
 
-    def _send(self, routing_id: bytes, each: Subscriber) -> None:
+    def _send(self, routing_id: bytes, each: ConnectedSubscriber) -> None:
         while (found := each.next()) is not None:
             key, number, item = found
             if item.description is not None:

@@ -5,8 +5,8 @@ from typing import Final, Literal
 
 from ertis_numba.network.processing.child import Child
 from ertis_numba.network.processing.choice import Mode
-from ertis_numba.network.processing.notes import FromWorker, Memory
-from ertis_numba.network.processing.runner import Job, Kind
+from ertis_numba.network.processing.pipe_messages import FromWorker, SlotMemory
+from ertis_numba.network.processing.runner import Job, JobKind
 from ertis_numba.network.processing.slots import Slot
 
 __all__ = ["SLOTS", "Worker"]
@@ -51,7 +51,7 @@ class Worker:
     slots: list[Slot] = field(default_factory=list)
     free: list[Slot] = field(default_factory=list)
     kinds: set[int] = field(default_factory=set)
-    preparing: Kind | None = None
+    preparing: JobKind | None = None
     job: Job | None = None
     slot: Slot | None = None
     mode: Mode | None = None
@@ -67,7 +67,7 @@ class Worker:
             return "starting"
         return "idle" if self.job is None else "busy"
 
-    def give_memory(self, words_bytes: int, image_bytes: int) -> None:
+    def attach_memory(self, words_bytes: int, image_bytes: int) -> None:
         """See to it that it has slots that are large enough; those that are read elsewhere are given later."""
         if self.child is None:
             return
@@ -77,11 +77,11 @@ class Worker:
             self.free = list(self.slots)
         elif not all(slot.holds(words_bytes, image_bytes) for slot in self.slots):
             # What the publisher reads of the old ones, it has as long as it needs it.
-            most = max(words_bytes, self.slots[0].words_bytes), max(image_bytes, self.slots[0].image_bytes)
+            largest = max(words_bytes, self.slots[0].words_bytes), max(image_bytes, self.slots[0].image_bytes)
             for slot in self.slots:
                 slot.close()
-            self.slots = [Slot(slot.number, *most) for slot in self.slots]
+            self.slots = [Slot(slot.number, *largest) for slot in self.slots]
             self.free = list(self.slots)
         for slot in self.slots:
-            note = Memory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
+            note = SlotMemory(slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes)
             self.child.pipe.send(note, files=(slot.descriptor,))

@@ -3,6 +3,6 @@
 from ertis_numba.network.sensor_node._link import Central
 from ertis_numba.network.sensor_node._node import SensorNode
 from ertis_numba.network.sensor_node._spool import SensorCounts
-from ertis_numba.network.sensor_node._wire import Settled
+from ertis_numba.network.sensor_node._wire import Acknowledged
 
-__all__ = ["Central", "SensorCounts", "SensorNode", "Settled"]
+__all__ = ["Acknowledged", "Central", "SensorCounts", "SensorNode"]

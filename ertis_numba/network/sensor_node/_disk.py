@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Final, Literal
 
 from ertis_numba import checks
-from ertis_numba.atomic import make_folder
-from ertis_numba.errors import DamagedError, DataError, InUseError, NetworkError
-from ertis_numba.journal import LOST, SUFFIX, Entry, Gap, Journal
-from ertis_numba.network.messages import MOST_SEQUENCE
-from ertis_numba.network.sensor_node._runs import Item, Run
+from ertis_numba.atomic_files import make_folder
+from ertis_numba.errors import DamagedError, DataError, JournalInUseError, NetworkError
+from ertis_numba.journal import LOST, SUFFIX, Entry, Journal, JournalGap
+from ertis_numba.network.messages import MAX_SEQUENCE
+from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
 
 __all__ = ["DAMAGED", "SPOOL_FULL", "DiskSpool"]
@@ -35,22 +35,20 @@ class DiskSpool(Spool):
         It is made if it is not there.
     ring_bytes : int
         Of words in memory.
-    most_bytes : int or None
+    max_bytes : int or None
         Of words in the journals.
     on_note : callable
         Called with a line, from whatever thread.
     """
 
-    def __init__(
-        self, folder: Path, ring_bytes: int, most_bytes: int | None, *, on_note: Callable[[str], None]
-    ) -> None:
+    def __init__(self, folder: Path, ring_bytes: int, max_bytes: int | None, *, on_note: Callable[[str], None]) -> None:
         super().__init__(ring_bytes)
         self._folder, self._on_note = folder, on_note
-        self._limit_bytes = None if most_bytes is None else checks.whole("spool_bytes", most_bytes, 1)
+        self._limit_bytes = None if max_bytes is None else checks.integer("spool_bytes", max_bytes, 1)
         self._writing = threading.RLock()  # taken before `turn`, and never while that is held
         self._journals: dict[int, Journal] = {}  # that measurements of this process go to, by epoch
         self._found: list[Journal] = []
-        self._open_gaps: dict[tuple[str, int], Gap] = {}  # that the journal has not been told of
+        self._open_gaps: dict[tuple[str, int], JournalGap] = {}  # that the journal has not been told of
         self._discards: dict[tuple[str, int], tuple[Journal, int]] = {}
         self._failing = ""
         self._sweep_now, self._stopping = threading.Event(), threading.Event()
@@ -75,18 +73,18 @@ class DiskSpool(Spool):
             try:
                 journal = Journal.open(path)
                 try:
-                    self._tell_losses(journal)
+                    self._report_losses(journal)
                     self._take_up(journal)
                 except BaseException:
                     journal.close()
                     raise
-            except InUseError:
+            except JournalInUseError:
                 continue  # another sensor node's, or being sealed
             except DataError as error:
                 self._on_note(f"what is in {path.name} is not sent: {error}")
         self._sweeper.start()
 
-    def _tell_losses(self, journal: Journal) -> None:
+    def _report_losses(self, journal: Journal) -> None:
         """Report the losses of a damaged log; the central node receives them as gaps, too."""
         n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
         if n_lost:
@@ -95,15 +93,15 @@ class DiskSpool(Spool):
             self._on_note(f"the log of {journal.path.name} was damaged; also lost: {journal.damage}")
 
     def _take_up(self, journal: Journal) -> None:
-        runs: dict[tuple[str, int], Run] = {}
-        found = [(key.sequence, key.sequence, "", key.sensor, key.epoch) for key in journal.index()]
-        found += [(gap.first, gap.last, gap.reason, gap.sensor, gap.epoch) for gap in journal.gaps]
-        for first, last, reason, name, epoch in sorted(found):
-            if last > MOST_SEQUENCE:
+        runs: dict[tuple[str, int], OutgoingSession] = {}
+        found = [(key.sequence, key.sequence, "", key.sensor, key.session_id) for key in journal.index()]
+        found += [(gap.first, gap.last, gap.reason, gap.sensor, gap.session_id) for gap in journal.gaps]
+        for first, last, reason, name, session_id in sorted(found):
+            if last > MAX_SEQUENCE:
                 raise DataError(
-                    f"sequence number {last} is above {MOST_SEQUENCE}; seal it by 'ertis recover {journal.path}'"
+                    f"sequence number {last} is above {MAX_SEQUENCE}; seal it by 'ertis recover {journal.path}'"
                 )
-            run = runs.setdefault((name, epoch), Run(journal.sensors[name], epoch, journal))
+            run = runs.setdefault((name, session_id), OutgoingSession(journal.sensors[name], session_id, journal))
             if reason:
                 run.add_gap(first, last, reason)
             elif run.following is None or first >= run.following:
@@ -131,15 +129,15 @@ class DiskSpool(Spool):
             taken: list[Entry] = []
             refused: list[Entry] = []
             for entry in entries:
-                free_bytes -= entry.measurement.words.nbytes
+                free_bytes -= entry.measurement.data.nbytes
                 (taken if free_bytes >= 0 else refused).append(entry)
-            for epoch, group in groupby(sorted(taken, key=_epoch), _epoch):
+            for session_id, group in groupby(sorted(taken, key=_session_id), _session_id):
                 fitting = list(group)
                 try:
-                    journal = self._journal(epoch, {entry.measurement.stamp.sensor for entry in fitting})
+                    journal = self._journal(session_id, {entry.measurement.stamp.sensor for entry in fitting})
                     journal.append(fitting)
                 except DataError as error:
-                    self._tell_failure(str(error))
+                    self._report_failure(str(error))
                     refused += fitting
                 else:
                     self._failing = ""
@@ -152,15 +150,17 @@ class DiskSpool(Spool):
     def _free_bytes(self) -> float:
         if self._limit_bytes is None:
             return float("inf")
-        return self._limit_bytes - sum(counts.unsettled_bytes for counts in self.counts.values())
+        return self._limit_bytes - sum(counts.unacked_bytes for counts in self.counts.values())
 
-    def _journal(self, epoch: int, sensors: Iterable[str]) -> Journal:
+    def _journal(self, session_id: int, sensors: Iterable[str]) -> Journal:
         """Return the journal of an epoch, made if it is not there, which knows these sensors."""
-        if epoch not in self._journals:
+        if session_id not in self._journals:
             with self.turn:
-                found = next((run.journal for run in self.runs.values() if run.epoch == epoch and run.journal), None)
-            self._journals[epoch] = found or self._make_journal(epoch)
-        journal = self._journals[epoch]
+                found = next(
+                    (run.journal for run in self.runs.values() if run.session_id == session_id and run.journal), None
+                )
+            self._journals[session_id] = found or self._make_journal(session_id)
+        journal = self._journals[session_id]
         for name in sensors:
             if name not in journal.sensors:
                 sensor = self._known(name)
@@ -173,19 +173,19 @@ class DiskSpool(Spool):
                 )
         return journal
 
-    def _make_journal(self, epoch: int) -> Journal:
-        name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{epoch:016x}.h5"
+    def _make_journal(self, session_id: int) -> Journal:
+        name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{session_id:016x}.h5"
         return Journal.create(self._folder / f"{name}{SUFFIX}", target=name, source="spool of a sensor node")
 
     def _add(self, journal: Journal, entries: Iterable[Entry]) -> None:
         """Make measurements that are in the journal items to be sent."""
         for entry in entries:
-            stamp, n_bytes = entry.measurement.stamp, entry.measurement.words.nbytes
-            self._tell_gap((stamp.sensor, stamp.epoch))
+            stamp, n_bytes = entry.measurement.stamp, entry.measurement.data.nbytes
+            self._report_gap((stamp.sensor, stamp.session_id))
             with self.turn:
-                run = self._run(stamp.sensor, stamp.epoch)
+                run = self._run(stamp.sensor, stamp.session_id)
                 run.journal = journal
-                if self._held_bytes + n_bytes <= self._most_bytes:
+                if self._held_bytes + n_bytes <= self._max_bytes:
                     self._keep(run, entry)
                 else:
                     run.add_measurement(stamp.sequence, n_bytes, entry=None)
@@ -194,65 +194,65 @@ class DiskSpool(Spool):
     def _refuse(self, entry: Entry) -> None:
         """Make a gap of a measurement for which there is no room."""
         stamp = entry.measurement.stamp
-        key = stamp.sensor, stamp.epoch
+        key = stamp.sensor, stamp.session_id
         gap = self._open_gaps.get(key)
         if gap is not None and gap.last + 1 != stamp.sequence:
-            self._tell_gap(key)
+            self._report_gap(key)
             gap = None
         first = stamp.sequence if gap is None else gap.first
-        self._open_gaps[key] = Gap(stamp.sensor, first, stamp.sequence, SPOOL_FULL, stamp.epoch)
+        self._open_gaps[key] = JournalGap(stamp.sensor, first, stamp.sequence, SPOOL_FULL, stamp.session_id)
         with self.turn:
             self.counts[stamp.sensor].refused += 1
             self._run(*key).add_gap(stamp.sequence, stamp.sequence, SPOOL_FULL)
         if stamp.sequence - first >= _GAP_NUMBERS:
-            self._tell_gap(key)
+            self._report_gap(key)
 
-    def _tell_gap(self, key: tuple[str, int]) -> None:
+    def _report_gap(self, key: tuple[str, int]) -> None:
         """Make a gap durable; where the disk is too full even for that, it stays in memory."""
         gap = self._open_gaps.get(key)
         if gap is None:
             return
         with suppress(DataError):
-            self._journal(gap.epoch, [gap.sensor]).note_gap(
-                gap.sensor, gap.first, gap.last, gap.reason, epoch=gap.epoch
+            self._journal(gap.session_id, [gap.sensor]).note_gap(
+                gap.sensor, gap.first, gap.last, gap.reason, session_id=gap.session_id
             )
             del self._open_gaps[key]
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Keep which of a sensor's numbers are missing, and why; durably, if the disk allows."""
         with self._writing:
-            super().note_gap(sensor, first, last, reason, epoch=epoch)
+            super().note_gap(sensor, first, last, reason, session_id=session_id)
             try:
-                journal = self._journal(epoch, [sensor])
-                journal.note_gap(sensor, first, last, reason, epoch=epoch)
+                journal = self._journal(session_id, [sensor])
+                journal.note_gap(sensor, first, last, reason, session_id=session_id)
             except DataError as error:
-                self._tell_failure(str(error))
+                self._report_failure(str(error))
             else:
                 with self.turn:
-                    self._run(sensor, epoch).journal = journal
+                    self._run(sensor, session_id).journal = journal
 
-    def entry(self, item: Item, run: Run) -> Entry | None:
+    def entry(self, item: UnackedItem, run: OutgoingSession) -> Entry | None:
         """Return the measurement of an item, read if it is not in memory; None if it is a gap."""
         entry = item.entry
         if entry is not None or item.reason or run.journal is None:
             return entry
         try:
-            return run.journal.entry(run.journal.find(run.sensor.name, run.epoch, item.first))
+            return run.journal.entry(run.journal.find(run.sensor.name, run.session_id, item.first))
         except DamagedError as error:
             self._on_note(str(error))
             with self.turn:
                 item.reason = DAMAGED
                 counts = self.counts[run.sensor.name]
                 counts.damaged += 1
-                counts.unsettled -= 1
-                counts.unsettled_bytes -= item.n_bytes
+                counts.unacked -= 1
+                counts.unacked_bytes -= item.n_bytes
                 item.n_bytes = 0
             return None
 
     def settle(
         self,
-        run: Run,
-        done: Iterable[Item],
+        run: OutgoingSession,
+        done: Iterable[UnackedItem],
         status: Literal["stored", "accepted"],
         dropped: Sequence[tuple[int, str]] = (),
     ) -> None:
@@ -260,7 +260,7 @@ class DiskSpool(Spool):
         with self.turn:
             super().settle(run, done, status, dropped)
             if run.journal is not None:
-                self._discards[run.key] = run.journal, run.settled
+                self._discards[run.key] = run.journal, run.acked_through
                 self._sweep_now.set()
 
     def _sweep(self) -> None:
@@ -275,16 +275,16 @@ class DiskSpool(Spool):
         """Discard what is settled, and remove journals of the past in which nothing is left."""
         with self.turn:
             discards, self._discards = self._discards, {}
-        for (sensor, epoch), (journal, settled) in discards.items():
+        for (sensor, session_id), (journal, acked_through) in discards.items():
             try:
-                journal.discard(sensor, epoch, settled)
+                journal.discard(sensor, session_id, acked_through)
             except DataError as error:
-                self._tell_failure(str(error))
+                self._report_failure(str(error))
                 with self.turn:  # with the next that is settled, or at the next start
-                    self._discards.setdefault((sensor, epoch), (journal, settled))
+                    self._discards.setdefault((sensor, session_id), (journal, acked_through))
         with self._writing:
             for key in list(self._open_gaps):
-                self._tell_gap(key)
+                self._report_gap(key)
             for journal in [journal for journal in self._found if journal not in self._journals.values()]:
                 if self._is_empty(journal):
                     self._found.remove(journal)
@@ -303,10 +303,10 @@ class DiskSpool(Spool):
                     for run in [run for run in self.runs.values() if run.journal is journal]:
                         del self.runs[run.key]
         except DataError as error:
-            self._tell_failure(str(error))
+            self._report_failure(str(error))
         journal.close()
 
-    def _tell_failure(self, text: str) -> None:
+    def _report_failure(self, text: str) -> None:
         """Tell of a disk that is full or fails, once until it works again."""
         if not self._failing:
             self._on_note(text)
@@ -328,5 +328,5 @@ class DiskSpool(Spool):
         yield from dict.fromkeys([*self._found, *self._journals.values()])
 
 
-def _epoch(entry: Entry) -> int:
-    return entry.measurement.stamp.epoch
+def _session_id(entry: Entry) -> int:
+    return entry.measurement.stamp.session_id

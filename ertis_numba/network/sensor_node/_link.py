@@ -11,10 +11,10 @@ import zmq
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.sensor_node._runs import Run
+from ertis_numba.network.sensor_node._runs import OutgoingSession
 from ertis_numba.network.sensor_node._spool import Spool
-from ertis_numba.network.sensor_node._wire import Frames, Settled, frames_of, greeting
-from ertis_numba.network.waker import Waker
+from ertis_numba.network.sensor_node._wire import Acknowledged, Frames, frames_of, greeting
+from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Central", "Link"]
 
@@ -29,7 +29,7 @@ _TURN_MS = 100
 _UNDER_WAY_BYTES = 32_000_000
 _AT_ONCE = 32  # messages sent or received before the others have a turn
 _LINE_CHARACTERS = 400
-_MOST_TOLD = 256
+_MAX_REPORTED = 256
 _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused)
 
 
@@ -41,7 +41,7 @@ class Link(threading.Thread):
     address : str
     keys : ClientKeys or None
     spool : Spool
-    on_settled, on_note : callable
+    on_acked, on_note : callable
         Called from this thread; they must not raise.
 
     Attributes
@@ -58,22 +58,22 @@ class Link(threading.Thread):
         *,
         keys: ClientKeys | None,
         spool: Spool,
-        on_settled: Callable[[Settled], None],
+        on_acked: Callable[[Acknowledged], None],
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__(name=f"link to {address}", daemon=True)
         self._address, self._keys, self._spool = address, keys, spool
-        self._on_settled, self._on_note = on_settled, on_note
+        self._on_acked, self._on_note = on_acked, on_note
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: sockets.Monitor | None = None
         self._poller = zmq.Poller()
-        self._waker = Waker()
+        self._wakeup_socket = WakeupSocket()
         self._stopping = threading.Event()
         self._heard_s = self._ping_s = 0.0
         self._is_blocked = False
         self._was_there = False
-        self._told: set[tuple[str, str]] = set()  # what it was about, and the sensor
+        self._reported: set[tuple[str, str]] = set()  # what it was about, and the sensor
         self._refusals: dict[str, str] = {}  # by sensor; "" is all of them
         self._next_sensor = 0
         self._greeted: set[tuple[str, int]] = set()
@@ -88,7 +88,7 @@ class Link(threading.Thread):
 
     def wake(self) -> None:
         """Say that there is something to send."""
-        self._waker.wake()
+        self._wakeup_socket.wake()
 
     def stop(self) -> None:
         """End, and wait for it."""
@@ -98,7 +98,7 @@ class Link(threading.Thread):
             self.join()
         self._disconnect(linger_ms=_TURN_MS)
         self._context.term()
-        self._waker.close()
+        self._wakeup_socket.close()
 
     def run(self) -> None:
         """Speak with the central node until stopped."""
@@ -120,7 +120,7 @@ class Link(threading.Thread):
         self._socket = sockets.client(self._context, self._address, keys=self._keys)
         self._monitor = sockets.Monitor(self._socket)
         self._poller = zmq.Poller()
-        self._poller.register(self._waker.fileno(), zmq.POLLIN)
+        self._poller.register(self._wakeup_socket.fileno(), zmq.POLLIN)
         self._poller.register(self._monitor.socket, zmq.POLLIN)
         self._is_blocked = False
         self._greeted.clear()
@@ -144,8 +144,8 @@ class Link(threading.Thread):
             return
         self._poller.register(socket, zmq.POLLIN | (zmq.POLLOUT if self._is_blocked else 0))
         events = dict(self._poller.poll(_TURN_MS))
-        if self._waker.fileno() in events:
-            self._waker.clear()
+        if self._wakeup_socket.fileno() in events:
+            self._wakeup_socket.clear()
         if monitor.socket in events:
             for text in monitor.read():
                 self._refusals[""] = text
@@ -159,7 +159,7 @@ class Link(threading.Thread):
             return
         if now_s - self._ping_s > _PING_S and self._send(socket, [messages.encode(messages.Ping())]):
             self._ping_s = now_s
-        self._send_what_may_go(socket, now_s)
+        self._send_pending(socket, now_s)
 
     def _lose(self) -> None:
         if self.central != "away" or not self._was_there:
@@ -199,42 +199,42 @@ class Link(threading.Thread):
                 self._see(message.state, message.text)
             case messages.Welcome():
                 with self._spool.turn:
-                    run = self._spool.runs.get((message.sensor, message.epoch))
+                    run = self._spool.runs.get((message.sensor, message.session_id))
                     if run is None or run.stage != "asked":
                         return
                     for refused in ("", message.sensor):
                         self._refusals.pop(refused, None)
-                    done = run.welcome(message.settled, message.window, time.monotonic())
+                    done = run.welcome(message.acked_through, message.window, time.monotonic())
                     self._spool.settle(run, done, message.acks)
                 self._see(message.state)
                 if done:
-                    self._on_settled(Settled(*run.key, run.settled, message.acks))
+                    self._on_acked(Acknowledged(*run.key, run.acked_through, message.acks))
             case messages.Ack():
                 with self._spool.turn:
-                    run = self._spool.runs.get((message.sensor, message.epoch))
+                    run = self._spool.runs.get((message.sensor, message.session_id))
                     if run is None:
                         return
-                    done = run.settle(message.settled, time.monotonic())
+                    done = run.settle(message.acked_through, time.monotonic())
                     dropped = run.newly_dropped(message.dropped)
                     self._spool.settle(run, done, message.status, dropped)
                 if done or dropped:
-                    self._on_settled(Settled(*run.key, run.settled, message.status, dropped))
+                    self._on_acked(Acknowledged(*run.key, run.acked_through, message.status, dropped))
 
     def _see(self, state: Literal["storage", "processing", "fault", "closing"], text: str | None = None) -> None:
         """Note how the central node is, and why if it says so."""
         before, self.central = self.central, state
         if before == "away":
             self.reconnects += self._was_there
-            if self._was_there or self._told:
+            if self._was_there or self._reported:
                 self._on_note(f"the central node at {self._address} is there")
             self._was_there = True
-            self._told.clear()
+            self._reported.clear()
         if state == "fault" and text is not None:
             why = text or "it does not say why"
             self._note(f"the central node cannot store: {why}; measurements are kept", "fault")
         elif state != "fault" and before == "fault":
             self._on_note("the central node stores again")
-            self._told.clear()
+            self._reported.clear()
             with self._spool.turn:
                 for run in self._spool.runs.values():
                     run.go_back(time.monotonic())
@@ -246,21 +246,22 @@ class Link(threading.Thread):
             runs = [
                 run
                 for run in self._spool.runs.values()
-                if message.sensor in ("", run.sensor.name) and (not message.sensor or message.epoch in (0, run.epoch))
+                if message.sensor in ("", run.sensor.name)
+                and (not message.sensor or message.session_id in (0, run.session_id))
             ]
         if message.code == "hello":
             for run in runs:
                 if run.stage == "welcome":
                     run.stage = "new"
             return
-        if message.code == "size" and self._say_bye():
+        if message.code == "size" and self._send_bye():
             return
         self._refusals[message.sensor] = message.reason
         about = f" of sensor {message.sensor}" if message.sensor else ""
         text = f"the central node refuses measurements{about}: {message.reason}"
         self._wait(runs, text, f"refused {message.code}", message.sensor)
 
-    def _say_bye(self) -> bool:
+    def _send_bye(self) -> bool:
         """Have the central node forget runs that are over, which it has room for some of; whether there were any."""
         socket = self._socket
         with self._spool.turn:
@@ -274,7 +275,7 @@ class Link(threading.Thread):
                     run.stage = "new"
         return True
 
-    def _wait(self, runs: list[Run], text: str, about: str, sensor: str = "") -> None:
+    def _wait(self, runs: list[OutgoingSession], text: str, about: str, sensor: str = "") -> None:
         """Try again later, and let others pass meanwhile."""
         self._note(text, about, sensor)
         for run in runs:
@@ -282,15 +283,15 @@ class Link(threading.Thread):
 
     def _note(self, text: str, about: str, sensor: str = "") -> None:
         """Tell something once until the central node is there again, even if another number is in it each time."""
-        if (about, sensor) not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add((about, sensor))
+        if (about, sensor) not in self._reported and len(self._reported) < _MAX_REPORTED:
+            self._reported.add((about, sensor))
             self._on_note(text)
 
     # What goes.
 
-    def _active(self, now_s: float) -> list[Run]:
+    def _active(self, now_s: float) -> list[OutgoingSession]:
         """Return the runs to send of: of each sensor the oldest one that has something and is not refused."""
-        active: dict[str, Run] = {}
+        active: dict[str, OutgoingSession] = {}
         with self._spool.turn:
             for run in self._spool.runs.values():
                 if run.stage == "waiting" and now_s > run.since_s:
@@ -299,7 +300,7 @@ class Link(threading.Thread):
                     active.setdefault(run.sensor.name, run)
         return list(active.values())
 
-    def _send_what_may_go(self, socket: "zmq.Socket[bytes]", now_s: float) -> None:
+    def _send_pending(self, socket: "zmq.Socket[bytes]", now_s: float) -> None:
         runs = self._active(now_s)
         for run in runs:
             with self._spool.turn:
@@ -318,7 +319,7 @@ class Link(threading.Thread):
         if n_sent >= _AT_ONCE:
             self.wake()
 
-    def _greet(self, socket: "zmq.Socket[bytes]", run: Run, now_s: float) -> None:
+    def _greet(self, socket: "zmq.Socket[bytes]", run: OutgoingSession, now_s: float) -> None:
         with self._spool.turn:
             if not run.items:
                 return
@@ -327,7 +328,7 @@ class Link(threading.Thread):
             run.stage, run.since_s = "asked", now_s
             self._greeted.add(run.key)
 
-    def _send_next(self, socket: "zmq.Socket[bytes]", runs: list[Run], run: Run) -> bool:
+    def _send_next(self, socket: "zmq.Socket[bytes]", runs: list[OutgoingSession], run: OutgoingSession) -> bool:
         """Send the next item of a run, and return whether there was one that might and could go."""
         window = 1 if self.central == "fault" else run.window
         with self._spool.turn:

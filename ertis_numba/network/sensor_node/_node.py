@@ -7,31 +7,31 @@ from typing import Generic, Self, TypeVar
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Sensor
+from ertis_numba.journal import Entry, JournalSensor
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.log import logger
-from ertis_numba.network.messages import MOST_SEQUENCE
+from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._disk import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
-from ertis_numba.network.sensor_node._wire import Settled
+from ertis_numba.network.sensor_node._wire import Acknowledged
 from ertis_numba.settings import Settings
 
 __all__ = ["SensorNode"]
 
-Told = TypeVar("Told")
+CallbackArgument = TypeVar("CallbackArgument")
 
 
-class _Listener(Generic[Told]):
+class _UserCallback(Generic[CallbackArgument]):
     """Calls a function of the user; where that fails, it is logged once until it works again, and nothing ends."""
 
-    def __init__(self, name: str, function: Callable[[Told], None]) -> None:
+    def __init__(self, name: str, function: Callable[[CallbackArgument], None]) -> None:
         self._name, self._function, self._fails = name, function, False
 
-    def __call__(self, told: Told) -> None:
+    def __call__(self, reported: CallbackArgument) -> None:
         try:
-            self._function(told)
+            self._function(reported)
         except Exception as error:  # noqa: BLE001  measurements are sent whatever becomes of who watches
             if not self._fails:
                 logger("sensor_node").error("listener", text=f"{self._name} failed: {type(error).__name__}: {error}")
@@ -61,8 +61,8 @@ class SensorNode:
     spool_bytes : int, optional
         Of measurements in the spool; when it is full, new ones are refused and become gaps. As much as the disk
         allows by default.
-    on_settled : callable, optional
-        Called with a `Settled` when the central node has more, from another thread. An exception is logged.
+    on_acked : callable, optional
+        Called with a `Acknowledged` when the central node has more, from another thread. An exception is logged.
     on_note : callable, optional
         Called with a line about what whoever watches should know, from another thread. An exception is logged.
 
@@ -80,15 +80,15 @@ class SensorNode:
         spool: str | Path | None = None,
         ring_bytes: int = 64_000_000,
         spool_bytes: int | None = None,
-        on_settled: Callable[[Settled], None] = lambda _: None,
+        on_acked: Callable[[Acknowledged], None] = lambda _: None,
         on_note: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
-        self._on_settled, self._on_note = _Listener("on_settled", on_settled), _Listener("on_note", on_note)
+        self._on_acked, self._on_note = _UserCallback("on_acked", on_acked), _UserCallback("on_note", on_note)
         if spool_bytes is not None and spool is None:
             raise ArgumentError("spool_bytes is given without a spool; give its folder, too")
-        checks.whole("ring_bytes", ring_bytes, 1)
+        checks.integer("ring_bytes", ring_bytes, 1)
         self._spool = (
             Spool(ring_bytes)
             if spool is None
@@ -99,7 +99,7 @@ class SensorNode:
     def __enter__(self) -> Self:
         self._spool.open()
         self._link = Link(
-            self._address, keys=self._keys, spool=self._spool, on_settled=self._on_settled, on_note=self._on_note
+            self._address, keys=self._keys, spool=self._spool, on_acked=self._on_acked, on_note=self._on_note
         )
         self._link.start()
         return self
@@ -134,7 +134,9 @@ class SensorNode:
         ArgumentError
             No recording could hold this, or a measurement is longer than the memory.
         """
-        made = Sensor.of(name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
+        made = JournalSensor.of(
+            name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
+        )
         self._spool.add_sensor(made)
 
     def append(self, entries: Sequence[Entry]) -> list[Entry]:
@@ -160,7 +162,7 @@ class SensorNode:
         self._wake()
         return kept
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Say why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
 
         Raises
@@ -169,9 +171,11 @@ class SensorNode:
             There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
             bytes.
         """
-        checks.gap(first, last, reason)
-        last = checks.whole("last missing sequence number", last, 0, MOST_SEQUENCE)
-        self._spool.note_gap(sensor, int(first), last, reason, epoch=checks.whole("epoch", epoch, 0, 2**63 - 1))
+        checks.sequence_gap(first, last, reason)
+        last = checks.integer("last missing sequence number", last, 0, MAX_SEQUENCE)
+        self._spool.note_gap(
+            sensor, int(first), last, reason, session_id=checks.integer("session_id", session_id, 0, 2**63 - 1)
+        )
         self._wake()
 
     def _wake(self) -> None:
@@ -195,9 +199,9 @@ class SensorNode:
         return self._spool.counts_now()
 
     @property
-    def unsettled(self) -> int:
+    def unacked(self) -> int:
         """Measurements that the central node does not have yet, as far as it has said."""
-        return sum(counts.unsettled for counts in self.counts.values())
+        return sum(counts.unacked for counts in self.counts.values())
 
     @property
     def central(self) -> Central:

@@ -7,20 +7,20 @@ from itertools import islice
 from typing import Final, Literal
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Journal, Sensor
+from ertis_numba.journal import Entry, Journal, JournalSensor
 
-__all__ = ["MEMORY_FULL", "NEVER_GIVEN", "Item", "Run"]
+__all__ = ["MEMORY_FULL", "NEVER_GIVEN", "OutgoingSession", "UnackedItem"]
 
 MEMORY_FULL: Final = "the sensor node's memory was full"
 NEVER_GIVEN: Final = "the sensor node never had it"
 
 _GAPS = 64  # at the front of a run; where there are more, the memory is too full to tell them apart
 _PATIENCE_S = 1.0  # without progress, before all under way is sent again; doubled while there is none
-_MOST_PATIENCE_S = 8.0
+_MAX_PATIENCE_S = 8.0
 
 
 @dataclass(slots=True, eq=False)
-class Item:
+class UnackedItem:
     """A measurement or a gap, to be settled in its turn.
 
     Attributes
@@ -43,7 +43,7 @@ class Item:
 
 
 @dataclass(slots=True, eq=False)
-class Run:
+class OutgoingSession:
     """The items of one epoch of a sensor, oldest first, and a window over them that is sent: go-back-N.
 
     Where sending is, is kept as numbers, so that items may change places or become others meanwhile. Who uses a run
@@ -52,12 +52,12 @@ class Run:
     Attributes
     ----------
     sensor : Sensor
-    epoch : int
+    session_id : int
     journal : Journal or None
     items : deque of Item
     following : int or None
         The number after the last item; None before the first.
-    settled : int
+    acked_through : int
         Up to which the central node has everything.
     sent : int
         Up to which everything was sent.
@@ -70,12 +70,12 @@ class Run:
     window : int
     """
 
-    sensor: Sensor
-    epoch: int
+    sensor: JournalSensor
+    session_id: int
     journal: Journal | None = None
-    items: deque[Item] = field(default_factory=deque)
+    items: deque[UnackedItem] = field(default_factory=deque)
     following: int | None = None
-    settled: int = -1
+    acked_through: int = -1
     sent: int = -1
     reached: int = -1
     stage: Literal["new", "asked", "welcome", "waiting"] = "new"
@@ -89,13 +89,13 @@ class Run:
     @property
     def key(self) -> tuple[str, int]:
         """Sensor and epoch."""
-        return self.sensor.name, self.epoch
+        return self.sensor.name, self.session_id
 
-    def add_measurement(self, number: int, n_bytes: int, *, entry: Entry | None) -> Item:
+    def add_measurement(self, number: int, n_bytes: int, *, entry: Entry | None) -> UnackedItem:
         """Add a measurement at the end; what is missing before it is a gap, too."""
         self.require_above(number)
         self._fill(number)
-        return self._add(Item(number, number, "", n_bytes, entry))
+        return self._add(UnackedItem(number, number, "", n_bytes, entry))
 
     def require_above(self, number: int) -> None:
         """Refuse a number that does not rise."""
@@ -118,20 +118,20 @@ class Run:
             self._under_way = min(self._under_way, len(self.items) - 1)
             self.following = last + 1
         else:
-            self._add(Item(first, last, reason))
+            self._add(UnackedItem(first, last, reason))
 
     def _fill(self, number: int) -> None:
         if self.following is not None and self.following < number:
             self.add_gap(self.following, number - 1, NEVER_GIVEN)
 
-    def _add(self, item: Item) -> Item:
+    def _add(self, item: UnackedItem) -> UnackedItem:
         if self.following is None:
-            self.settled = self.sent = self.reached = item.first - 1
+            self.acked_through = self.sent = self.reached = item.first - 1
         self.items.append(item)
         self.following = item.last + 1
         return item
 
-    def forget_oldest(self) -> Item | None:
+    def forget_oldest(self) -> UnackedItem | None:
         """Make a gap of the oldest measurement, and return what it was."""
         gaps = []
         while self.items and self.items[0].reason:
@@ -140,14 +140,14 @@ class Run:
             self.items.extend(gaps)
             return None
         oldest = self.items.popleft()
-        gaps.append(Item(oldest.first, oldest.last, MEMORY_FULL))
+        gaps.append(UnackedItem(oldest.first, oldest.last, MEMORY_FULL))
         while len(gaps) > 1 and (gaps[-2].reason == MEMORY_FULL or len(gaps) > _GAPS):
-            gaps[-2:] = [Item(gaps[-2].first, gaps[-1].last, MEMORY_FULL)]
+            gaps[-2:] = [UnackedItem(gaps[-2].first, gaps[-1].last, MEMORY_FULL)]
         self.items.extendleft(reversed(gaps))
         self._under_way = 0  # counted again by `to_send`
         return oldest
 
-    def to_send(self, window: int) -> Item | None:
+    def to_send(self, window: int) -> UnackedItem | None:
         """Return the first item that was not sent, if the window has room for it."""
         self._count_under_way()
         if self._under_way >= min(window, len(self.items)):
@@ -158,7 +158,7 @@ class Run:
         while self._under_way < len(self.items) and self.items[self._under_way].last <= self.sent:
             self._under_way += 1
 
-    def under_way(self) -> Iterator[Item]:
+    def under_way(self) -> Iterator[UnackedItem]:
         """Yield what was sent and is not settled."""
         self._count_under_way()
         return islice(self.items, self._under_way)
@@ -173,23 +173,25 @@ class Run:
 
     def go_back(self, now_s: float) -> None:
         """Send everything that is not settled again."""
-        self.sent, self._under_way, self._moved_s = self.settled, 0, now_s
+        self.sent, self._under_way, self._moved_s = self.acked_through, 0, now_s
 
-    def welcome(self, settled: int, window: int, now_s: float) -> list[Item]:
+    def welcome(self, acked_through: int, window: int, now_s: float) -> list[UnackedItem]:
         """Begin to send, and return what was settled before."""
         self.stage, self.since_s, self.window = "welcome", now_s, window
         last = -1 if self.following is None else self.following - 1
-        settled = min(settled, last)  # it may have more than is left here, as when the end of a spool was lost
-        self.reached = max(self.reached, settled)
-        done = self.settle(settled, now_s)
+        acked_through = min(
+            acked_through, last
+        )  # it may have more than is left here, as when the end of a spool was lost
+        self.reached = max(self.reached, acked_through)
+        done = self.settle(acked_through, now_s)
         self.go_back(now_s)
         return done
 
-    def settle(self, number: int, now_s: float) -> list[Item]:
+    def settle(self, number: int, now_s: float) -> list[UnackedItem]:
         """Return what an ack settles, which is not held any more; none where it is late or no ack of this."""
-        if not self.settled < number <= self.reached:
+        if not self.acked_through < number <= self.reached:
             return []
-        self.settled, self._moved_s, self._patience_s = number, now_s, _PATIENCE_S
+        self.acked_through, self._moved_s, self._patience_s = number, now_s, _PATIENCE_S
         self.sent = max(self.sent, number)
         done = []
         while self.items and self.items[0].last <= number:
@@ -203,7 +205,7 @@ class Run:
         """Whether acks have not moved for too long; asked again, it is patient for longer."""
         if not self._under_way or now_s - self._moved_s < self._patience_s:
             return False
-        self._patience_s = min(2 * self._patience_s, _MOST_PATIENCE_S)
+        self._patience_s = min(2 * self._patience_s, _MAX_PATIENCE_S)
         return True
 
     def newly_dropped(self, dropped: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Literal
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
-from ertis_numba.journal import Entry, Sensor, require_same
-from ertis_numba.network.messages import MOST_SEQUENCE
-from ertis_numba.network.sensor_node._runs import Item, Run
+from ertis_numba.journal import Entry, JournalSensor, require_same
+from ertis_numba.network.messages import MAX_SEQUENCE
+from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 __all__ = ["SensorCounts", "Spool"]
 
 _NAME_CHARACTERS = 64  # of a sensor, on the wire
-_SETTLED_IN_ORDER = 1000  # items
+_ACKED_IN_ORDER = 1000  # items
 
 
 @dataclass(slots=True)
 class SensorCounts:
     """What became of one sensor's measurements at its node so far.
 
-    ``accepted = stored + taken + overwritten + damaged + unsettled``, of those that this process has accepted or found
+    ``accepted = stored + taken + overwritten + damaged + unacked``, of those that this process has accepted or found
     in its spool.
 
     Attributes
@@ -48,9 +48,9 @@ class SensorCounts:
         Measurements that the spool holds damaged.
     missing : Counter of str
         Numbers that were told to be missing, by reason, by whoever gives measurements.
-    unsettled : int
+    unacked : int
         Measurements that are held.
-    unsettled_bytes : int
+    unacked_bytes : int
     """
 
     accepted: int = 0
@@ -61,8 +61,8 @@ class SensorCounts:
     overwritten: int = 0
     damaged: int = 0
     missing: Counter[str] = field(default_factory=Counter)
-    unsettled: int = 0
-    unsettled_bytes: int = 0
+    unacked: int = 0
+    unacked_bytes: int = 0
 
 
 class Spool:
@@ -70,41 +70,41 @@ class Spool:
 
     Parameters
     ----------
-    most_bytes : int
+    max_bytes : int
         Of words in memory.
 
     Attributes
     ----------
     turn : threading.RLock
         To be held while `runs` or `counts` are looked at.
-    settled : threading.Condition
+    acked_through : threading.Condition
         Of that lock; told whenever something has been settled.
     runs : dict of (sensor, epoch) to Run
         Oldest first.
     counts : dict of str to SensorCounts
     """
 
-    def __init__(self, most_bytes: int) -> None:
-        self._most_bytes = checks.whole("ring_bytes", most_bytes, 1)
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = checks.integer("ring_bytes", max_bytes, 1)
         self._held_bytes = 0
         self.turn = threading.RLock()
-        self.settled = threading.Condition(self.turn)
-        self.runs: dict[tuple[str, int], Run] = {}
+        self.acked_through = threading.Condition(self.turn)
+        self.runs: dict[tuple[str, int], OutgoingSession] = {}
         self.counts: dict[str, SensorCounts] = {}
-        self._sensors: dict[str, Sensor] = {}
+        self._sensors: dict[str, JournalSensor] = {}
         self._accepted: dict[str, Settings] = {}
-        self._order: deque[tuple[Run, Item]] = deque()  # of arrival
+        self._order: deque[tuple[OutgoingSession, UnackedItem]] = deque()  # of arrival
 
-    def add_sensor(self, sensor: Sensor) -> None:
+    def add_sensor(self, sensor: JournalSensor) -> None:
         """Tell of a sensor before its first measurement, or of what it is in epochs that will follow."""
         if len(sensor.name) > _NAME_CHARACTERS:
             raise ArgumentError(
                 f"sensor name {sensor.name!r} has {len(sensor.name)} characters; give {_NAME_CHARACTERS} at most"
             )
-        if sensor.n_bytes > self._most_bytes:
+        if sensor.n_bytes > self._max_bytes:
             raise ArgumentError(
                 f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, and the memory has room for "
-                f"{self._most_bytes}; give ring_bytes (--ring) that hold some"
+                f"{self._max_bytes}; give ring_bytes (--ring) that hold some"
             )
         with self.turn:
             self._sensors[sensor.name] = sensor
@@ -116,7 +116,7 @@ class Spool:
         with self.turn:
             self.check(entries)
             for entry in entries:
-                run = self._run(entry.measurement.stamp.sensor, entry.measurement.stamp.epoch)
+                run = self._run(entry.measurement.stamp.sensor, entry.measurement.stamp.session_id)
                 self._keep(run, entry)
             self._forget_oldest()
             self._tidy()
@@ -132,19 +132,21 @@ class Spool:
                 require_same(sensor, settings)
                 self._accepted[sensor.name] = settings
             # Checked: words are contiguous and little-endian, and numbers are Python's, as what encodes them wants.
-            _, epoch, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(entry, 0)
-            checks.whole("sequence", number, 0, MOST_SEQUENCE)
+            _, session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(
+                entry, 0
+            )
+            checks.integer("sequence", number, 0, MAX_SEQUENCE)
             stamp = Stamp(
                 sensor=sensor.name,
                 sequence=number,
                 sync_count=sync_count,
                 timestamp_ns=time_ns,
                 timestamp_uncertainty_ns=uncertainty_ns,
-                epoch=epoch,
+                session_id=session_id,
             )
             entry.measurement = type(entry.measurement)(words, settings, stamp)
             entry.monotonic_ns, entry.crc32 = rest[0], crc32
-            key = stamp.sensor, stamp.epoch
+            key = stamp.sensor, stamp.session_id
             if stamp.sequence <= last.get(key, -1):
                 raise ArgumentError(
                     f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in "
@@ -154,38 +156,38 @@ class Spool:
                 self.runs[key].require_above(stamp.sequence)
             last[key] = stamp.sequence
 
-    def _known(self, name: str) -> Sensor:
+    def _known(self, name: str) -> JournalSensor:
         if name not in self._sensors:
             raise ArgumentError(f"sensor {name!r} is not known to this sensor node; add it first")
         return self._sensors[name]
 
-    def _run(self, sensor: str, epoch: int) -> Run:
+    def _run(self, sensor: str, session_id: int) -> OutgoingSession:
         """Return a run, begun if it is new; then earlier ones of this sensor that are empty are over."""
-        key = sensor, epoch
+        key = sensor, session_id
         if key not in self.runs:
             for run in [run for run in self.runs.values() if run.sensor.name == sensor and not run.items]:
                 del self.runs[run.key]
-            self.runs[key] = Run(self._known(sensor), epoch)
+            self.runs[key] = OutgoingSession(self._known(sensor), session_id)
         return self.runs[key]
 
-    def _keep(self, run: Run, entry: Entry) -> Item:
+    def _keep(self, run: OutgoingSession, entry: Entry) -> UnackedItem:
         """Add a measurement that is in memory to its run, and count it."""
-        n_bytes = entry.measurement.words.nbytes
+        n_bytes = entry.measurement.data.nbytes
         item = run.add_measurement(entry.measurement.stamp.sequence, n_bytes, entry=entry)
         self._held_bytes += n_bytes
         self._order.append((run, item))
         self._count_kept(run, n_bytes)
         return item
 
-    def _count_kept(self, run: Run, n_bytes: int) -> None:
+    def _count_kept(self, run: OutgoingSession, n_bytes: int) -> None:
         counts = self.counts[run.sensor.name]
         counts.accepted += 1
-        counts.unsettled += 1
-        counts.unsettled_bytes += n_bytes
+        counts.unacked += 1
+        counts.unacked_bytes += n_bytes
 
     def _forget_oldest(self) -> None:
         """Make gaps of the oldest measurements, until the others have room."""
-        while self._held_bytes > self._most_bytes:
+        while self._held_bytes > self._max_bytes:
             run, item = self._order.popleft()
             if item.entry is None:  # settled already
                 continue
@@ -194,28 +196,28 @@ class Spool:
             self._held_bytes -= item.n_bytes
             counts = self.counts[run.sensor.name]
             counts.overwritten += 1
-            counts.unsettled -= 1
-            counts.unsettled_bytes -= item.n_bytes
+            counts.unacked -= 1
+            counts.unacked_bytes -= item.n_bytes
 
     def _tidy(self) -> None:
         """Forget the order of what has been settled, which a sensor that is not let in would keep for ever."""
-        if len(self._order) > 2 * sum(counts.unsettled for counts in self.counts.values()) + _SETTLED_IN_ORDER:
+        if len(self._order) > 2 * sum(counts.unacked for counts in self.counts.values()) + _ACKED_IN_ORDER:
             self._order = deque(pair for pair in self._order if pair[1].entry is not None)
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, epoch: int) -> None:
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Keep which of a sensor's numbers are missing, and why."""
         with self.turn:
-            self._run(sensor, epoch).add_gap(first, last, reason)
+            self._run(sensor, session_id).add_gap(first, last, reason)
             self.counts[sensor].missing[reason] += last - first + 1
 
-    def entry(self, item: Item, run: Run) -> Entry | None:  # noqa: ARG002  another spool has to ask the run
+    def entry(self, item: UnackedItem, run: OutgoingSession) -> Entry | None:  # noqa: ARG002  another spool has to ask the run
         """Return the measurement of an item; None if it has become a gap."""
         return item.entry
 
     def settle(
         self,
-        run: Run,
-        done: Iterable[Item],
+        run: OutgoingSession,
+        done: Iterable[UnackedItem],
         status: Literal["stored", "accepted"],
         dropped: Sequence[tuple[int, str]] = (),
     ) -> None:
@@ -230,14 +232,14 @@ class Spool:
                     counts.stored += 1
                 else:
                     counts.taken += 1
-                counts.unsettled -= 1
-                counts.unsettled_bytes -= item.n_bytes
-                self._let_go(item)
+                counts.unacked -= 1
+                counts.unacked_bytes -= item.n_bytes
+                self._discard(item)
             while self._order and self._order[0][1].entry is None:
                 self._order.popleft()
-            self.settled.notify_all()
+            self.acked_through.notify_all()
 
-    def _let_go(self, item: Item) -> None:
+    def _discard(self, item: UnackedItem) -> None:
         if item.entry is not None:
             item.entry = None
             self._held_bytes -= item.n_bytes
@@ -250,7 +252,7 @@ class Spool:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or stop():
                     return False
-                self.settled.wait(min(left_s, 0.1))
+                self.acked_through.wait(min(left_s, 0.1))
             return True
 
     @property

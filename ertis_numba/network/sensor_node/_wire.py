@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 from ertis_numba.journal import Entry
 from ertis_numba.network import messages
-from ertis_numba.network.sensor_node._runs import Item, Run
+from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 
 if TYPE_CHECKING:
     from ertis_numba.network.fields import Position, Quaternion
 
-__all__ = ["Frames", "Settled", "frames_of", "greeting"]
+__all__ = ["Acknowledged", "Frames", "frames_of", "greeting"]
 
 Frames: TypeAlias = "list[bytes | memoryview]"
 
@@ -19,14 +19,14 @@ _FIRMWARE_CHARACTERS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
+class Acknowledged:
     """What an ack has brought.
 
     Attributes
     ----------
     sensor : str
-    epoch : int
-    settled : int
+    session_id : int
+    acked_through : int
         Up to which every number is stored or accepted, or known to be missing.
     status : {"stored", "accepted"}
         What is settled is on the disk of the central node, or in its memory.
@@ -35,18 +35,18 @@ class Settled:
     """
 
     sensor: str
-    epoch: int
-    settled: int
+    session_id: int
+    acked_through: int
     status: Literal["stored", "accepted"]
     dropped: tuple[tuple[int, str], ...] = ()
 
 
-def greeting(run: Run) -> Frames:
+def greeting(run: OutgoingSession) -> Frames:
     """Return what introduces a run that has items."""
     settings = run.sensor.settings.to_toml().encode()
     hello = messages.Hello(
         sensor=run.sensor.name,
-        epoch=run.epoch,
+        session_id=run.session_id,
         next_sequence=run.items[0].first,
         settings_crc32=zlib.crc32(settings),
         firmware=run.sensor.firmware[:_FIRMWARE_CHARACTERS],
@@ -56,18 +56,18 @@ def greeting(run: Run) -> Frames:
     return [messages.encode(hello), settings]
 
 
-def frames_of(run: Run, item: Item, entry: Entry | None) -> tuple[Frames, int]:
+def frames_of(run: OutgoingSession, item: UnackedItem, entry: Entry | None) -> tuple[Frames, int]:
     """Return an item as it goes over the wire, and its last number as it was then."""
     if entry is None:
         first, last = item.first, item.last
         gap = messages.Gap(
-            sensor=run.sensor.name, epoch=run.epoch, first=first, last=max(first, last), reason=item.reason
+            sensor=run.sensor.name, session_id=run.session_id, first=first, last=max(first, last), reason=item.reason
         )
         return [messages.encode(gap)], last
     stamp, air = entry.measurement.stamp, entry.measurement.settings.air
     data = messages.Data(
         sensor=run.sensor.name,
-        epoch=run.epoch,
+        session_id=run.session_id,
         sequence=stamp.sequence,
         sync_count=stamp.sync_count,
         timestamp_ns=stamp.timestamp_ns,
@@ -78,4 +78,4 @@ def frames_of(run: Run, item: Item, entry: Entry | None) -> tuple[Frames, int]:
         pressure_pa=float(air.pressure_pa),
         crc32=entry.crc32 or 0,
     )
-    return [messages.encode(data), entry.measurement.words.data.cast("B")], stamp.sequence
+    return [messages.encode(data), entry.measurement.data.data.cast("B")], stamp.sequence

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-__all__ = ["FRAME", "Frames", "band_bins", "drawn", "window"]
+__all__ = ["FRAME", "OverlappingFrames", "band_bins", "drawn", "window"]
 
 Floats = NDArray[np.float64]
 
@@ -17,7 +17,7 @@ _EARLIEST = 2**32  # frames begin before the record, and a seed is no negative n
 _SHARED = 3  # frames that reach from one block into the next
 
 
-class Frames:
+class OverlappingFrames:
     """Sums frames of half overlap; under `window` their powers add up to 1.
 
     Parameters

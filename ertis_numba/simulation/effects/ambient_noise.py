@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ertis_numba.simulation.effects._frames import FRAME, Frames, band_bins, drawn, window
+from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.sources import Ambient
 
@@ -12,7 +12,7 @@ _OWN = 1e-6  # share of each microphone alone: below some kilohertz all hear the
 _NODE_HZ = 2000.0  # coherence of microphones 15 cm apart changes by a few hundredths from one to the next
 
 
-def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> Frames:
+def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> OverlappingFrames:
     """Return a diffuse field: plane waves from all sides, alike in level and independent.
 
     Of two microphones d apart its coherence is ``sin(k d) / (k d)`` (R. K. Cook et al., Measurement of correlation
@@ -30,4 +30,4 @@ def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> Fr
     coherence = np.sinc(2 * apart_m / shot.speed_m_s * np.maximum(places, 0.5)[:, None, None] * _NODE_HZ)
     mix = np.linalg.cholesky(coherence + _OWN * np.eye(len(every)))[:, np.searchsorted(every, shot.channels)]
     level = 10 ** (ambient.level_dbfs / 20)
-    return Frames(seed, lambda random: level * drawn(random, bins, mix[nodes]) * window())
+    return OverlappingFrames(seed, lambda random: level * drawn(random, bins, mix[nodes]) * window())

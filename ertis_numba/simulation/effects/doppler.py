@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.snapshot import Ear, Mouth
+from ertis_numba.simulation.snapshot import ReceiverPose, TransmitterPose
 
 __all__ = ["doppler"]
 
@@ -29,38 +29,40 @@ def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
 
 def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     """Return when what is sent at some time arrives: (path, mic) float64."""
-    mouth, ear = paths.mouth, paths.ear
-    sent_m = mouth.position_m + start_s * _own_m_s(mouth)
-    target_m = mouth.position_m + paths.first_m[..., None] * paths.leaving
+    transmitter, receiver = paths.transmitter, paths.receiver
+    sent_m = transmitter.position_m + start_s * _own_m_s(transmitter)
+    target_m = transmitter.position_m + paths.first_m[..., None] * paths.leaving
     met_s = start_s + paths.first_m / speed_m_s
     arrival_s = met_s + paths.second_m / speed_m_s
-    mouth_sways, ear_sways = (any(np.any(sway_m_s) for sway_m_s in end.sways_m_s) for end in (mouth, ear))
+    transmitter_sways, receiver_sways = (
+        any(np.any(sway_m_s) for sway_m_s in end.sways_m_s) for end in (transmitter, receiver)
+    )
     for _ in range(_ROUNDS):
         before_s, from_m = arrival_s, sent_m
-        if mouth_sways:  # a wall is met when the same part of the way is done as if nothing moved
+        if transmitter_sways:  # a wall is met when the same part of the way is done as if nothing moved
             done = (met_s if len(paths.targets) else arrival_s) - start_s
             whole_m = paths.first_m if len(paths.targets) else paths.second_m
-            from_m = sent_m + _swayed_m(mouth, start_s + paths.mouth_corners_m * _mean(done, whole_m))
+            from_m = sent_m + _swayed_m(transmitter, start_s + paths.transmitter_corners_m * _mean(done, whole_m))
         met_m = from_m
         if len(paths.targets):
             met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
             met_s = start_s + _length(met_m - from_m) / speed_m_s
-        ear_m = ear.positions_m + arrival_s[..., None] * _own_m_s(ear)
-        if ear_sways:
+        receiver_m = receiver.positions_m + arrival_s[..., None] * _own_m_s(receiver)
+        if receiver_sways:
             back = _mean(arrival_s - met_s, paths.second_m)
-            ear_m = ear_m + _swayed_m(ear, np.mean(arrival_s, axis=1) - paths.ear_corners_m * back)
-        arrival_s = (met_s if len(paths.targets) else start_s) + _length(ear_m - met_m) / speed_m_s
+            receiver_m = receiver_m + _swayed_m(receiver, np.mean(arrival_s, axis=1) - paths.receiver_corners_m * back)
+        arrival_s = (met_s if len(paths.targets) else start_s) + _length(receiver_m - met_m) / speed_m_s
         if np.abs(arrival_s - before_s).max() < _ENOUGH_S:
             break
     return arrival_s
 
 
-def _own_m_s(end: Mouth | Ear) -> Floats:
+def _own_m_s(end: TransmitterPose | ReceiverPose) -> Floats:
     """Return the velocity of an image without what the walls add."""
     return np.asarray(end.velocity_m_s - sum(end.sways_m_s, np.zeros(3)))
 
 
-def _swayed_m(end: Mouth | Ear, met_s: Floats) -> Floats:
+def _swayed_m(end: TransmitterPose | ReceiverPose, met_s: Floats) -> Floats:
     """Return how far walls have moved an image when the sound meets them, (wall, path): (path, 1, axis) float64."""
     sway_m = np.zeros((met_s.shape[1], 1, 3))
     for velocity_m_s, at_s in zip(end.sways_m_s, met_s, strict=True):

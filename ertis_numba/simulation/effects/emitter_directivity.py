@@ -20,7 +20,7 @@ def emitter_directivity(
     microphones where they hear the same target.
     """
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
-    cos = leaving @ paths.mouth.facing
+    cos = leaving @ paths.transmitter.facing
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
     pattern = piston(math.pi * diameter_m / speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))

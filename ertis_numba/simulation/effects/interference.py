@@ -6,11 +6,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._frames import FRAME, Frames, band_bins, drawn, window
+from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.paths import Paths, without_target
 from ertis_numba.simulation.placed import Placed
-from ertis_numba.simulation.snapshot import Mouth, Snapshot
+from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 from ertis_numba.simulation.sources import Noise, Sonar, Tone
 
 __all__ = ["add_tone", "calls_of", "noise_of", "way_from"]
@@ -18,10 +18,10 @@ __all__ = ["add_tone", "calls_of", "noise_of", "way_from"]
 
 def way_from(shot: Snapshot, source: Placed) -> Paths:
     """Return the straight way from a source to the microphones; it sends alike in all directions."""
-    mouth = Mouth(
+    transmitter = TransmitterPose(
         position_m=source.position_at(shot.time_s), velocity_m_s=source.velocity_at(shot.time_s), facing=np.zeros(3)
     )
-    return without_target(mouth, shot.ear, shot.targets)
+    return without_target(transmitter, shot.receiver, shot.targets)
 
 
 def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: int) -> None:
@@ -36,13 +36,13 @@ def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: in
     signals += np.outer(amplitude * np.sin(start_rad), np.cos(swing_rad))
 
 
-def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> Frames:
+def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> OverlappingFrames:
     """Return the noise of one source: the same for all microphones but for delay and ``1 / r``.
 
     The frame is delayed window and all, so that microphones far apart hear the same.
     """
     way, rate_hz = way_from(shot, noise), shot.sensor.recording.sample_rate_hz
-    apart_m = way.length_m[0] - np.linalg.norm(way.mouth.position_m - shot.ear.centre_m)
+    apart_m = way.length_m[0] - np.linalg.norm(way.transmitter.position_m - shot.receiver.centre_m)
     late_samples = apart_m / shot.speed_m_s * rate_hz
     amplitude = 10 ** (noise.level_db / 20) * spreading(way)[0]
     margin = math.ceil(np.abs(late_samples).max()) + 1
@@ -55,7 +55,7 @@ def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> Frames:
         spectrum = scipy.fft.rfft(drawn(random, bins, alone)[0] * window(), n_fft)
         return np.asarray(amplitude[:, None] * scipy.fft.irfft(spectrum * turned, n_fft))
 
-    return Frames(seed, heard, margin=margin)
+    return OverlappingFrames(seed, heard, margin=margin)
 
 
 def calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:

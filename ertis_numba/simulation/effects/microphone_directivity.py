@@ -19,7 +19,7 @@ def microphone_directivity(
     By reciprocity a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and nothing
     from behind.
     """
-    cos = -paths.arriving @ paths.ear.axes[0]
+    cos = -paths.arriving @ paths.receiver.axes[0]
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
     pattern = piston(math.pi * diameter_m / speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))

@@ -26,6 +26,6 @@ def stick_numbers(
     numbers: NDArray[np.int16] | NDArray[np.float32], electronics: Electronics, full_scale: float
 ) -> None:
     """Set stuck channels of PCM to either end of the scale, in place: (sample, channel)."""
-    most = full_scale - 1 if numbers.dtype.kind == "i" else full_scale
+    largest = full_scale - 1 if numbers.dtype.kind == "i" else full_scale
     numbers[:, list(electronics.stuck_low)] = -full_scale
-    numbers[:, list(electronics.stuck_high)] = most
+    numbers[:, list(electronics.stuck_high)] = largest

@@ -10,14 +10,16 @@ from ertis_numba.simulation.effects.rigid_sphere import LARGE, rigid_sphere
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.paths import Paths, turning, unit
-from ertis_numba.simulation.snapshot import Ear, Mouth, Targets
+from ertis_numba.simulation.snapshot import ReceiverPose, Targets, TransmitterPose
 
 __all__ = ["over_surfaces", "patterns"]
 
 Floats = NDArray[np.float64]
 
 
-def over_surfaces(first: Seen[Mouth], second: Seen[Ear], targets: Targets, chosen: NDArray[np.intp]) -> Paths:
+def over_surfaces(
+    first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
+) -> Paths:
     """Return paths that turn on the surface of spheres rather than in their centre.
 
     The arguments are those of `by_targets`.
@@ -54,11 +56,11 @@ def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | N
 
 def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDArray[np.complex128]:
     """Return the gain from the sound at a disc to its echo at each microphone: (disc, mic, frequency) complex128."""
-    to_ear, to_mouth = paths.arriving[chosen], -paths.leaving[chosen]
+    to_receiver, to_transmitter = paths.arriving[chosen], -paths.leaving[chosen]
     normal, radius_m = paths.targets.normals[chosen, None], paths.targets.diameter_m[chosen, None] / 2
-    both = to_ear + to_mouth
+    both = to_receiver + to_transmitter
     aside = np.linalg.norm(both - np.sum(both * normal, axis=-1, keepdims=True) * normal, axis=-1)
     bent_m = 1 / np.maximum(paths.first_m[chosen], NEAREST_M) + 1 / np.maximum(paths.second_m[chosen], NEAREST_M)
     pattern = disc((radius_m * aside)[..., None] * wave, (radius_m**2 * bent_m)[..., None] * wave)
-    seen = (np.sum(to_ear * normal, axis=-1) > 0) & (np.sum(to_mouth * normal, axis=-1) > 0)
+    seen = (np.sum(to_receiver * normal, axis=-1) > 0) & (np.sum(to_transmitter * normal, axis=-1) > 0)
     return np.where(seen[..., None], pattern, 0.0)

@@ -1,0 +1,116 @@
+"""Figures of bits and signals: shares, spectra over time, and lines in them. What they mean is told in health.py."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.fft
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+__all__ = [
+    "ROUNDING",
+    "Shares",
+    "bit_shares",
+    "bits_of",
+    "common_lines",
+    "decibels",
+    "octets_of",
+    "rises",
+    "signal_of",
+    "spectrogram",
+]
+
+ROUNDING = 1e-14
+"""Power below which spectra in single precision tell nothing, full scale 1."""
+_LONGEST_PATTERN = 32  # samples; no modulator with noise or dither repeats itself over a whole record
+_RUN_DOUBLINGS = 4  # 2⁴ equal neighbours: 17 equal bits
+_SURROUNDINGS = 12  # lines to either side
+_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
+
+
+class Shares(NamedTuple):
+    """Of eight channels, each (bit,).
+
+    Attributes
+    ----------
+    ones, changes : float64
+        Share of ones, and of samples at which the bit changes.
+    runs : float64
+        Share of places where 17 equal bits begin.
+    repeats : bool
+        Whether the whole record repeats a pattern of 2 to 32 samples.
+    """
+
+    ones: NDArray[np.float64]
+    changes: NDArray[np.float64]
+    runs: NDArray[np.float64]
+    repeats: NDArray[np.bool_]
+
+
+def octets_of(words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.uint8]:
+    """Return words, (sample, word), as (sample, octet), bit b of octet k being channel 8 k + b."""
+    return np.ascontiguousarray(words).view(np.uint8)
+
+
+def bits_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.uint8]:
+    """Return the bits of a channel as 0 and 1: (sample,) uint8."""
+    return np.asarray(octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1))
+
+
+def signal_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.float32]:
+    """Return the bits of a channel as −1 and 1: (sample,) float32."""
+    return np.asarray(2 * bits_of(octets, channel).astype(np.float32) - 1)
+
+
+def bit_shares(column: NDArray[np.uint8]) -> Shares:
+    """Return what can be counted in an octet per sample: (sample,) uint8, 33 samples at least."""
+    differs = column[1:] ^ column[:-1]
+    runs = ~differs
+    for doubling in range(_RUN_DOUBLINGS):
+        runs = runs[1 << doubling :] & runs[: -(1 << doubling)]
+    repeats = np.uint8(0)
+    for period in range(2, _LONGEST_PATTERN + 1):
+        repeats |= ~np.bitwise_or.reduce(column[period:] ^ column[:-period])
+    return Shares(_ones(column), _ones(differs), _ones(runs), _BITS[repeats] > 0)
+
+
+def _ones(column: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return np.asarray(np.bincount(column, minlength=256) @ _BITS / len(column))
+
+
+def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDArray[np.float32]:
+    """Return the power of a signal over time and frequency: (segment, line) float32.
+
+    Periodograms under a Hann window, of segments that overlap by half (P. D. Welch, The use of fast Fourier
+    transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). All ``size / 2``
+    lines of white noise add up to its mean square, full scale 1. scipy.signal, which has the same, takes
+    longer to import than everything here to run.
+    """
+    segments = sliding_window_view(signal, size)[:: size // 2]
+    window = np.hanning(size + 1)[:-1].astype(np.float32)
+    lines = scipy.fft.rfft(segments * window)[:, :n_lines]
+    return np.asarray((lines.real**2 + lines.imag**2) * np.float32(2 / size / (window @ window)))
+
+
+def rises(level_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how many decibels lines stand out of the median of those around: (mic, line) float64."""
+    around = np.pad(level_db, ((0, 0), (_SURROUNDINGS, _SURROUNDINGS)), mode="reflect")
+    return np.asarray(level_db - np.median(sliding_window_view(around, 2 * _SURROUNDINGS + 1, axis=1), axis=-1))
+
+
+def common_lines(rise_db: NDArray[np.float64], min_db: float, share: float) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return which lines stand out in more than a share of channels, (line,) bool, and the highest of each group.
+
+    One line to either side counts as the same.
+    """
+    apart = np.pad(rise_db, ((0, 0), (1, 1)), constant_values=-np.inf)
+    near_db = np.max(sliding_window_view(apart, 3, axis=1), axis=-1)
+    is_common = np.mean(near_db > min_db, axis=0) > share
+    middle_db = np.where(is_common, np.median(rise_db, axis=0), -np.inf)
+    groups = np.split(np.flatnonzero(is_common), np.flatnonzero(np.diff(np.flatnonzero(is_common)) > 1) + 1)
+    return is_common, [int(group[np.argmax(middle_db[group])]) for group in groups if len(group)]
+
+
+def decibels(power: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return levels, none below that of rounding."""
+    return np.asarray(10 * np.log10(np.maximum(power, ROUNDING)), dtype=np.float64)

@@ -1,0 +1,305 @@
+"""From reflectors found to errors: what an image shows against what it ought to show."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.frames import Energyscape, Peak, Reflector
+from ertis_numba.geometry import array_weights, microphones, unit_vectors
+from ertis_numba.settings import Settings
+from ertis_numba.waveform import matched_filter_spectrum
+
+__all__ = ["Comparison", "Errors", "Match", "compare", "errors_of"]
+
+_GATE_M = 0.1  # between a reflector and its peak
+_GATE_HALF_LOBES = 3.0  # one and a half main lobes
+_HALF_AMPLITUDE = math.sqrt(2 * math.log(2))  # where exp(-x² / 2) is a half
+_SLACK_DB = 3.0  # by which a level in the image may differ from the true one
+_MAX_FALSE = 100  # noise alone has thousands of maxima, which tell no more than a hundred
+_MIN_DB = -1000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """A reflector and the peak that shows it.
+
+    Attributes
+    ----------
+    reflector : Reflector
+    peak : Peak
+    angle_deg : float
+        Between the two directions; between the two azimuths where the image is planar.
+    range_m : float
+        How much too far the peak is.
+    level_db : float
+        How much too strong the peak is, both below the strongest reflector that was found.
+    """
+
+    reflector: Reflector
+    peak: Peak
+    angle_deg: float
+    range_m: float
+    level_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """What one image shows against what it ought to show.
+
+    Attributes
+    ----------
+    matched : tuple of Match
+        In the order of the reflectors.
+    missed : tuple of Reflector
+        Those that the image ought to show and does not.
+    false : tuple of Peak
+        Those that no reflector explains.
+    explained : tuple of Peak
+        Those of reflectors that do not count, being too weak or outside of the image, of another sensor's call, or
+        mirrored by a plane array.
+    """
+
+    matched: tuple[Match, ...]
+    missed: tuple[Reflector, ...]
+    false: tuple[Peak, ...]
+    explained: tuple[Peak, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Errors:
+    """Errors over many images.
+
+    Attributes
+    ----------
+    measurements, matched, missed, false : int
+    angle_rms_deg, range_bias_m, range_rms_m, level_rms_db : float or None
+        Of what was matched, None if nothing was; the bias is above 0 where peaks are too far.
+    """
+
+    measurements: int
+    angle_rms_deg: float | None
+    range_bias_m: float | None
+    range_rms_m: float | None
+    level_rms_db: float | None
+    missed: int
+    false: int
+    matched: int
+
+
+def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db: float = -30.0) -> Comparison:
+    """Return which reflectors an image shows, and which it does not.
+
+    A reflector counts if the image can show it: it returns the sensor's own call, its range lies on the range axis,
+    its direction within half of the main lobe of the nearest direction, and its level is at least ``min_level_db``
+    below the strongest that counts. Peaks are assigned to those one to one, such that as many as possible lie
+    within 0.1 m and one and a half main lobes, at the least sum of squared distances (the
+    assignment problem, solved by SciPy after D. F. Crouse, 2016). At most 100 peaks more than reflectors are
+    looked for.
+
+    Parameters
+    ----------
+    image : Energyscape
+    reflectors : sequence of Reflector
+        The truth of the measurement that the image was made from.
+    min_level_db : float
+
+    Raises
+    ------
+    ArgumentError
+        ``min_level_db`` is above 0.
+    """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))
+    checks.between("min_level_db", min_level_db, _MIN_DB, 0.0)
+    lobe = _Lobe(image.settings)
+    in_view = _in_view(image, reflectors, lobe)
+    in_range = _in_range(image, reflectors)
+    is_shown = in_view & in_range & np.array([not reflector.emitter for reflector in reflectors], dtype=np.bool_)
+    levels_db = np.array([reflector.level_db for reflector in reflectors])
+    strongest_db = float(np.max(levels_db, where=is_shown, initial=_MIN_DB))
+    counts = is_shown & (levels_db >= strongest_db + min_level_db)
+    counted = [reflector for reflector, does in zip(reflectors, counts, strict=True) if does]
+
+    # What does not count may still be the strongest in the image, or leak into it.
+    above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
+    floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
+    peaks = find_peaks(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db)
+    pairs = _assign(image, counted, peaks, lobe)
+    # Peaks are below the strongest peak, reflectors below the strongest reflector: one found gives the step.
+    step_db = _step_db(pairs, strongest_db if counted else 0.0)
+
+    min_db = min_level_db + (strongest_db if counted else 0.0) - step_db
+    left = [peak for peak in peaks if peak.level_db >= min_db and not any(peak is taken for _, taken in pairs)]
+    is_due = _explained(image, reflectors, left, lobe, in_view=in_view, counts=counts, step_db=step_db)
+    return Comparison(
+        matched=tuple(_match(image, reflector, peak, step_db) for reflector, peak in pairs),
+        missed=tuple(reflector for reflector in counted if not any(reflector is found for found, _ in pairs)),
+        false=tuple(peak for peak, due in zip(left, is_due, strict=True) if not due),
+        explained=tuple(peak for peak, due in zip(left, is_due, strict=True) if due),
+    )
+
+
+def errors_of(comparisons: Iterable[Comparison]) -> Errors:
+    """Return the errors over all reflectors of several images."""
+    given = list(comparisons)
+    matches = [match for comparison in given for match in comparison.matched]
+    ranges_m = [match.range_m for match in matches]
+    return Errors(
+        measurements=len(given),
+        angle_rms_deg=_rms(match.angle_deg for match in matches),
+        range_bias_m=math.fsum(ranges_m) / len(ranges_m) if ranges_m else None,
+        range_rms_m=_rms(ranges_m),
+        level_rms_db=_rms(match.level_db for match in matches),
+        missed=sum(len(comparison.missed) for comparison in given),
+        false=sum(len(comparison.false) for comparison in given),
+        matched=len(matches),
+    )
+
+
+def _rms(values: Iterable[float]) -> float | None:
+    squares = [value**2 for value in values]
+    return math.sqrt(math.fsum(squares) / len(squares)) if squares else None
+
+
+class _Lobe:
+    """How far the main lobe of an array reaches.
+
+    Near a reflector its amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``: Δu is the difference of the unit
+    vectors, C the weighted covariance of the microphones' positions and k the wave number at the centre of the
+    call. For the shipped layouts this gives the width at half amplitude within a tenth.
+
+    Attributes
+    ----------
+    half_deg : float
+        Half of the width at half amplitude, in the direction in which it is least; infinite for a
+        single microphone.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        positions_m = microphones(settings.array).enabled_positions_m
+        rate_hz = settings.signal_rate_hz
+        n_fft = math.ceil(settings.call.duration_s * rate_hz) + 1
+        centre_hz = matched_filter_spectrum(settings, n_fft=n_fft).centre_hz
+        wave_1_m = 2 * math.pi * centre_hz / sound_speed_m_s(settings.air)
+        scale = wave_1_m / _HALF_AMPLITUDE / math.sqrt(len(positions_m))
+        self._reach = scale * positions_m * np.sqrt(array_weights(settings))[:, None]
+        largest = float(np.linalg.norm(self._reach, ord=2))
+        self.half_deg = math.degrees(1 / largest) if largest else math.inf
+
+    def __call__(self, direction_offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far directions are apart for the array, in halves of its main lobe: (...,) float64.
+
+        It is 0 between a direction and its mirror image behind a plane array.
+
+        Parameters
+        ----------
+        direction_offset : (..., axis) float64
+            Difference of the unit vectors.
+        """
+        return np.asarray(np.linalg.norm(direction_offset @ self._reach.T, axis=-1))
+
+
+def _in_view(image: Energyscape, reflectors: Sequence[Reflector], lobe: _Lobe) -> NDArray[np.bool_]:
+    """Return which reflectors lie in the solid angle of an image: (reflector,) bool."""
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    chords = np.array([np.min(np.linalg.norm(directions - unit, axis=1)) for unit in _units(reflectors)])
+    return np.asarray(_degrees_between(chords) <= lobe.half_deg)
+
+
+def _in_range(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
+    """Return which reflectors lie on the range axis: (reflector,) bool; its ends can be no maximum."""
+    inner_m = image.range_m[1:-1] if len(image.range_m) > 2 else image.range_m
+    ranges_m = np.array([reflector.range_m for reflector in reflectors])
+    return np.asarray((ranges_m >= inner_m[0]) & (ranges_m <= inner_m[-1]))
+
+
+def _assign(
+    image: Energyscape, counted: Sequence[Reflector], peaks: Sequence[Peak], lobe: _Lobe
+) -> list[tuple[Reflector, Peak]]:
+    """Return which peak shows which reflector."""
+    if not counted or not peaks:
+        return []
+    angles = _angles_deg(image, counted, peaks) / (_GATE_HALF_LOBES * lobe.half_deg)
+    ranges = _range_offsets_m(counted, peaks) / _GATE_M
+    near = (angles <= 1) & (np.abs(ranges) <= 1)
+    dear = 2.0 * min(near.shape) + 1  # more than all that are near together
+    rows, columns = scipy.optimize.linear_sum_assignment(np.where(near, angles**2 + ranges**2, dear))
+    return [(counted[row], peaks[column]) for row, column in zip(rows, columns, strict=True) if near[row, column]]
+
+
+def _step_db(pairs: Sequence[tuple[Reflector, Peak]], strongest_db: float) -> float:
+    """Return what to add to the level of a peak to compare it with those of reflectors."""
+    if not pairs:
+        return strongest_db
+    reflector, peak = max(pairs, key=lambda pair: pair[0].level_db)
+    return reflector.level_db - peak.level_db
+
+
+def _match(image: Energyscape, reflector: Reflector, peak: Peak, step_db: float) -> Match:
+    return Match(
+        reflector=reflector,
+        peak=peak,
+        angle_deg=float(_angles_deg(image, [reflector], [peak])[0, 0]),
+        range_m=peak.range_m - reflector.range_m,
+        level_db=peak.level_db + step_db - reflector.level_db,
+    )
+
+
+def _explained(
+    image: Energyscape,
+    reflectors: Sequence[Reflector],
+    peaks: Sequence[Peak],
+    lobe: _Lobe,
+    *,
+    in_view: NDArray[np.bool_],
+    counts: NDArray[np.bool_],
+    step_db: float,
+) -> NDArray[np.bool_]:
+    """Return which peaks are due to reflectors that need not be found there: (peak,) bool.
+
+    Those are the ones that do not count, the mirror images of all behind the array, and the side lobes
+    of what lies outside of the solid angle, which `find_peaks` cannot know.
+    """
+    if not peaks or not reflectors:
+        return np.zeros(len(peaks), dtype=np.bool_)
+    offsets = _units(reflectors)[:, None] - _units(peaks)[None]
+    alike = lobe(offsets) <= _GATE_HALF_LOBES
+    apart = _angles_deg(image, reflectors, peaks) > _GATE_HALF_LOBES * lobe.half_deg
+    weaker = np.array([peak.level_db + step_db for peak in peaks]) <= np.array(
+        [[reflector.level_db + _SLACK_DB] for reflector in reflectors]
+    )
+    near = np.abs(_range_offsets_m(reflectors, peaks)) <= _GATE_M
+    due = near & ((alike & (apart | ~counts[:, None])) | (weaker & ~in_view[:, None]))
+    return np.asarray(np.any(due, axis=0))
+
+
+def _units(places: Sequence[Reflector] | Sequence[Peak]) -> NDArray[np.float64]:
+    """Return the directions as unit vectors: (place, axis) float64."""
+    angles_rad = np.radians([[place.azimuth_deg, place.elevation_deg] for place in places]).reshape(-1, 2)
+    return unit_vectors(angles_rad[:, 0], angles_rad[:, 1])
+
+
+def _degrees_between(chords: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angle between unit vectors from the length of their difference."""
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(chords / 2, 1.0))))
+
+
+def _angles_deg(image: Energyscape, reflectors: Sequence[Reflector], peaks: Sequence[Peak]) -> NDArray[np.float64]:
+    """Return the angles between reflectors and peaks: (reflector, peak) float64."""
+    if image.is_planar:
+        azimuths = ([place.azimuth_deg for place in places] for places in (reflectors, peaks))
+        difference = np.subtract.outer(*azimuths)
+        return np.asarray(np.abs((difference + 180) % 360 - 180))
+    return _degrees_between(np.linalg.norm(_units(reflectors)[:, None] - _units(peaks)[None], axis=-1))
+
+
+def _range_offsets_m(reflectors: Sequence[Reflector], peaks: Sequence[Peak]) -> NDArray[np.float64]:
+    """Return how much farther peaks are than reflectors: (reflector, peak) float64."""
+    return np.subtract.outer([peak.range_m for peak in peaks], [reflector.range_m for reflector in reflectors]).T

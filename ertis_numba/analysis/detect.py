@@ -1,0 +1,153 @@
+"""From energyscapes to reflectors."""
+
+import math
+
+import numpy as np
+import scipy.spatial
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.analysis.noise import threshold_of
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator
+from ertis_numba.analysis.side_lobes import SideLobes
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["find_peaks", "neighbours_of", "spacing_of"]
+
+_NEIGHBOURS = 8  # directions around one in the plane of a dense grid
+
+
+def find_peaks(
+    image: Energyscape,
+    *,
+    top: int | None = 10,
+    min_level_db: float = -30.0,
+    where: NDArray[np.bool_] | None = None,
+    false_alarm: float | None = None,
+) -> list[Peak]:
+    """Return the reflectors of an image, strongest first.
+
+    A reflector is a local maximum over directions and ranges that exceeds the side lobes of all stronger reflectors
+    there, see `ertis_numba.analysis.side_lobes.SideLobes`. So each gives one entry, not one per bin of its main lobe nor
+    one per side lobe. Direction, range and level are interpolated: see
+    `ertis_numba.analysis.peak_interpolation.PeakInterpolator`.
+
+    Parameters
+    ----------
+    image : Energyscape
+    top : int, optional
+        At most so many; None for all.
+    min_level_db : float
+        Level below the strongest reflector at which to stop.
+    where : (direction, range) bool, optional
+        Bins that may be the maximum of a reflector; all by default.
+    false_alarm : float, optional
+        Probability that noise alone gives a reflector anywhere in the image. Weaker maxima are left out, except for
+        beamformers whose noise is unknown: see `ertis_numba.analysis.noise.threshold_of`. By default, maxima of noise
+        count as reflectors.
+
+    Raises
+    ------
+    ArgumentError
+        ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
+        ``false_alarm`` is not between 0 and 1.
+    """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    top = image.amplitude.size if top is None else checks.integer("top", top, 1)
+    checks.between("min_level_db", min_level_db, -1000.0, 0.0)
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    neighbours = neighbours_of(directions)
+    highest = float(np.max(image.amplitude, initial=0.0))
+    floor = checks.finite("the maximum of the image", highest) * 10 ** (min_level_db / 20)
+    if false_alarm is not None:
+        floor = max(floor, threshold_of(image, false_alarm))
+    if where is not None:
+        where = np.asarray(where)
+        checks.shape("where", where.shape, image.amplitude.shape)
+        if where.dtype != np.bool_:
+            raise ArgumentError(f"where holds {where.dtype}; give bool, such as image.energy > 0.01")
+    places = _local_maxima(image.amplitude, neighbours, floor, where)
+    levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
+    order = np.argsort(-levels, kind="stable")
+    side_lobes = SideLobes(image, directions, places[order])
+    interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
+    found: list[tuple[NDArray[np.float64], float, float]] = []
+    for k in order:
+        if len(found) == top:
+            break
+        # Only what comes next in order is compared with what was found, which is few of many candidates, and
+        # with where that really lies: a side lobe is several decibels off when its reflector is half a bin off.
+        if side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
+            continue
+        tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
+        found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
+        side_lobes.add(*found[-1])
+    found.sort(key=lambda entry: -entry[2])
+    return [
+        Peak(
+            azimuth_deg=math.degrees(math.atan2(direction[1], direction[0])),
+            elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, direction[2])))),
+            range_m=range_m,
+            level_db=20 * math.log10(level / found[0][2]),
+            level_dbfs=20 * math.log10(level),
+        )
+        for direction, range_m, level in found
+    ]
+
+
+def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return for each direction itself and the nearest others.
+
+    In a plane these are the ones next to it; elsewhere the eight around it.
+
+    Parameters
+    ----------
+    directions : (direction, axis) float64
+        Unit vectors.
+
+    Returns
+    -------
+    (direction, neighbour) int64
+        Fewer neighbours where there are too few directions.
+    """
+    count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
+    _, nearest = scipy.spatial.KDTree(directions).query(directions, k=min(count + 1, len(directions)))
+    return np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)
+
+
+def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the distance from each direction to the nearest other, in radians: (direction,) float64.
+
+    Infinite where there is no other. Neighbours are those of `neighbours_of`.
+    """
+    if neighbours.shape[1] < 2:
+        return np.full(len(directions), np.inf)
+    return np.asarray(np.linalg.norm(directions[neighbours[:, 1]] - directions, axis=1))
+
+
+def _local_maxima(
+    amplitude: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float, where: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
+    """Return (peak, [direction, range]) of what is above ``floor`` and not below any neighbour.
+
+    The first and the last range are no maxima: what rises towards them lies outside of the image.
+    """
+    inner = slice(1, -1) if amplitude.shape[1] > 2 else slice(None)
+    start = inner.start or 0
+    here = amplitude[:, inner]
+    is_peak = (here >= floor) & (here > 0)
+    if where is not None:
+        is_peak &= where[:, inner]
+    if start:
+        is_peak &= (here >= amplitude[:, :-2]) & (here > amplitude[:, 2:])
+    # Only what is left is compared over directions; that is few.
+    directions, ranges = np.nonzero(is_peak)
+    ranges += start
+    around = amplitude[neighbours[directions], ranges[:, None]]
+    highest = around.max(axis=1, initial=0.0) <= amplitude[directions, ranges]
+    # Of two equal neighbours the first counts.
+    equal = (around == amplitude[directions, ranges][:, None]) & (neighbours[directions] < directions[:, None])
+    keep = highest & ~equal.any(axis=1)
+    return np.stack([directions[keep], ranges[keep]], axis=1)

@@ -1,0 +1,49 @@
+"""The points of images that come one after the other, of any sensors."""
+
+from typing import Any
+
+import numpy as np
+
+from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.geometry import Grid
+
+__all__ = ["PointFinder", "same_directions"]
+
+
+class PointFinder:
+    """Finds the points of images of any sensors, with an extractor for each as long as it suits.
+
+    Parameters
+    ----------
+    top, min_level_db : optional
+        As for `ertis_numba.analysis.points.PointExtractor`.
+    """
+
+    def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:
+        given = {"top": top, "min_level_db": min_level_db}
+        self._finding: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
+
+    def __call__(self, image: Energyscape) -> PointCloud:
+        """Return the points of an image, in the frame of its sensor."""
+        known = self._extractors.get(image.stamp.sensor)
+        if known is None or not _suits(known[0], image):
+            grid = Grid(image.azimuth_rad, image.elevation_rad)
+            extractor = PointExtractor(image.settings, grid, **self._finding)
+            known = self._extractors[image.stamp.sensor] = image, extractor
+        return known[1](image)
+
+
+def _suits(image: Energyscape, other: Energyscape) -> bool:
+    """Whether the extractor of an image is that of another: air and processing may differ."""
+    ours, theirs = image.settings, other.settings
+    return ours.array == theirs.array and ours.call == theirs.call and same_directions(image, other)
+
+
+def same_directions(image: Energyscape, other: Energyscape) -> bool:
+    """Whether two images have the same directions."""
+    return all(
+        getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
+        for name in ("azimuth_rad", "elevation_rad")
+    )

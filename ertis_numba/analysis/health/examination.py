@@ -1,0 +1,175 @@
+"""Examination of one measurement: every check in turn, and the report."""
+
+import functools
+import math
+import statistics
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.analysis import _bits
+from ertis_numba.analysis.health.bits import by_bits
+from ertis_numba.analysis.health.kinds import kind_of
+from ertis_numba.analysis.health.limits import (
+    MAX_OFFSET,
+    MAX_SAMPLES,
+    MAX_SATURATED,
+    MAX_STUCK_NUMBERS,
+    MAX_STUCK_SAMPLES,
+    MAX_TONE_DB,
+    MIN_CHANGES,
+    MIN_LEVEL_DB,
+    MIN_SAMPLES,
+)
+from ertis_numba.analysis.health.numbers import by_numbers, scaled, swapped_bytes
+from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks, stuck_at_times
+from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
+from ertis_numba.analysis.health.spectra import by_spectra
+from ertis_numba.analysis.health.wavefront import by_wavefront
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.sample_format import sample_format
+from ertis_numba.settings import Settings
+
+__all__ = ["health"]
+
+_HUM_BLOCK_S = 1e-3
+_DEAF = {"dead", "saturated", "white bits", "duplicate", "stuck at times"}  # which hide what arrives
+_LOWEST_NOISE_DBFS = -95.0  # in the call's band; rounding to 16 bits has -106
+
+
+def health(measurement: Measurement) -> Health:
+    """Return the state of the microphones of one measurement.
+
+    Only enabled channels are looked at, in the first 524,288 samples. Loud and quiet are the eighths of
+    the record in which the median channel has most and least power in the call's band.
+
+    The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale, against the noise in the call's
+    band, raised by a matched filter by bandwidth times duration (G. L. Turin, An introduction to matched filters,
+    IRE Trans. Inf. Theory 6, 1960) and by delay and sum by the number of microphones without fault. Of the duration,
+    five eighths of each ramp are taken off, as a Hann ramp has three eighths of the energy.
+
+    Parameters
+    ----------
+    measurement : Measurement
+
+    Raises
+    ------
+    DataError
+        The words are not those of the settings.
+    """
+    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
+    words = sample_format(settings).validated(measurement.data, any_length=True)[:MAX_SAMPLES]
+    if len(words) < MIN_SAMPLES:
+        too_short = f"anything: {len(words)} samples are fewer than {MIN_SAMPLES}"
+        return Health(channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,))
+    signal_of: Callable[[int], NDArray[np.float32]]
+    columns: Callable[[int], NDArray[Any]]
+    if settings.recording.is_pdm:
+        octets = _bits.octets_of(words)
+        signal_of = functools.partial(_bits.signal_of, octets)
+        columns = functools.partial(_bits.bits_of, octets)
+        reported, half_scale = by_bits(octets, enabled), 0.5
+    else:
+        full, is_float = settings.recording.full_scale, settings.recording.encoding == "float32"
+        reported = [by_numbers(i, scaled(words, full, i), is_float=is_float) for i in enabled.tolist()]
+        if is_float:  # of which the amplitudes may be pascals
+            full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
+        signal_of = functools.partial(scaled, words, full)
+        columns, half_scale = functools.partial(_column, words), full
+    found = {item.channel: item for item in reported}
+    moving = [item for item in reported if not any(name.startswith("stuck") for name in item.faults)]
+    reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings)
+    found |= {item.channel: item for item in reported}
+    moved = [(item.channel, columns(item.channel)) for item in moving]
+    findings += _by_words(words, moved, found, settings, half_scale)
+    deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
+    heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
+    not_observable: tuple[str, ...] = ()
+    if heard and not any("resolve" in text for text in unknown):
+        shown, not_observable = by_wavefront(signal_of, heard, settings, n_samples=len(words))
+        findings += shown
+    findings = [*_of_channels(found.values()), *findings]
+    channels = _with_faults(found, findings)
+    fine = [item for item in channels if not item.faults and item.noise_dbfs is not None]
+    noise = [10 ** (item.noise_dbfs / 10) for item in fine if item.noise_dbfs is not None]
+    report = Health(
+        channels=channels,
+        tones_hz=tones_hz,
+        unknown=unknown,
+        findings=tuple(findings),
+        not_observable=not_observable,
+    )
+    if not noise:
+        return report
+    call = settings.call
+    noise_dbfs = 10 * math.log10(math.fsum(noise) / len(noise))
+    duration_s = call.duration_s * (1 - 5 / 4 * call.ramp_fraction)
+    gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
+    dynamic_range_db = 10 * math.log10(gain / 2) - noise_dbfs
+    return replace(report, noise_dbfs=noise_dbfs, dynamic_range_db=dynamic_range_db)
+
+
+def _by_words(
+    words: NDArray[Any],
+    moved: list[tuple[int, NDArray[Any]]],
+    found: dict[int, ChannelHealth],
+    settings: Settings,
+    half_scale: float,
+) -> list[Finding]:
+    """Return what the words themselves show, without a spectrum."""
+    recording, enabled = settings.recording, tuple(found)
+    comparable = moved if recording.is_pdm or _have_noise(found.values()) else []
+    findings = duplicates(comparable, is_pdm=recording.is_pdm)
+    findings += repeated_blocks(words, enabled) if moved else []
+    findings += stuck_at_times(comparable, largest=MAX_STUCK_SAMPLES if recording.is_pdm else MAX_STUCK_NUMBERS)
+    steady = [(channel, column) for channel, column in moved if not {"saturated", "offset"} & {*found[channel].faults}]
+    block = round(_HUM_BLOCK_S * recording.sample_rate_hz)
+    findings += hum(steady, block=block, full_scale=half_scale)
+    if recording.encoding == "int16":
+        findings += swapped_bytes(words, enabled)
+    return findings
+
+
+def _with_faults(found: dict[int, ChannelHealth], findings: Iterable[Finding]) -> tuple[ChannelHealth, ...]:
+    """Return the channels with the names of their findings."""
+    named = dict(found)
+    for finding in findings:
+        for channel in () if kind_of(finding.fault).of_record else finding.channels:
+            if finding.fault not in named[channel].faults:
+                named[channel] = replace(named[channel], faults=(*named[channel].faults, finding.fault))
+    return tuple(named.values())
+
+
+def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
+    return np.asarray(words[:, channel])
+
+
+def _have_noise(channels: Iterable[ChannelHealth]) -> bool:
+    """Return whether numbers hold noise; without it a symmetrical array hears some echoes alike."""
+    levels = [item.noise_dbfs for item in channels if item.noise_dbfs is not None]
+    return bool(levels) and statistics.median(levels) > _LOWEST_NOISE_DBFS
+
+
+def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:
+    """Return the findings behind the faults that figures of channels show."""
+    measured: dict[str, tuple[str, float]] = {
+        "stuck at": ("changes", MIN_CHANGES),
+        "stuck in a pattern": ("changes", MIN_CHANGES),
+        "saturated": ("overload", MAX_SATURATED),
+        "offset": ("offset", MAX_OFFSET),
+        "idle tone": ("tone_db", MAX_TONE_DB),
+        "dead": ("level_db", MIN_LEVEL_DB),
+    }
+    return [
+        Finding(fault=fault, channels=(item.channel,), measured=float(getattr(item, figure)), limit=limit)
+        for item in channels
+        for fault in item.faults
+        for name, (figure, limit) in measured.items()
+        if fault == name or (name == "stuck at" and fault.startswith("stuck at "))
+    ]

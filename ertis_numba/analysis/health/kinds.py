@@ -1,0 +1,67 @@
+"""Table of the faults that one recording can show: unit of the measured value, and remedy."""
+
+from dataclasses import dataclass
+
+__all__ = ["DISABLE", "KINDS", "FaultKind", "kind_of"]
+
+DISABLE = "leave them out by 'ertis process --without', or by array.disabled in a settings file"
+"""Remedy for faults of single channels."""
+
+_LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKind:
+    """Description of a fault.
+
+    Attributes
+    ----------
+    unit : str
+        Unit of the measured value and of its limit; empty for a share or a count.
+    remedy : str
+        Imperative sentence without a full stop.
+    of_record : bool
+        Faults of the whole record rather than of single channels.
+    """
+
+    unit: str = ""
+    remedy: str = DISABLE
+    of_record: bool = False
+
+
+KINDS = {
+    "stuck at": FaultKind(),
+    "stuck in a pattern": FaultKind(),
+    "stuck at times": FaultKind(
+        unit="samples", remedy="check the contact of their cable, or disable them in a layout file"
+    ),
+    "saturated": FaultKind(),
+    "offset": FaultKind(),
+    "low-frequency hum": FaultKind(remedy="check their supply and ground, or disable them in a layout file"),
+    "idle tone": FaultKind(unit="dB"),
+    "dead": FaultKind(unit="dB"),
+    "gain": FaultKind(unit="dB", remedy="give their sensitivity as array.gain, or disable them in a layout file"),
+    "noisy": FaultKind(unit="dB"),
+    "white bits": FaultKind(unit="dB", remedy="check that a microphone is connected, or disable them in a layout file"),
+    "flipped bits": FaultKind(unit="dB", remedy="check the clock and the cable, or disable them in a layout file"),
+    "duplicate": FaultKind(
+        remedy="check the select pins of the microphones that share a line, or disable one of each pair"
+    ),
+    "inverted polarity": FaultKind(remedy="swap their wires, or disable them in a layout file"),
+    "swapped": FaultKind(unit="µs", remedy=_LAYOUT),
+    "late": FaultKind(unit="µs", remedy="give their lateness as array.delay_s, or disable them in a layout file"),
+    "order of channels": FaultKind(unit="µs", remedy=_LAYOUT, of_record=True),
+    "order of bytes": FaultKind(unit="dB", remedy="swap the bytes of every number when importing", of_record=True),
+    "repeated blocks": FaultKind(
+        unit="samples", remedy="record again, and check the link to the sensor", of_record=True
+    ),
+    "shifted record": FaultKind(
+        unit="µs", remedy="start the record with the emission, or correct its first sample", of_record=True
+    ),
+}
+"""Every fault by its name; ``stuck at`` is followed by the value."""
+
+
+def kind_of(fault: str) -> FaultKind:
+    """Return the kind of a fault by its name as reports have it."""
+    return KINDS.get(fault) or KINDS[next(name for name in KINDS if fault.startswith(name))]

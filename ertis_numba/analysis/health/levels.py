@@ -1,0 +1,106 @@
+"""Checks of the level and the noise of each channel against the array's median."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.health.limits import (
+    MAX_FLIPPED_DB,
+    MAX_FLIPS_DB,
+    MAX_GAIN_DB,
+    MAX_NOISE_DB,
+    MAX_WHITE_DB,
+)
+from ertis_numba.analysis.health.report import ChannelHealth, Finding
+
+__all__ = ["flip_findings", "gain_findings", "in_limit_cycles", "noise_findings"]
+
+_MIN_CHANNELS = 5  # of which a median and a spread can be had
+_DEVIATIONS = 5.0  # of the array's own spread
+_NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
+_LOWEST_NOISE_DB = -100.0  # in the call's band; below it lie rounding and the ends of echoes
+_MAX_LEVEL_DB = 20.0
+_LIMIT_CYCLE_DB = -120.0  # of PDM, in the call's band: far below the noise of any modulator
+_SHARE_OF_LIMIT_CYCLES = 0.1
+
+
+def in_limit_cycles(quiet_db: NDArray[np.float64]) -> bool:
+    """Return whether so many modulators of PDM repeat themselves without noise that channels cannot be compared."""
+    return float(np.mean(quiet_db < _LIMIT_CYCLE_DB)) > _SHARE_OF_LIMIT_CYCLES
+
+
+def _limit(values_db: NDArray[np.float64], min_db: float) -> tuple[NDArray[np.float64], float]:
+    """Return the deviations from the median, and the limit that the array's own spread allows."""
+    deviation_db = values_db - np.median(values_db)
+    return deviation_db, max(min_db, _DEVIATIONS * _NORMAL * float(np.median(np.abs(deviation_db))))
+
+
+def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> list[Finding]:
+    """Return the channels in which one arrival is too loud or too quiet.
+
+    Parameters
+    ----------
+    channels : sequence of int
+    level_db : (channel,) float64
+        Of the arrival; NaN where its waveform is not that of the other channels.
+    """
+    known = np.isfinite(level_db)
+    if known.sum() < _MIN_CHANNELS:
+        return []
+    deviation_db, limit_db = _limit(level_db[known], MAX_GAIN_DB)
+    return [
+        Finding(fault="gain", channels=(channel,), measured=float(value), limit=limit_db)
+        for channel, value in zip(np.asarray(channels)[known].tolist(), deviation_db, strict=True)
+        if abs(value) > limit_db
+    ]
+
+
+def noise_findings(
+    channels: Sequence[ChannelHealth], quiet_db: NDArray[np.float64], *, white_db: float | None
+) -> list[Finding]:
+    """Return the channels with more noise than the others in their own quietest eighth of the record.
+
+    Parameters
+    ----------
+    channels : sequence of ChannelHealth
+    quiet_db : (channel,) float64
+        In the call's band, full scale 1.
+    white_db : float or None
+        Level of white bits in that band; None of PCM.
+    """
+    if len(channels) < 2 or (white_db is not None and in_limit_cycles(quiet_db)):
+        return []
+    usual_db = np.maximum(quiet_db, _LOWEST_NOISE_DB)
+    deviation_db, limit_db = _limit(usual_db, MAX_NOISE_DB)
+    if len(channels) < _MIN_CHANNELS:
+        deviation_db, limit_db = usual_db - np.min(usual_db), _MAX_LEVEL_DB
+    found = []
+    for item, more_db, noise_db in zip(channels, deviation_db.tolist(), quiet_db.tolist(), strict=True):
+        if more_db <= limit_db:
+            continue
+        if white_db is not None and noise_db > white_db + MAX_WHITE_DB and "idle tone" not in item.faults:
+            found.append(
+                Finding(fault="white bits", channels=(item.channel,), measured=noise_db - white_db, limit=MAX_WHITE_DB)
+            )
+        else:
+            found.append(Finding(fault="noisy", channels=(item.channel,), measured=more_db, limit=limit_db))
+    return found
+
+
+def flip_findings(channels: Sequence[ChannelHealth], floor_db: NDArray[np.float64]) -> list[Finding]:
+    """Return the channels of PDM whose floor is that of a share of white bits.
+
+    ``p`` flipped bits add ``4 p (1 - p)`` of the power of white bits, at all frequencies alike.
+
+    Parameters
+    ----------
+    channels : sequence of ChannelHealth
+    floor_db : (channel,) float64
+        Density of the quietest lines, relative to white bits.
+    """
+    return [
+        Finding(fault="flipped bits", channels=(item.channel,), measured=value, limit=MAX_FLIPPED_DB)
+        for item, value in zip(channels, floor_db.tolist(), strict=True)
+        if MAX_FLIPPED_DB < value <= MAX_FLIPS_DB and not item.faults
+    ]

@@ -1,0 +1,48 @@
+"""Checks of single channels on the numbers of PCM: stuck, saturated, offset."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.health.limits import MAX_OFFSET, MAX_SATURATED, MAX_SWAP_DB, MIN_CHANGES, OFFSET_DEVIATIONS
+from ertis_numba.analysis.health.report import ChannelHealth, Finding
+
+__all__ = ["by_numbers", "scaled", "swapped_bytes"]
+
+_FULL = 1 - 2.0**-15  # of full scale: the largest number of 16 bits; float32 has no end, and clips where it did before
+
+
+def scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32]:
+    """Return a channel of PCM whose full scale becomes 1."""
+    return np.asarray(np.multiply(words[:, channel], np.float32(1 / full), dtype=np.float32))
+
+
+def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:
+    """Return figures and faults of a channel of PCM that need no spectrum."""
+    changes = float(np.mean(signal[1:] != signal[:-1]))
+    level = np.abs(signal)
+    peak = float(level.max())
+    overload = float(np.mean(level >= (peak if is_float else _FULL)))
+    offset = float(np.mean(signal, dtype=np.float64))
+    if changes < MIN_CHANGES:
+        faults: tuple[str, ...] = (f"stuck at {float(np.median(signal)):g}",)
+    else:
+        full = max(1.0, peak) if is_float else 1.0
+        deviation = float(np.std(signal, dtype=np.float64)) / math.sqrt(len(signal))
+        max_offset = MAX_OFFSET * full + OFFSET_DEVIATIONS * deviation
+        faults = ("saturated",) * (overload > MAX_SATURATED) + ("offset",) * (abs(offset) > max_offset)
+    return ChannelHealth(channel=channel, faults=faults, offset=offset, changes=changes, overload=overload)
+
+
+def swapped_bytes(words: NDArray[np.int16], channels: tuple[int, ...]) -> list[Finding]:
+    """Return a finding if numbers of 16 bits vary less from one to the next with their bytes swapped."""
+    roughness = []
+    for numbers in (words, words.byteswap()):
+        steps = np.diff(numbers[:, list(channels)].astype(np.float64), axis=0)
+        roughness.append(float(np.median(np.mean(np.abs(steps), axis=0))) + 1.0)
+    ratio_db = 20 * math.log10(roughness[0] / roughness[1])
+    if ratio_db <= MAX_SWAP_DB:
+        return []
+    return [Finding(fault="order of bytes", channels=channels, measured=ratio_db, limit=MAX_SWAP_DB)]

@@ -1,0 +1,265 @@
+"""Checks of each channel against the wavefront of the strongest arrival: polarity, order, delay, and the emission."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
+from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, mean_of
+from ertis_numba.analysis.health.levels import gain_findings
+from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
+from ertis_numba.analysis.health.report import Finding
+from ertis_numba.geometry import Layout, layout_names, load_layout, microphones
+from ertis_numba.settings import Settings
+
+__all__ = ["by_wavefront"]
+
+_DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
+_COMPACT_SHARE = 0.75  # of the microphones that a wavefront must fit
+_PERMUTED_SHARE = 0.9  # of those that it fits in another order
+_MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
+_MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
+_MIN_DEPTH_M = 0.01  # of the distances from the emitter; on a ring its sound is that of an echo from ahead
+_DIRECT_SPREAD = 0.75  # relative to that of an echo, which has two more unknowns
+_MIN_RECORD_CHANNELS = 12  # fewer fit another order or the emitter by chance
+_PILOTS = 4  # microphones among which the strongest arrival is looked for
+_MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
+_HALF_PERIOD_S = 12e-6  # of the highest usual carrier
+_AGREEMENT_S = 8e-6  # of the delays of a swapped pair, or of the halves of the band
+_LAG_S = 60e-6
+_PRESENT = 0.85  # of the usual amplitude
+_DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
+_COHERENT = 0.85
+_COMPACT_COHERENCE = 0.97  # of the median channel; a single echo has 0.995
+_SAME = 0.95  # coherence of a channel whose delay or level is compared
+_INVERTED = 0.97
+_OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
+_MAX_SUSPECTS = 0.25  # of the microphones; where more of them disagree, the arrival is to blame
+
+
+def by_wavefront(
+    signals: Callable[[int], NDArray[np.float32]],
+    channels: Sequence[int],
+    settings: Settings,
+    *,
+    n_samples: int,
+) -> tuple[list[Finding], tuple[str, ...]]:
+    """Return what the strongest arrival shows, and what it cannot show.
+
+    Parameters
+    ----------
+    signals : callable
+        Samples of a channel.
+    channels : sequence of int
+        Those that carry sound.
+    settings : Settings
+    n_samples : int
+    """
+    layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
+    positions_m = layout.positions_m[list(channels)]
+    rate_hz = settings.recording.sample_rate_hz
+    first, last = _loudest(signals, channels, settings, n_samples)
+    found = compress(signals, channels, settings.call, rate_hz=rate_hz, first=first, last=last)
+    width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
+    arrived = strongest(found, width_s)
+    if arrived is None:
+        return [], (f"{_DESCRIPTIONS}: no arrival stands out",)
+    times_s, middle_s = arrived
+    times_s = times_s - layout.delay_s[list(channels)]
+    path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
+    curvatures = (0.0, 1 / path_m, 2 / path_m)
+    echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
+    if echo is None:
+        return [], (f"{_DESCRIPTIONS}: {len(channels)} microphones are too few for a wavefront",)
+    direct = fit_emitter(times_s, positions_m, speed_m_s)
+    from_centre_m = np.linalg.norm(positions_m, axis=1)
+    is_direct = (
+        direct.share >= max(_COMPACT_SHARE, echo.share)
+        and direct.spread_s < _DIRECT_SPREAD * echo.spread_s
+        and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
+    )
+    if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
+        return [], (f"{_DESCRIPTIONS}: the strongest arrival is too near for a wavefront",)
+    fit = direct if is_direct else echo
+    if fit.share < _COMPACT_SHARE:
+        enough = len(channels) >= _MIN_RECORD_CHANNELS
+        ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
+        return (ordered, ()) if ordered else ([], (f"{_DESCRIPTIONS}: the strongest arrival is not of one wavefront",))
+    findings = []
+    if is_direct and len(channels) >= _MIN_RECORD_CHANNELS and abs(direct.emission_s) > MAX_SHIFT_S:
+        findings.append(
+            Finding(
+                fault="shifted record",
+                channels=tuple(channels),
+                measured=1e6 * direct.emission_s,
+                limit=1e6 * MAX_SHIFT_S,
+                detail=f"emission at {1e3 * direct.emission_s:.2f} ms",
+            )
+        )
+    findings += _of_channels(found, times_s, fit, channels, layout)
+    return findings, () if is_direct else ("a shift of the record: no direct sound stands out",)
+
+
+def _loudest(
+    signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
+) -> tuple[int, int]:
+    """Return the samples around the strongest arrival of a few microphones, with a call's length to either side."""
+    rate_hz, call = settings.recording.sample_rate_hz, settings.call
+    length = round(call.duration_s * rate_hz)
+    few = list(channels)[:: max(1, len(channels) // _PILOTS)]
+    pilot = compress(signals, few, call, rate_hz=rate_hz, first=0, last=n_samples)
+    middle_s = pilot.start_s + int(np.argmax(np.median(pilot.envelope, axis=0))) * pilot.step_s
+    middle = round(middle_s * rate_hz)
+    return max(0, middle - length), min(n_samples, middle + 2 * length)
+
+
+def _other_order(
+    times_s: NDArray[np.float64],
+    channels: Sequence[int],
+    layout: Layout,
+    fit: Fit,
+    curvatures: tuple[float, ...],
+    speed_m_s: float,
+) -> list[Finding]:
+    """Return the order of channels that fits the arrival, if the given one does not."""
+    best: tuple[float, float, str] | None = None
+    for name, positions_m in _orders(layout):
+        other_m = positions_m[list(channels)]
+        candidates = [fit_delays(times_s, other_m, curvatures, speed_m_s), fit_emitter(times_s, other_m, speed_m_s)]
+        for item in candidates:
+            if item is not None and (best is None or (item.share, -item.spread_s) > (best[0], -best[1])):
+                best = item.share, item.spread_s, name
+    if best is None or best[0] < max(_PERMUTED_SHARE, fit.share + _MIN_INCOMPATIBLE):
+        return []
+    return [
+        Finding(
+            fault="order of channels",
+            channels=tuple(channels),
+            measured=1e6 * fit.spread_s,
+            limit=1e6 * MAX_DELAY_S,
+            detail=f"{best[2]} fits {best[0]:.0%} of the microphones, the given order {fit.share:.0%}",
+        )
+    ]
+
+
+def _orders(layout: Layout) -> list[tuple[str, NDArray[np.float64]]]:
+    """Return positions of channels in orders that happen: those of shipped layouts, and those of turned words."""
+    n_channels = len(layout.enabled)
+    octets = [channel ^ 7 for channel in range(n_channels)]
+    orders = [("the reversed order", layout.positions_m[::-1])]
+    if n_channels % 8 == 0:
+        swapped = np.arange(n_channels).reshape(-1, 8)[::-1].ravel()
+        orders += [
+            ("the order of reversed bits in each byte", layout.positions_m[octets]),
+            ("the order of reversed bytes", layout.positions_m[swapped]),
+        ]
+    for name in layout_names():
+        other = load_layout(name)
+        same = len(other.enabled) == n_channels and np.allclose(other.positions_m, layout.positions_m, atol=1e-6)
+        if len(other.enabled) == n_channels and not same:
+            orders.append((f"layout {name}", other.positions_m))
+    return orders
+
+
+def _of_channels(
+    found: Compressed, times_s: NDArray[np.float64], fit: Fit, channels: Sequence[int], layout: Layout
+) -> list[Finding]:
+    """Return the channels whose signal is not where the wavefront is, or upside down."""
+    picked = list(channels)
+    gain, delay_s = layout.gain[picked], layout.delay_s[picked]
+    matrix = np.column_stack([np.ones(len(picked)), layout.positions_m[picked]])
+    fitted_s = fit.delay_s
+    for _ in range(2):
+        wide = aligned(found, fitted_s + delay_s, _LAG_S) / gain[:, None]
+        reference = mean_of(wide[fit.inliers], found, _LAG_S)
+        here = correlate(wide, reference, found, _LAG_S)
+        # The carrier gives the delay of those in line; their common slope belongs to the wavefront.
+        near = fit.inliers & (np.abs(here.lag_s) < MAX_DELAY_S)
+        if near.sum() > matrix.shape[1]:
+            fitted_s = fitted_s + matrix @ np.linalg.lstsq(matrix[near], here.lag_s[near], rcond=None)[0]
+    if np.median(here.coherence) < _COHERENT:
+        return []
+    # Where the lag may be beyond the gate, the channel is aligned by its own peak.
+    own = correlate(aligned(found, times_s + delay_s, _LAG_S) / gain[:, None], reference, found, _LAG_S)
+    if np.median(own.coherence) < _COMPACT_COHERENCE:
+        return []
+    beyond = (here.coherence < _COHERENT) & (own.coherence >= _COHERENT)
+    offset_s = np.where(beyond, times_s - fitted_s + own.lag_s, here.lag_s)
+    coherence = np.maximum(here.coherence, own.coherence)
+    usual = float(np.median(here.peak[fit.inliers]))
+    strength = np.maximum(np.maximum(here.peak, own.peak), here.negative)
+    is_same = np.maximum(coherence, here.opposite) >= _SAME
+    findings = gain_findings(channels, np.where(is_same, 20 * np.log10(strength), np.nan))
+    if fit.spread_s > _MAX_SPREAD_S:
+        return findings
+    inverted = (here.opposite >= _INVERTED) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
+    inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # an echo that is late by half a period is none
+    moved = ~inverted & (coherence >= _SAME) & (here.at_zero < _PRESENT * usual)
+    limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
+    moved &= np.abs(offset_s) > limit_s
+    # Echoes that overlap shift the carrier by a period, but neither the envelope nor both halves of the band with it.
+    moved &= np.abs(times_s - fitted_s - offset_s) < _HALF_PERIOD_S
+    if moved.any():
+        moved &= _in_half_bands(found, fitted_s + delay_s, offset_s, fit.inliers)
+    if np.mean(inverted | moved) > _MAX_SUSPECTS:
+        return findings
+    findings += [
+        Finding(
+            fault="inverted polarity",
+            channels=(channels[int(mic)],),
+            measured=-float(here.opposite[mic]),
+            limit=-_INVERTED,
+        )
+        for mic in np.flatnonzero(inverted)
+    ]
+    return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels, limit_s)
+
+
+def _in_half_bands(
+    found: Compressed, at_s: NDArray[np.float64], offset_s: NDArray[np.float64], inliers: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return whether each channel has its offset in either half of the band: (mic,) bool."""
+    agrees = np.ones(len(at_s), bool)
+    for half in half_bands(found):
+        reference = mean_of(aligned(half, at_s, _LAG_S)[inliers], half, _LAG_S)
+        rest = correlate(aligned(half, at_s + offset_s, _LAG_S), reference, half, _LAG_S)
+        agrees &= np.abs(rest.lag_s) < _AGREEMENT_S
+    return agrees
+
+
+def _moved(
+    mics: NDArray[np.intp],
+    offset_s: NDArray[np.float64],
+    fitted_s: NDArray[np.float64],
+    channels: Sequence[int],
+    limit_s: float,
+) -> list[Finding]:
+    """Return pairs whose delays fit each other's place as swapped, and the others as late."""
+    findings, left = [], mics.tolist()
+    while left:
+        mic = left.pop(0)
+        measured = Finding(
+            fault="late", channels=(channels[mic],), measured=1e6 * float(offset_s[mic]), limit=1e6 * limit_s
+        )
+        for other in np.flatnonzero(np.abs(offset_s) > limit_s).tolist():
+            apart_s = fitted_s[other] - fitted_s[mic]
+            if abs(offset_s[mic] - apart_s) < _AGREEMENT_S and abs(offset_s[other] + apart_s) < _AGREEMENT_S:
+                left = [rest for rest in left if rest != other]
+                pair = ((mic, other), (other, mic))
+                findings += [
+                    replace(
+                        measured,
+                        fault="swapped",
+                        channels=(channels[one],),
+                        measured=1e6 * float(offset_s[one]),
+                        detail=f"with channel {channels[two]}",
+                    )
+                    for one, two in pair
+                ]
+                break
+        else:
+            findings.append(measured)
+    return findings

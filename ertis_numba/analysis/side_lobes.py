@@ -1,0 +1,182 @@
+"""Side lobes of the reflectors in an image: predicted where the array is as designed, and bounded where it is not."""
+
+import math
+from typing import Final
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
+from ertis_numba.frames import Energyscape
+
+__all__ = ["SIDE_LOBE_DB", "SideLobes", "side_lobe_floor", "without_side_lobes"]
+
+SIDE_LOBE_DB = 10.0
+"""Below the strongest of the same range, from which on side lobes are expected.
+
+Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `point_spread.PULSE_M`.
+"""
+
+_MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predicted side lobes of stronger ones
+_FALSE_ALARM: Final = 0.01
+_N_DIRECTIONS: Final = 64  # in which prediction and image are compared
+_N_COMPARED: Final = 8  # reflectors by which the prediction is judged
+# Deviations relative to the mean: up to the first a pattern is as predicted, from the second on it is unknown.
+_TRUSTED: Final = (0.25, 0.4)
+_N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
+# Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
+# main lobes of reflectors take less than a quarter of the directions.
+_QUARTILE: Final = 0.75
+_QUARTILE_OF_MAGNITUDE: Final = math.sqrt(math.log(4))
+_QUARTILE_OF_COMPONENT: Final = 0.8134
+
+
+class SideLobes:
+    """Test of maxima of an image: each is a reflector, or may be a side lobe of stronger reflectors.
+
+    `PointSpread` predicts side lobes for an array as designed and for reflectors that are points. Real microphones,
+    transducers and surfaces change the pattern of the side lobes, but hardly their mean power. So the limit is the sum
+    of what is predicted and of what may deviate from it. The deviation is a sum of many phasors, so its amplitude
+    follows a Rayleigh distribution [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of
+    1 - p. The image itself tells σ: its deviation from the prediction at the range in question, but at most the mean
+    of all side lobes that reach this range. Echoes that interfere deviate as well, so the image is first judged by the
+    reflector that it fits best: if the pattern around that one is as predicted, the array is as designed, and σ is 0.
+
+    Parameters
+    ----------
+    image : Energyscape
+    directions : (direction, axis) float64
+        Unit vectors of the image's directions.
+    candidates : (candidate, [direction, range]) int64
+        Places of local maxima, the strongest first.
+
+    References
+    ----------
+    .. [1] J. W. Goodman, *Speckle Phenomena in Optics*, 2nd edition, chapter 3.
+    """
+
+    def __init__(self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> None:
+        self._image, self._spread = image, PointSpread(image.settings)
+        count = len(directions)
+        self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
+        self._sampled = directions[self._samples]
+        self._factor = math.sqrt(math.log(count / _FALSE_ALARM))
+        self._offsets_m = np.linspace(0.0, self._spread.reach_m, _N_OFFSETS)
+        self._mean = np.zeros(_N_OFFSETS)  # of the side lobes of a reflector of amplitude 1, by range offset
+        self._sources: list[tuple[NDArray[np.float64], float, float]] = []
+        self._deviations: dict[int, float] = {}  # by range bin
+        self._doubt = self._doubt_of(directions, candidates)
+
+    def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
+        """Add a reflector, strongest first.
+
+        Parameters
+        ----------
+        direction : (axis,) float64
+        range_m, amplitude : float
+        """
+        if not self._sources:
+            self._mean = self._mean_around(direction)
+        self._sources.append((direction, range_m, amplitude))
+        self._deviations.clear()
+
+    def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
+        """Return True if a maximum of this amplitude may be a side lobe of the reflectors added so far.
+
+        Parameters
+        ----------
+        direction : (axis,) float64
+        range_bin : int
+        level : float
+        """
+        range_m = float(self._image.range_m[range_bin])
+        near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.reach_m]
+        if not near:
+            return False
+        sources, ranges_m, amplitudes = (np.array(each) for each in zip(*near, strict=True))
+        offsets_m = range_m - ranges_m
+        predicted = float(amplitudes @ self._spread(direction - sources, offsets_m))
+        if level <= _MARGIN * predicted:
+            return True
+        # Echoes of real surfaces are longer than the pulse.
+        means = self._doubt * amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
+        largest = self._factor * math.hypot(*means)
+        return level <= predicted + largest and level <= predicted + self._factor * self._deviation(range_bin)
+
+    def _doubt_of(self, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> float:
+        """Return how far the pattern of side lobes is unknown, from 0 to 1, by the reflector whose pattern fits best.
+
+        Only the strongest maxima of ranges apart from each other are compared: one of them may have no other
+        reflector at its range. Adaptive beamformers have weaker side lobes than predicted, so the limit stays.
+        """
+        if self._image.settings.processing.beamformer != "delay_and_sum":
+            return 0.0
+        ratios: list[float] = []
+        ranges_m: list[float] = []
+        for direction, range_bin in candidates:
+            range_m = float(self._image.range_m[range_bin])
+            if any(abs(range_m - other_m) < self._spread.reach_m for other_m in ranges_m):
+                continue
+            ranges_m.append(range_m)
+            amplitude = float(self._image.amplitude[direction, range_bin])
+            levels = amplitude * self._spread(self._sampled - directions[direction], np.zeros(len(self._samples)))
+            measured = self._image.amplitude[self._samples, range_bin]
+            mean = float(np.quantile(levels, _QUARTILE)) / _QUARTILE_OF_MAGNITUDE
+            ratios.append(_deviation_of(measured, levels) / mean)
+            if len(ratios) == _N_COMPARED:
+                break
+        low, high = _TRUSTED
+        return min(1.0, max(0.0, (min(ratios, default=high) - low) / (high - low)))
+
+    def _deviation(self, range_bin: int) -> float:
+        """Return the standard deviation of the image from the prediction at a range."""
+        if range_bin not in self._deviations:
+            n_samples = len(self._samples)
+            sources, ranges_m, amplitudes = (np.array(each) for each in zip(*self._sources, strict=True))
+            offsets_m = float(self._image.range_m[range_bin]) - ranges_m
+            near = np.abs(offsets_m) < self._spread.reach_m
+            sources, offsets_m, amplitudes = sources[near], offsets_m[near], amplitudes[near]
+            directions = (self._sampled - sources[:, None]).reshape(-1, 3)
+            levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
+            predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
+            measured = self._image.amplitude[self._samples, range_bin]
+            self._deviations[range_bin] = _deviation_of(measured, predicted)
+        return self._deviations[range_bin]
+
+    def _mean_around(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the root mean square of the side lobes of a reflector of amplitude 1: (offset,) float64."""
+        n_samples = len(self._samples)
+        offsets = np.repeat(self._sampled - direction, _N_OFFSETS, axis=0)
+        levels = self._spread(offsets, np.tile(self._offsets_m, n_samples)).reshape(n_samples, _N_OFFSETS)
+        return np.asarray(np.quantile(levels, _QUARTILE, axis=0) / _QUARTILE_OF_MAGNITUDE)
+
+
+def _deviation_of(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
+    """Return the standard deviation of complex amplitudes, of which only magnitudes are known."""
+    return float(np.quantile(np.abs(measured - predicted), _QUARTILE)) / _QUARTILE_OF_COMPONENT
+
+
+def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the amplitude below which side lobes are expected, for each range: (range,) float32.
+
+    It is `SIDE_LOBE_DB` below the strongest of all ranges within a pulse. This is coarser than `SideLobes`, and quick.
+
+    Parameters
+    ----------
+    highest : (range,) float32
+        Maximum of the image over all directions.
+    range_m : (range,) float64
+        At least two, evenly spaced.
+    """
+    reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
+    around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")
+    return np.asarray(around * np.float32(10 ** (-SIDE_LOBE_DB / 20)))
+
+
+def without_side_lobes(image: Energyscape) -> Energyscape:
+    """Return an image whose values below `side_lobe_floor` are 0."""
+    if len(image.range_m) < 2:
+        return image
+    floor = side_lobe_floor(image.amplitude.max(axis=0, initial=0.0), image.range_m)
+    return image.replace(amplitude=np.where(image.amplitude >= floor, image.amplitude, np.float32(0)))

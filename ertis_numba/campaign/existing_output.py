@@ -1,0 +1,143 @@
+"""Whether an energyscape file that is there already is what would be made."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ertis_numba.errors import DamagedError, ErtisError
+from ertis_numba.geometry import direction_grid, grid_count, self_contained
+from ertis_numba.settings import Accuracy, Settings
+from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
+from ertis_numba.storage.recording import Mounting
+from ertis_numba.storage.schema import software_versions
+
+__all__ = ["difference", "look_at"]
+
+_OPEN = (None, "auto")  # what settings leave to the planner
+_ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
+
+
+class _ExistingOutput(EnergyscapeReader):
+    """What a file has to tell of how it was made."""
+
+    @property
+    def dtype(self) -> str:
+        """Type of its images."""
+        return str(self._group["amplitude"].dtype.name)
+
+    @property
+    def axes(self) -> str:
+        return _digest(self.azimuth_rad.tobytes(), self.elevation_rad.tobytes())
+
+    @property
+    def mounting(self) -> list[list[float]] | None:
+        """Translation and rotation of the sensor; None if its mounting is unknown."""
+        if self.translation_m is None or self.rotation_xyzw is None:
+            return None
+        return [self.translation_m.tolist(), self.rotation_xyzw.tolist()]
+
+    def require_whole(self) -> None:
+        """Refuse images that are not what was written."""
+        with self._reading():
+            for index in range(len(self)):
+                self._rows.row(index)
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
+    """Return what there is of an energyscape file that was made of a recording: its sensors' settings and axes.
+
+    ``differs`` in it says why it is something else, or that it is damaged; it is empty where only settings can be
+    different. None is returned where there is no file. A ``recording`` is never to be replaced.
+    """
+    if not target.exists():
+        return None
+    try:
+        found, made_of = _read(target, recording, dtype)
+    except DamagedError:
+        return {"differs": "is damaged"}
+    except (ErtisError, *_ODD):
+        return {"differs": "is no energyscape file that can be read"}
+    if not found["differs"] and made_of != recording.sha256():  # last, as it reads all of it
+        return {"differs": "was made of another file of the same recording"}
+    return found
+
+
+def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[str, Any], object]:
+    """Return what a file is, and the SHA-256 of the file that it was made of."""
+    if file_kind(target) == "recording":
+        return {"differs": "is a recording", "recording": True}, None
+    sensors: dict[str, Any] = {}
+    made_of: object = None
+    for name in sensor_names(target):
+        with _ExistingOutput(target, sensor=name) as made:
+            differs = _differs(made, recording, dtype)
+            if differs:
+                return {"differs": differs}, None
+            made.require_whole()
+            made_of = made.attributes.get("recording_sha256")
+            sensors[name] = {
+                "settings": made.settings.to_toml(),
+                "axes": made.axes,
+                "measurements": len(made),
+                "mounting": made.mounting,
+            }
+    return {"differs": "", "sensors": sensors}, made_of
+
+
+def _differs(made: _ExistingOutput, recording: RecordingReader, dtype: str) -> str:
+    if made.attributes.get("recording_uuid") != recording.uuid:
+        return "was made of another recording"
+    for name, wanted in software_versions().items():
+        came = made.attributes.get(f"{name.replace('-', '_')}_version", "unknown")
+        if came != wanted:
+            return f"was made by {name} {came}, this is {wanted}"
+    if made.dtype != dtype:
+        return f"holds {made.dtype}, wanted {dtype}"
+    return ""
+
+
+def difference(
+    made: dict[str, Any], wanted: dict[str, Settings], mounting: Mapping[str, Mounting] | None = None
+) -> str:
+    """Return why a file is not what these settings would make of its sensors; empty if it is.
+
+    Only a ``mounting`` that is given is compared; that of the recording is in the file already.
+    """
+    if made["differs"]:
+        return str(made["differs"])
+    if list(made["sensors"]) != list(wanted):
+        return f"holds sensor {', '.join(made['sensors'])}, wanted {', '.join(wanted)}"
+    for name, settings in wanted.items():
+        held = made["sensors"][name]
+        found = _changed(Settings.from_toml(held["settings"], "settings"), self_contained(settings))
+        if not found and grid_count(settings.processing.directions) is None:  # a file, whose content may be another one
+            grid = direction_grid(settings.processing)
+            found = "" if _digest(grid.azimuth_rad.tobytes(), grid.elevation_rad.tobytes()) == held["axes"] else "grid"
+        if found:
+            return f"was made with other settings ({found} of sensor {name})"
+        if mounting and name in mounting and held["mounting"] != [list(each) for each in mounting[name]]:
+            return f"was made with another mounting of sensor {name}"
+    return ""
+
+
+def _changed(made: Settings, wanted: Settings) -> str:
+    """Return what is different; a plan may have settled whatever was left open."""
+    opened = made.replace(accuracy=_reopened(made.accuracy, wanted.accuracy))
+    if wanted.processing.wavefront == "auto":
+        opened = opened.replace(processing=opened.processing.replace(wavefront="auto"))
+    for table in Settings.__struct_fields__:
+        came, asked = getattr(opened, table), getattr(wanted, table)
+        if came != asked:
+            fields = [name for name in came.__struct_fields__ if getattr(came, name) != getattr(asked, name)]
+            return f"{table}.{fields[0]}"
+    return ""
+
+
+def _reopened(made: Accuracy, wanted: Accuracy) -> Accuracy:
+    asked = {name: getattr(wanted, name) for name in Accuracy.__struct_fields__}
+    return made.replace(**{name: value for name, value in asked.items() if value in _OPEN})

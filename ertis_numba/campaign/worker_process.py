@@ -1,0 +1,79 @@
+"""A process that follows orders, lines of JSON: ``python -m ertis_numba.campaign.worker_process``.
+
+It ends at once when nobody gives orders any more.
+"""
+
+import functools
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any, Final
+
+from ertis_numba.campaign.folder import clear_parts
+from ertis_numba.campaign.work import follow
+
+__all__ = ["main"]
+
+_REPORT_INTERVAL_S: Final = 0.1
+
+
+class _Process:
+    def __init__(self, out: IO[str]) -> None:
+        self._out = out
+        self._orders: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._target: Path | None = None
+        self._reported_s = 0.0
+
+    def run(self) -> None:
+        threading.Thread(target=self._listen, daemon=True).start()
+        self._out.write("{}\n")
+        self._out.flush()
+        while True:
+            order = self._orders.get()
+            number, about = order["number"], order["about"]
+            self._emit_event(number)  # from now on it is its own fault if this process dies
+            if order["do"] == "make":
+                self._target = Path(about["target"])
+            try:
+                result = follow(order["do"], about, functools.partial(self._advance, number))
+            except Exception as error:  # noqa: BLE001  a mistake in one recording's way must not end the others'
+                text = f"{about.get('path', '')}: {type(error).__name__}: {' '.join(str(error).split())}"
+                result = {"error": text, "by_chance": True}
+            self._target = None
+            self._emit_event(number, result=result)
+
+    def _advance(self, number: int, done: int) -> None:
+        if time.monotonic() > self._reported_s + _REPORT_INTERVAL_S:
+            self._reported_s = time.monotonic()
+            self._emit_event(number, done=done)
+
+    def _emit_event(self, number: int, **what: Any) -> None:
+        self._out.write(json.dumps({"number": number, **what}) + "\n")
+        self._out.flush()
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            self._orders.put(json.loads(line))
+        # Whoever gave orders is gone. What is half-written is of no use to the next one.
+        if (target := self._target) is not None:
+            with suppress(OSError):
+                clear_parts(target.parent, {target.name})
+        os._exit(0)
+
+
+def main() -> None:
+    """Follow orders from stdin, and tell on stdout what came of them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is the other process that says when to end
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever else prints must not get between
+    _Process(out).run()
+
+
+if __name__ == "__main__":
+    main()

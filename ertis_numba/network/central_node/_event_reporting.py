@@ -1,0 +1,89 @@
+"""What a central node tells of itself while it runs, each thing once."""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final
+
+from ertis_numba.journal import Sealed
+from ertis_numba.network.central_node._received_items import ReceivedItem
+
+__all__ = ["Telling", "text_of"]
+
+_LOG_INTERVAL_S: Final = 1.0  # between two events about mistakes
+
+
+class Telling:
+    """Makes events of what has changed.
+
+    Parameters
+    ----------
+    on_event : callable
+        Called with each event.
+    on_stored : callable, optional
+        Called with sensor, epoch, sequence and CRC-32 of measurements that are durable.
+    """
+
+    def __init__(
+        self, on_event: Callable[[dict[str, Any]], None], on_stored: Callable[[str, int, int, int], None] | None = None
+    ) -> None:
+        self._on_event, self._on_stored = on_event, on_stored
+        self._fault = self._note = ""
+        self._refused: Counter[str] = Counter()
+        self._next_internal_s = 0.0
+
+    def notify(self, event: str, **reported: Any) -> None:
+        """Tell of an event."""
+        with suppress(OSError):  # who listened may be gone: measurements are taken all the same
+            self._on_event({"event": event} | reported)
+
+    def stored(self, items: list[ReceivedItem]) -> None:
+        """Tell of measurements that are durable."""
+        if self._on_stored is not None:
+            with suppress(OSError):  # the same
+                for item in items:
+                    self._on_stored(item.run.sensor, item.run.session_id, item.first, getattr(item.what, "crc32", 0))
+
+    def sealed(self, sealed: Sealed) -> None:
+        """Tell of a journal that has become a recording."""
+        self.notify(
+            "sealed",
+            recording=None if sealed.recording is None else str(sealed.recording),
+            measurements=sealed.measurements,
+            missing=sealed.missing,
+            text=sealed.remark,
+        )
+
+    def internal(self, error: Exception) -> None:
+        """Tell of a mistake in this package, but not all the time."""
+        now_s = time.monotonic()
+        if now_s >= self._next_internal_s:
+            self._next_internal_s = now_s + _LOG_INTERVAL_S
+            self.notify("internal", text=text_of(error))
+
+    def fault(self, text: str) -> None:
+        """Tell why nothing can be stored, if that is new; ``text`` is empty where it can."""
+        before, self._fault = self._fault, text
+        if text and text != before:
+            self.notify("fault", text=text)
+        elif before and not text:
+            self.notify("resumed")
+
+    def keys(self, note: str) -> None:
+        """Tell why the list of keys cannot be used, if that is new; ``note`` is empty where it can."""
+        if note != self._note:
+            self._note = note
+            self.notify("keys", text=note or "the list of keys can be used again")
+
+    def refused(self, counts: Counter[str]) -> None:
+        """Tell what was refused since."""
+        now = counts.copy()
+        for reason, count in (now - self._refused).items():
+            self.notify("refused", reason=reason, count=count)
+        self._refused = now
+
+
+def text_of(error: Exception) -> str:
+    """Return what an error is, in a line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,0 +1,339 @@
+"""The journals of a folder, and how far each run is settled in them."""
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from ertis_numba.errors import ArgumentError, DataError, DiskFullError
+from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.network.central_node._checksums import Checksums
+from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
+from ertis_numba.network.central_node._received_items import (
+    Event,
+    Forgotten,
+    ReceivedItem,
+    Remark,
+    SensorSession,
+    Stored,
+    Twin,
+)
+from ertis_numba.network.central_node._unrecorded_gaps import UnrecordedGaps
+from ertis_numba.network.central_node._volumes import Volume, journal_name, runs_of
+
+__all__ = ["JournalStore"]
+
+_TWINS_KEPT: Final = 4096
+
+
+class JournalStore:
+    """What is stored, and what is still to be: knows of each number whether it is.
+
+    Nothing in it is done twice, and nothing out of order: an item is stored only if it follows what is settled.
+
+    Parameters
+    ----------
+    folder : Path
+        It is locked.
+    name : str
+        Of recordings.
+    ledger : Ledger
+        Of the folder.
+    notify : callable
+        Called with what has happened.
+
+    Attributes
+    ----------
+    acked_through : dict of Run to int
+        The number up to which all of a run is stored or known to be missing.
+    volume : Volume or None
+        That is being written.
+    to_hand_on : list of Path
+        Journals that are to be sealed.
+
+    Raises
+    ------
+    InUseError
+        Somebody has a journal whose content has to be known.
+    DataError
+        What is in the folder cannot be read.
+    """
+
+    def __init__(self, folder: Path, name: str, ledger: Ledger, notify: Callable[[Event], None]) -> None:
+        self._folder, self._name, self._ledger, self._emit_event = folder, name, ledger, notify
+        self.acked_through: dict[SensorSession, int] = dict(ledger.acked_through)
+        self._by_age = dict.fromkeys(ledger.acked_through)
+        self.volume: Volume | None = None
+        self._twins: Volume | None = None
+        self._checksums = Checksums(ledger.tails)
+        self._known_twins: dict[tuple[SensorSession, int, int], None] = {}
+        self._unsealed: set[str] = set(ledger.unsealed)
+        self._unrecorded = UnrecordedGaps(ledger.gaps)
+        self._failed: list[Volume] = []  # closed, and not yet given up durably
+        self._is_saved = False  # whether the ledger has what journals hold that are to be handed on
+        self.to_hand_on: list[Path] = []
+        self._take_up()
+
+    def _take_up(self) -> None:
+        """Learn what journals hold that a crash has left; they are to be sealed."""
+        damage = self._ledger.damage
+        if damage:
+            self._emit_event(Remark(damage))
+        if self._ledger.is_new or damage:
+            self._settle(read_acked_through(sorted(self._folder.glob("*.h5"))))
+            names = sorted(path.name for path in self._folder.glob(f"*.h5{SUFFIX}"))
+        else:
+            names = self._ledger.open
+        for name in names:
+            self._learn(self._folder / name)
+        for name in dict.fromkeys([*self._ledger.unsealed, *names]):
+            if (self._folder / name).exists():
+                self._retire(self._folder / name)
+        if damage:
+            with suppress(OSError, DataError):  # otherwise the same is done at the next start
+                self._save(open_=[])
+
+    def _learn(self, path: Path) -> None:
+        """Learn what a journal holds, or the recording that somebody has made of it meanwhile."""
+        recording = path.with_name(path.name.removesuffix(SUFFIX))
+        if path.exists():
+            with Journal.open(path) as journal:
+                self._settle(runs_of(journal))
+                self._unrecorded.learn(journal)
+                if "_conflicts" not in path.name:  # whose measurements come second under their numbers
+                    self._checksums.learn(journal)
+                if journal.damage:
+                    self._emit_event(Remark(f"the log of {path.name} was damaged; measurements lost: {journal.damage}"))
+        elif recording.exists():
+            self._settle(read_acked_through([recording]))
+
+    def _settle(self, runs: dict[SensorSession, int]) -> None:
+        for run, last in runs.items():
+            self._grow(run, last)
+
+    def _grow(self, run: SensorSession, last: int) -> None:
+        """Raise the mark of a run, which is then the newest."""
+        self.acked_through[run] = max(last, self.acked_through.get(run, -1))  # others read it meanwhile
+        self._by_age.pop(run, None)
+        self._by_age[run] = None
+
+    def store(self, items: list[ReceivedItem]) -> None:
+        """Make items durable and tell of them; after an error, call it again with the same ones.
+
+        Raises
+        ------
+        Exception
+            The disk fails. What was told of is durable, and the rest of the items is not lost.
+        """
+        try:
+            self._abandon_failed()
+            self._store(items)
+        except DiskFullError:  # nothing was written, so the journals are sound
+            self._free_logs()
+            raise
+        except Exception:
+            self._fail()
+            raise
+
+    def _store(self, items: list[ReceivedItem]) -> None:
+        batch: list[ReceivedItem] = []
+        ahead: dict[SensorSession, int] = {}  # settled, once the batch is
+
+        def flush() -> None:
+            self._append(batch)
+            batch.clear()
+            ahead.clear()
+
+        for item in items:
+            if item.done:
+                continue
+            if item.again:
+                flush()
+                self._store_twin(item)
+                continue
+            last = ahead.get(item.run, self.acked_through.get(item.run, -1))
+            if item.last <= last:  # a commit that seemed to fail had not
+                self._report_stored([item], 0.0)
+            elif item.first != last + 1:
+                self._send_back(item)
+            else:
+                if batch and isinstance(item.what, Entry) != isinstance(batch[-1].what, Entry):
+                    flush()
+                self._fit(item, flush)
+                batch.append(item)
+                ahead[item.run] = item.last
+        flush()
+
+    def _send_back(self, item: ReceivedItem, reason: str = "") -> None:
+        item.done = True
+        self._emit_event(Forgotten(item, reason))
+
+    def _fit(self, item: ReceivedItem, flush: Callable[[], None]) -> None:
+        """Make sure of a journal that an item can go into."""
+        if self.volume is not None and not self.volume.fits(item):
+            flush()
+            self.rotate()
+        if self.volume is None:
+            name = journal_name(self._folder, self._name, taken=self._unsealed)
+            self._save(open_=[name])  # before there is such a file: what a crash leaves of it is found
+            self.volume = Volume.create(self._folder / name)
+        self.volume.register(item.source)
+
+    def _append(self, batch: list[ReceivedItem]) -> None:
+        """Store measurements, or gaps, in one transaction; by themselves where that cannot be."""
+        if not batch or self.volume is None:
+            return
+        begun_s = time.monotonic()
+        try:
+            self.volume.append(batch)
+        except ArgumentError as error:
+            if len(batch) == 1:
+                self._send_back(batch[0], " ".join(str(error).split()))
+                return
+            for item in batch:  # the others must not suffer for one that nothing can hold, but those that follow it
+                if item.first == self.acked_through.get(item.run, -1) + 1:
+                    self._append([item])
+                else:
+                    self._send_back(item)
+            return
+        self._report_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
+        if isinstance(batch[0].what, Entry):
+            unrecorded = self._unrecorded.of(item.run.sensor for item in batch)
+            if unrecorded:
+                self.volume.note_gaps(unrecorded)
+                self._unrecorded.reported(unrecorded)
+
+    def _report_stored(self, items: list[ReceivedItem], took_ms: float) -> None:
+        for item in items:
+            self._grow(item.run, item.last)
+            item.done = True
+            if isinstance(item.what, Entry):
+                self._checksums.add(item.run, item.first, item.what.crc32 or 0)
+        self._emit_event(Stored(items, took_ms))
+
+    def _store_twin(self, item: ReceivedItem) -> None:
+        """Store a measurement with a settled number as a conflict, unless it equals the stored one."""
+        if not isinstance(item.what, Entry):
+            return
+        key = (item.run, item.first, item.what.crc32 or 0)
+        differs = key not in self._known_twins and self._differs(item, item.what)
+        if differs:
+            if self._twins is not None and not self._twins.fits(item):
+                self._retire_volume(self._twins)
+                self._twins = None
+            if self._twins is None:
+                name = journal_name(self._folder, self._name, end="_conflicts", taken=self._unsealed)
+                self._save(open_=self._open, also=[name])
+                self._twins = Volume.create(self._folder / name)
+            self._twins.append([item])
+            self._known_twins[key] = None
+            for old in list(islice(self._known_twins, max(0, len(self._known_twins) - _TWINS_KEPT))):
+                del self._known_twins[old]
+        item.done = True
+        self._emit_event(Twin(item, differs=differs))
+
+    def _differs(self, item: ReceivedItem, entry: Entry) -> bool:
+        """Return True if a number holds another measurement, or one that cannot be compared any more."""
+        held = self._checksums.find(item.run, item.first)
+        if held is None and self.volume is not None:
+            held = self.volume.crc32_of(entry)
+        if held is None:
+            return item.first <= self.acked_through.get(item.run, -1)
+        return held != entry.crc32
+
+    @property
+    def _open(self) -> list[str]:
+        """Names of journals that hold more than the ledger says."""
+        volumes = [*self._failed, *([] if self.volume is None else [self.volume])]
+        return [volume.path.name for volume in volumes]
+
+    def _save(self, *, open_: list[str], also: Iterable[str] = ()) -> None:
+        self._unsealed = {name for name in self._unsealed if (self._folder / name).exists()}
+        unsealed = sorted({*self._unsealed, *also})
+        acked_through = {run: self.acked_through[run] for run in self._by_age}
+        tails = self._checksums.tails(acked_through)
+        self._ledger.save(acked_through, open_=open_, unsealed=unsealed, gaps=self._unrecorded.gaps, tails=tails)
+        self._unsealed.update(also)
+        self._is_saved = True
+
+    def rotate(self) -> None:
+        """Begin new recordings with what comes next.
+
+        Raises
+        ------
+        Exception
+            A journal that has failed still does; it is taken up at the next start.
+        """
+        self._abandon_failed()
+        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        for volume in volumes:
+            if volume is not None:
+                self._retire_volume(volume)
+
+    def _retire_volume(self, volume: Volume) -> None:
+        self._retire(volume.path)
+        with suppress(DataError):  # what was committed is there, whatever happens now
+            self._unrecorded.learn(volume.journal)
+        with suppress(DataError):
+            volume.close()
+
+    def _retire(self, path: Path) -> None:
+        self._unsealed.add(path.name)
+        self.to_hand_on.append(path)
+        self._is_saved = False
+
+    def hand_on(self) -> list[Path]:
+        """Return journals that can be sealed: the ledger has durably what they hold.
+
+        Raises
+        ------
+        DataError, OSError
+            It cannot be written; call this again.
+        """
+        if not self._is_saved:
+            self._save(open_=self._open)
+        found, self.to_hand_on = self.to_hand_on, []
+        return found
+
+    def _free_logs(self) -> None:
+        """Give the room of logs back: on a small disk it is what the next measurements need."""
+        try:
+            for volume in (self.volume, self._twins):
+                if volume is not None:
+                    volume.journal.free_log()
+        except (DataError, OSError):
+            self._fail()
+
+    def _fail(self) -> None:
+        """Close the journals that are written: after a failed sync, what they show may never reach the disk."""
+        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        for volume in volumes:
+            if volume is not None:
+                self._failed.append(volume)
+                with suppress(Exception):
+                    volume.close()
+
+    def _abandon_failed(self) -> None:
+        """Limit failed journals durably to their acknowledged measurements, and queue them for sealing.
+
+        Raises
+        ------
+        Exception
+            The disk still fails; call this again.
+        """
+        while self._failed:
+            volume = self._failed[0]
+            if volume.path.exists():
+                acked = {(run.sensor, run.session_id): last for run, last in volume.acked.items()}
+                Journal.abandon(volume.path, acked)
+                if volume.acked:
+                    self._retire(volume.path)
+            else:  # somebody took it away, or has sealed it
+                self._learn(volume.path)
+            del self._failed[0]
+
+    def close(self) -> None:
+        """Close all journals."""
+        self.rotate()

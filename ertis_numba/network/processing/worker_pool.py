@@ -1,0 +1,329 @@
+"""Local worker processes: started, fed, watched, killed and started again."""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+
+from ertis_numba.cpu_cores import usable_cores
+from ertis_numba.network.log import EventLog
+from ertis_numba.network.processing.child import Child
+from ertis_numba.network.processing.choice import Choice
+from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.pipe_messages import (
+    FromWorker,
+    JobFailed,
+    JobFinished,
+    Predicted,
+    Prepare,
+    Prepared,
+    ProcessJob,
+    Ready,
+    Release,
+    Unusable,
+)
+from ertis_numba.network.processing.runner import (
+    Event,
+    FinishedJob,
+    Job,
+    JobKind,
+    KindFailed,
+    KindReady,
+    Lost,
+    bytes_of,
+)
+from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.worker import SLOTS, Worker
+from ertis_numba.network.status import WorkerStatus
+
+__all__ = ["LocalWorkerPool"]
+
+_MODULE: Final = "ertis_numba.network.processing.worker_process"
+_LOADING_S: Final = 60.0
+_BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # before a worker that dies again and again is started again
+_TRIES: Final = 3  # workers that may die over getting ready for a kind for which none has ever been
+
+
+class LocalWorkerPool:
+    """A `Runner` whose jobs run in processes of this machine.
+
+    Each worker has a pipe and two slots of its own, so that one that dies at any moment takes nothing with it but the
+    job it had. A worker is killed when it is not done in time.
+
+    Parameters
+    ----------
+    options : Options
+    log : Log
+        Told what goes wrong.
+
+    Attributes
+    ----------
+    choice : str
+    respawned : int
+    """
+
+    def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
+        self._options, self._log = options, log
+        self._threads = options.threads or usable_cores()
+        count = options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads)
+        self._chosen = Choice(count, self._threads)
+        self._kinds: dict[int, JobKind] = {}
+        self._prepared: dict[int, Prepared] = {}
+        self._tries: dict[int, int] = {}
+        self._workers = [Worker(number) for number in range(count)]
+        self._started = 1  # the others wait until the first has compiled what all need, and has found a device
+        self.respawned = 0
+        self._start(self._workers[0])
+
+    @property
+    def choice(self) -> str:
+        """How measurements share the cores, and why."""
+        return self._chosen.why
+
+    def prepare(self, kind: JobKind) -> None:
+        """See `Runner`."""
+        self._kinds[kind.number] = kind
+        self._tries.pop(kind.number, None)
+        for worker in self._workers:
+            self._next_kind(worker)
+
+    def forget(self, kind: JobKind) -> None:
+        """See `Runner`."""
+        self._kinds.pop(kind.number, None)
+        self._prepared.pop(kind.number, None)
+        self._tries.pop(kind.number, None)
+        for worker in self._workers:
+            if kind.number in worker.kinds and worker.child is not None:
+                worker.kinds.discard(kind.number)
+                worker.child.pipe.send(Release(kind=kind.number))
+
+    def takes(self, kind: JobKind) -> bool:
+        """See `Runner`."""
+        busy = sum(worker.job is not None for worker in self._workers)
+        return busy < self._chosen.mode.at_once and self._idle(kind) is not None
+
+    def _idle(self, kind: JobKind) -> Worker | None:
+        for worker in self._workers:
+            if worker.state == "idle" and kind.number in worker.kinds and worker.free:
+                return worker
+        return None
+
+    def submit(self, job: Job) -> None:
+        """See `Runner`."""
+        worker = self._idle(job.kind)
+        if worker is None or worker.child is None:
+            raise AssertionError("a job is submitted that no worker takes; ask takes() first")
+        worker.job, worker.mode = job, self._chosen.mode
+        worker.slot = slot = worker.free.pop(0)
+        slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
+        worker.deadline_s = time.monotonic() + self._options.deadline_s
+        worker.child.pipe.send(
+            ProcessJob(
+                job=job.number,
+                kind=job.kind.number,
+                slot=slot.number,
+                words_bytes=job.words.nbytes,
+                threads=worker.mode.threads,
+                points=job.points,
+                predict_for=job.data.sensor if job.predict else "",
+            )
+        )
+
+    def release(self, slot: Slot) -> None:
+        """See `Runner`."""
+        worker = self._workers[slot.number // SLOTS]
+        if slot in worker.slots:
+            worker.free.append(slot)
+
+    def fds(self) -> Iterable[int]:
+        """See `Runner`."""
+        children = (worker.child for worker in self._workers)
+        return [child.pipe.fileno() for child in children if child is not None and not child.pipe.closed]
+
+    def ready(self, fd: int) -> Sequence[Event]:
+        """See `Runner`."""
+        for worker in self._workers:
+            if worker.child is not None and worker.child.pipe.fileno() == fd:
+                return self._heard(worker)
+        return []
+
+    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
+        """See `Runner`."""
+        found: list[Event] = []
+        for worker in self._workers[: self._started]:
+            if worker.child is None:
+                if now_s >= worker.start_s:
+                    self._start(worker)
+                continue
+            worker.child.pipe.flush()
+            if now_s > worker.deadline_s:
+                self._log.warning("worker_killed", pid=worker.child.pid, text="it was not done in time")
+                worker.deadline_s = float("inf")
+                worker.child.kill()
+            if worker.child.ended:
+                found += self._heard(worker)  # it may have told something before
+            else:
+                self._next_kind(worker)
+        if self._chosen.look(now_s, rate_hz):
+            self._log.info("choice", text=self._chosen.why)
+        return found
+
+    def status(self) -> list[WorkerStatus]:
+        """See `Runner`."""
+        return [
+            WorkerStatus(pid=worker.child.pid, state=worker.state, done=worker.done)
+            for worker in self._workers
+            if worker.child is not None
+        ]
+
+    def close(self) -> None:
+        """See `Runner`."""
+        for worker in self._workers:
+            if worker.child is not None:
+                worker.child.kill()  # left alone, it would end without clearing up as well, but after its imports
+        for worker in self._workers:
+            if worker.child is not None:
+                worker.child.close()
+                worker.child = None
+            for slot in worker.slots:
+                slot.close()
+            worker.slots, worker.free = [], []
+
+    def _start(self, worker: Worker) -> None:
+        threads = str(self._threads)
+        worker.child = Child(
+            _MODULE,
+            FromWorker,
+            [
+                self._options.device,
+                self._options.dtype,
+                threads,
+                str(len(self._workers)),
+                str(self._options.deadline_s),
+            ],
+        )
+        worker.deadline_s = time.monotonic() + _LOADING_S
+
+    def _heard(self, worker: Worker) -> list[Event]:
+        """Return what a worker has to tell."""
+        found: list[Event] = []
+        if worker.child is None:
+            return found
+        for note in worker.child.pipe.receive():
+            found += self._events_of(worker, note)
+        if worker.child.ended:
+            found += self._died(worker)
+        elif worker.child.pipe.closed:  # `tick` clears up, when it is gone and writes no more
+            worker.ready = False
+            worker.child.kill()
+        else:
+            self._next_kind(worker)
+        return found
+
+    def _events_of(self, worker: Worker, note: FromWorker) -> list[Event]:
+        match note:
+            case Ready(device=device, threads=threads):
+                self._loaded(worker, device, threads)
+            case Prepared():
+                return self._became_ready(worker, note)
+            case Unusable(kind=kind, text=text):
+                worker.preparing, worker.deadline_s = None, float("inf")
+                if self._kinds.pop(kind, None) is not None:
+                    return [KindFailed(kind, text)]
+            case Predicted(sensor=sensor, event=event, warning=warning):
+                self._log.warning(event, sensor=sensor, text=warning)
+            case JobFinished() | JobFailed():
+                return self._finished(worker, note)
+        return []
+
+    def _loaded(self, worker: Worker, device: str, threads: int) -> None:
+        worker.ready, worker.deadline_s = True, float("inf")
+        if self._started == 1 and not self._kinds_known:
+            if threads == 1 and self._options.workers is None and len(self._workers) > 1:
+                # A GPU, say, that serves one measurement faster than it serves several.
+                self._log.info("choice", text=f"device {device} has one worker")
+                del self._workers[1:]
+                self._chosen = Choice(1, 1)
+            elif threads < self._threads:
+                self._chosen = Choice(len(self._workers), threads)
+
+    @property
+    def _kinds_known(self) -> bool:
+        return bool(self._prepared)
+
+    def _became_ready(self, worker: Worker, note: Prepared) -> list[Event]:
+        kind = worker.preparing
+        worker.preparing, worker.deadline_s = None, float("inf")
+        if worker.child is None or kind is None:
+            return []
+        if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
+            worker.child.pipe.send(Release(kind=note.kind))
+            return []
+        worker.kinds.add(kind.number)
+        worker.attach_memory(kind.words_bytes, self._image_bytes(note))
+        self._started = len(self._workers)
+        if kind.number in self._prepared:
+            return []
+        self._prepared[kind.number] = note
+        self._chosen.seed(note.wide_s, note.many_s)
+        return [KindReady(note)]
+
+    def _image_bytes(self, note: Prepared) -> int:
+        return int(np.prod(note.shape)) * np.dtype(self._options.dtype).itemsize
+
+    def _finished(self, worker: Worker, note: JobFinished | JobFailed) -> list[Event]:
+        job, slot = worker.job, worker.slot
+        if job is None or slot is None or note.job != job.number:
+            return []
+        worker.job = worker.slot = None
+        worker.deadline_s = float("inf")
+        if isinstance(note, JobFailed):
+            worker.free.append(slot)
+            return [Lost(job, note.text, note.again)]
+        worker.done += 1
+        worker.deaths = 0
+        if worker.mode in (self._chosen.wide, self._chosen.many) and worker.mode is not None:
+            self._chosen.took(worker.mode, note.took_s)
+        job.slot, job.n_points = slot, note.n_points
+        return [FinishedJob(job, note.took_s)]
+
+    def _next_kind(self, worker: Worker) -> None:
+        """Let a worker that has nothing else to do get ready for a kind that it does not know."""
+        if worker.child is None or worker.state != "idle":
+            return
+        if worker.kinds and any(other.preparing for other in self._workers):
+            return  # one after the other, so that sensors which are served go on to be
+        for number, kind in self._kinds.items():
+            if number not in worker.kinds:
+                worker.preparing = kind
+                worker.deadline_s = time.monotonic() + self._options.prepare_s
+                measure = not self._prepared
+                worker.child.pipe.send(Prepare(kind=number, settings=kind.settings, measure=measure))
+                return
+
+    def _died(self, worker: Worker) -> list[Event]:
+        """Clear up after a worker, and return what became of its job."""
+        if worker.child is None:
+            return []
+        pid, found = worker.child.pid, list[Event]()
+        worker.child.close()
+        worker.child, worker.ready = None, False
+        worker.kinds.clear()
+        worker.deadline_s = float("inf")
+        worker.start_s = time.monotonic() + _BACK_OFF_S[min(worker.deaths, len(_BACK_OFF_S) - 1)]
+        worker.deaths += 1
+        self.respawned += 1
+        kind, job, slot = worker.preparing, worker.job, worker.slot
+        worker.preparing = worker.job = worker.slot = None
+        self._log.warning("worker_died", pid=pid, text="another takes its place")
+        if kind is not None and kind.number in self._kinds and kind.number not in self._prepared:
+            self._tries[kind.number] = self._tries.get(kind.number, 0) + 1
+            if self._tries[kind.number] >= _TRIES:
+                del self._kinds[kind.number]
+                found.append(KindFailed(kind.number, "workers die of getting ready for it"))
+        if slot is not None:
+            worker.free.append(slot)
+        if job is not None:
+            found.append(Lost(job, f"worker {pid} has died of it or was killed", again=True))
+        return found

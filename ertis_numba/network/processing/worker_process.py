@@ -1,0 +1,121 @@
+"""A process that makes images: ``python -m ertis_numba.network.processing.worker_process DESCRIPTOR``."""
+
+import faulthandler
+import os
+import sys
+import time
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.frames import Measurement
+from ertis_numba.network.processing._predictions import Predictions
+from ertis_numba.network.processing.child import pipe_of_child
+from ertis_numba.network.processing.pipe_messages import (
+    FromWorker,
+    JobFailed,
+    JobFinished,
+    Prepare,
+    ProcessJob,
+    Ready,
+    Release,
+    SlotMemory,
+    ToWorker,
+    Unusable,
+)
+from ertis_numba.network.processing.slots import POINTS_BYTES, SlotView
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing.chain import SharedPipeline
+    from ertis_numba.network.processing.pipe import Pipe
+
+_DRAIN_S: Final = 0.1
+_NEGLECTED: Final = 3  # deadlines after which a worker that hangs ends by itself, where nobody is left to kill it
+
+
+class _ImageWorker:
+    def __init__(self, pipe: "Pipe[ToWorker]", arguments: list[str]) -> None:
+        self._pipe = pipe
+        self._device, self._dtype = arguments[2:4]
+        self._threads, self._at_once = int(arguments[4]), int(arguments[5])
+        self._deadline_s = float(arguments[6])
+        self._views: dict[int, SlotView] = {}
+        self._chains: dict[int, SharedPipeline] = {}
+        self._predictions = Predictions(self._device)
+
+    def run(self) -> None:
+        from ertis_numba import kernels  # noqa: PLC0415  in this process alone
+
+        try:
+            loaded: kernels.KernelSet | None = kernels.load(self._device)
+        except DeviceError:  # which making the pipeline says again, then it can be told
+            loaded = None
+        largest = 1 if loaded is None else loaded.max_threads
+        self._threads = min(self._threads, largest)
+        self._pipe.send(Ready(device=self._device if loaded is None else loaded.device, threads=largest))
+        while not self._pipe.closed:
+            self._pipe.wait(_DRAIN_S if self._predictions.busy else None)
+            for order in self._pipe.receive():
+                self._obey(order)
+            for prediction in self._predictions.drain():
+                self._pipe.send(prediction)
+
+    def _obey(self, order: ToWorker) -> None:
+        match order:
+            case SlotMemory():
+                descriptor = self._pipe.files.popleft()
+                self._views[order.slot] = SlotView(descriptor, order.words_bytes, order.image_bytes)
+                os.close(descriptor)
+            case Prepare():
+                self._pipe.send(self._prepared(order))
+            case Release():
+                if (chain := self._chains.pop(order.kind, None)) is not None:
+                    chain.pipeline.close()
+            case ProcessJob():
+                self._pipe.send(self._processed(order))
+
+    def _prepared(self, order: Prepare) -> FromWorker:
+        from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in this process alone
+
+        try:
+            chain = SharedPipeline(order.settings, self._device)
+            times_s = chain.times_s(self._threads, self._at_once) if order.measure else (0.0, 0.0)
+            reported = chain.prepared(order.kind, *times_s)
+        except (ArgumentError, DataError, DeviceError, MemoryError) as error:
+            return Unusable(kind=order.kind, text=str(error) or type(error).__name__)
+        self._chains[order.kind] = chain
+        return reported
+
+    def _processed(self, order: ProcessJob) -> FromWorker:
+        begun_s = time.perf_counter()
+        faulthandler.dump_traceback_later(_NEGLECTED * self._deadline_s, exit=True)
+        try:
+            n_points = self._made(self._chains[order.kind], self._views[order.slot], order)
+        except DataError as error:
+            return JobFailed(job=order.job, text=str(error), again=False)
+        except Exception as error:  # noqa: BLE001  a mistake in one measurement's way must not end the others'
+            return JobFailed(job=order.job, text=f"{type(error).__name__}: {error}", again=True)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+        return JobFinished(job=order.job, took_s=time.perf_counter() - begun_s, n_points=n_points)
+
+    def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> int:
+        """Make the image in its slot, and the points, of which there are that many."""
+        place = view.image_as(chain.shape, self._dtype)
+        words = view.words(order.words_bytes)
+        image = chain.image(words, place if self._dtype == "float32" else None, threads=order.threads)
+        if order.predict_for:
+            measurement = Measurement(chain.format.from_bytes(bytes(words)), image.settings)
+            self._predictions.add(order.predict_for, image.replace(amplitude=image.amplitude.copy()), measurement)
+        if self._dtype != "float32":
+            np.copyto(place, image.amplitude, casting="same_kind")
+        if not order.points:
+            return 0
+        points = chain.points(image, POINTS_BYTES // 16)
+        view.points(points.nbytes)[:] = points.tobytes()
+        return len(points)
+
+
+if __name__ == "__main__":
+    _ImageWorker(pipe_of_child(sys.argv, ToWorker), sys.argv).run()

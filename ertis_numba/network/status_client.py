@@ -1,0 +1,120 @@
+"""Asks a central node how it is."""
+
+import time
+from types import TracebackType
+from typing import Final, Self
+
+import zmq
+
+from ertis_numba.errors import NetworkError, RefusedError
+from ertis_numba.network import addresses, messages, sockets
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.messages import AskStatus, Refused, Report
+from ertis_numba.network.status import Status
+
+__all__ = ["Asking"]
+
+_REPORT_BYTES: Final = 4_000_000
+_AGAIN_S: Final = 0.5
+
+
+class Asking:
+    """Asks a central node how it is, as often as wanted; use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    address : str
+        Where it takes measurements in, or where it publishes.
+    keys : ClientKeys, optional
+        Of an application or an admin.
+
+    Raises
+    ------
+    ArgumentError
+        The address cannot be used, or not without keys.
+    """
+
+    def __init__(self, address: str, *, keys: ClientKeys | None = None) -> None:
+        self._address, self._keys = addresses.endpoint(address), keys
+        addresses.require_keys(self._address, keys=keys)
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: sockets.Monitor | None = None
+
+    def __enter__(self) -> Self:
+        self._context = zmq.Context()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._hang_up()
+        if self._context is not None:
+            self._context.term()
+        self._context = None
+
+    def ask(self, patience_s: float = 3.0) -> Status:
+        """Return how it is.
+
+        Parameters
+        ----------
+        patience_s : float
+
+        Raises
+        ------
+        NetworkError
+            Nothing has answered in this time.
+        RefusedError
+            It does not let this node in, or does not tell it.
+        DataError
+            The answer is not of this protocol.
+        """
+        end_s, asked_s, why = time.monotonic() + patience_s, 0.0, ""
+        while time.monotonic() < end_s:
+            socket, monitor = self._connection()
+            if time.monotonic() - asked_s > _AGAIN_S and socket.poll(0, zmq.POLLOUT):
+                socket.send(messages.encode(AskStatus()), zmq.NOBLOCK)
+                asked_s = time.monotonic()
+            poller = zmq.Poller()
+            poller.register(socket, zmq.POLLIN)
+            poller.register(monitor.socket, zmq.POLLIN)
+            ready = dict(poller.poll(20))  # a connection that is made wakes nobody
+            if socket in ready:
+                answer = _read(socket.recv_multipart())
+                if answer is not None:
+                    return answer
+            why = next(iter(monitor.read()), why)
+            if monitor.final:
+                break
+        self._hang_up()
+        if why:
+            raise RefusedError(f"{self._address}: {why}")
+        raise NetworkError(
+            f"{self._address} has not answered for {patience_s:g} s; start a central node there by 'ertis record' or "
+            "'ertis serve', or give its address"
+        )
+
+    def _connection(self) -> tuple["zmq.Socket[bytes]", sockets.Monitor]:
+        if self._context is None:
+            raise NetworkError("nothing can be asked now; use it in a with statement")
+        if self._socket is None or self._monitor is None:
+            self._socket = sockets.client(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)
+            self._monitor = sockets.Monitor(self._socket)
+        return self._socket, self._monitor
+
+    def _hang_up(self) -> None:
+        if self._monitor is not None:
+            self._monitor.close()
+        if self._socket is not None:
+            self._socket.close(linger=0)
+        self._monitor = self._socket = None
+
+
+def _read(frames: list[bytes]) -> Status | None:
+    """Return a status; None if a message is another."""
+    message = messages.decode(frames[0])
+    if isinstance(message, Refused):
+        raise RefusedError(message.reason)
+    if not isinstance(message, Report):
+        return None
+    return Status.decode(b"".join(frames[1:]))

@@ -1,0 +1,62 @@
+"""Names of the windows that ``processing.array_weights`` accepts."""
+
+from typing import Final, NamedTuple
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["WINDOWS", "ArrayWindow", "parse_window"]
+
+
+class _Parameter(NamedTuple):
+    default: float
+    low: float
+    high: float
+
+
+WINDOWS: Final[dict[str, _Parameter | None]] = {
+    "uniform": None,
+    "cosine": None,
+    "hann": None,
+    "hamming": None,
+    "blackman": None,
+    "taylor": _Parameter(30.0, 20.0, 80.0),
+    "kaiser": _Parameter(6.0, 0.0, 20.0),
+}
+"""Windows, and the parameter of those that have one: side-lobe attenuation in dB for Taylor, beta for Kaiser."""
+
+
+class ArrayWindow(NamedTuple):
+    """A window with its parameter, which is 0 if it has none."""
+
+    window: str
+    parameter: float
+
+
+def parse_window(name: str) -> ArrayWindow:
+    """Return the window that a name such as ``hann`` or ``taylor:35`` stands for.
+
+    Raises
+    ------
+    ArgumentError
+        The window is unknown, or its parameter cannot be used.
+    """
+    window, colon, given = name.partition(":")
+    checks.choice("processing.array_weights", window, WINDOWS)
+    parameter = WINDOWS[window]
+    if parameter is None:
+        if colon:
+            raise ArgumentError(
+                f"processing.array_weights is {name[:80]!r}, but the window {window} has no parameter; give {window!r}"
+            )
+        return ArrayWindow(window, 0.0)
+    if not colon:
+        return ArrayWindow(window, parameter.default)
+    try:
+        value = float(given)
+    except ValueError:
+        raise ArgumentError(
+            f"processing.array_weights is {name[:80]!r}; give a number after the colon, such as "
+            f"'{window}:{parameter.default:g}'"
+        ) from None
+    return ArrayWindow(window, checks.between(f"parameter of processing.array_weights {window}", value, *parameter[1:]))

@@ -1,0 +1,167 @@
+"""Two renderings compared: what an effect really changes in an image."""
+
+import functools
+import math
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid
+from ertis_numba.settings import Settings
+from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.loudness import LOUD
+from ertis_numba.simulation.scene import Scene
+from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
+from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.stages import planner
+from ertis_numba.stages.fast import FastChain
+
+__all__ = ["ABRender", "image_change_db"]
+
+Image = NDArray[np.float32]
+
+_KEPT = 24  # images: most verdicts are about the same effects with one more or less
+_KEPT_BYTES = 2**28  # total of stored images, which are few for large grids
+
+
+class ABRender:
+    """Renders and processes measurements of a scene with some effects and with others.
+
+    Modulators and converters are included if a signal comes within 6 dB of full scale. Otherwise they are left out: any
+    change of the input changes their noise, which is no change of the image.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._signals = functools.lru_cache(maxsize=2)(self._rendered)
+        kept = min(_KEPT, max(2, _KEPT_BYTES // max(_image_bytes(sensor.settings()) for sensor in scene.sensors)))
+        self._image = functools.lru_cache(maxsize=kept)(self._imaged)
+        self._images = functools.lru_cache(maxsize=max(2, kept // 2))(self._converted)
+        self._chain = functools.lru_cache(maxsize=8)(_chain)
+        # All renderings have the same noise, which takes as long as the rest of one.
+        self._noise = functools.lru_cache(maxsize=1)(_noise)
+
+    def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
+        """Return by how much an effect changes the images of all sensors at the most, in decibels.
+
+        Sensors whose settings yield no image, such as a range window beyond the end of their records, are left out.
+        The result is None if no sensor yields an image.
+
+        Parameters
+        ----------
+        index : int
+            Of the measurement.
+        others : frozenset of str
+            The other effects.
+        name : str
+        """
+        changes_db = []
+        for sensor in self._scene.sensors:
+            both = others, others | {name}
+            try:
+                self._chain(sensor.settings())
+            except ArgumentError:
+                continue
+            shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
+            spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+            floor = min(Sight(shot, active).floor for active in both)
+            (before, one), (after, other) = (self._image(sensor.name, index, active) for active in both)
+            changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
+            if max(one, other) >= LOUD:
+                pairs = [self._images(sensor.name, index, active) for active in both]
+                noise = np.min([_local(np.abs(pair[1] - pair[0]), spacing_m) for pair in pairs], axis=0)
+                change_db = image_change_db(pairs[0][0], pairs[1][0], spacing_m=spacing_m, floor=floor, noise=noise)
+                changes_db.append(change_db)
+        return max(changes_db, default=None)
+
+    def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
+        """Return the input of modulators or converters, with noise: (mic, sample) float64."""
+        sensor = self._scene.sensor(name)
+        signals = Engine(self._scene, sensor, active).signals(index)
+        dbfs = sensor.electronics.noise_dbfs
+        if "microphone_noise" in active and dbfs is not None:
+            signals += 10 ** (dbfs / 20) * self._noise(self._scene.seed, signals.shape)
+        return signals
+
+    def _imaged(self, name: str, index: int, active: frozenset[str]) -> tuple[Image, float]:
+        """Return the image of the signals themselves, and their highest amplitude."""
+        signals = self._signals(name, index, active)
+        chain = self._chain(self._scene.sensor(name).settings())
+        image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
+        chain.process_signals(signals, image)
+        return image, float(np.abs(signals).max())
+
+    def _converted(self, name: str, index: int, active: frozenset[str]) -> list[Image]:
+        """Return two images from the output of modulators or converters, with different dither."""
+        sensor = self._scene.sensor(name)
+        engine, signals = Engine(self._scene, sensor, active), self._signals(name, index, active)
+        chain = self._chain(sensor.settings())
+        images = [np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32) for _ in range(2)]
+        for draw, image in enumerate(images):
+            chain.process(engine.converted(signals, draw), image)
+        return images
+
+
+def image_change_db(
+    before: Image,
+    after: Image,
+    *,
+    spacing_m: float,
+    floor: float,
+    noise: Image | float = 0.0,
+) -> float:
+    """Return by how much two images differ at the most.
+
+    At each place the difference is taken beside the strongest, over all directions and 5 cm of range, that both
+    images have there, and at least beside ``floor``: ``20 log10(1 + |Δ| / beside)``. So what hides among
+    the side lobes of a stronger echo does not count.
+
+    Parameters
+    ----------
+    before, after : (direction, range) float32
+    spacing_m : float
+        Of the ranges.
+    floor : float
+        The weakest reflector that is to be kept.
+    noise : float or (range,) float32
+        Difference that noise alone makes, which is no change.
+    """
+    beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
+    change = np.maximum(np.abs(after - before) - noise, 0.0)
+    return float(20 * np.log10(1 + np.max(change / beside, initial=0.0)))
+
+
+def _local(image: Image, spacing_m: float) -> Image:
+    """Return the strongest amplitude over all directions and 5 cm of range: (range,) float32."""
+    strongest = image.max(axis=0)
+    near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(strongest))) + 1
+    return np.asarray(scipy.ndimage.maximum_filter1d(strongest, near))
+
+
+def _image_bytes(settings: Settings) -> int:
+    """Return the approximate size of an image."""
+    range_rate_m = 2 * settings.output_rate_hz / sound_speed_m_s(settings.air)
+    n_ranges = np.ptp(settings.processing.range_m) * range_rate_m + 1
+    return int(4 * len(direction_grid(settings.processing).azimuth_rad) * n_ranges)
+
+
+def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def _chain(settings: Settings) -> FastChain:
+    kernel_set = kernels.load("cpu")
+    threads = kernel_set.max_threads
+    single = settings.replace(
+        processing=settings.processing.replace(method="fast"),
+        accuracy=settings.accuracy.replace(precision="float32"),
+    )
+    return FastChain(planner.complete(single, kernel_set, threads=threads), kernel_set, threads=threads)

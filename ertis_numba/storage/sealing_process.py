@@ -1,0 +1,101 @@
+"""Seal a journal: make the recording of it, and remove it."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TextIO
+
+from ertis_numba.atomic_files import temporary_path
+from ertis_numba.errors import ErtisError, JournalInUseError
+from ertis_numba.journal import SUFFIX, Sealed
+from ertis_numba.storage._gradual_sync import GradualSync, shrinking
+from ertis_numba.storage.sealing import TOKEN, seal
+
+__all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NOTHING", "main"]
+
+FAILED, INTERRUPTED = 1, 130
+
+NOTHING = 66
+"""Exit code where nothing was measured: EX_NOINPUT of sysexits.h. The journal is gone."""
+
+IN_USE = 75
+"""Exit code where another process has the journal: EX_TEMPFAIL of sysexits.h, try again later."""
+
+_STEPS = 100  # in which progress is told
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Seal a journal and return an exit code: 0 done, `FAILED`, `NOTHING`, `IN_USE` or `INTERRUPTED`.
+
+    The path of the recording goes to stdout, errors in a line to stderr. With ``--json``, stdout has lines of one
+    object each: progress (``done``, ``of``), and at last what is in `Sealed`, or ``error`` and ``in_use``.
+    """
+    parser = argparse.ArgumentParser(
+        "python -m ertis_numba.storage.sealing", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("journal", type=Path)
+    parser.add_argument("--force", action="store_true", help="replace a file of the recording's name")
+    parser.add_argument(
+        "--rests", type=float, help="let others have the processors, and the disk for so many times as long as a step"
+    )
+    parser.add_argument("--json", action="store_true", help="tell progress and result as lines of JSON")
+    given = parser.parse_args(arguments)
+    recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
+    pace = None if given.rests is None else GradualSync(temporary_path(recording, TOKEN), given.rests)
+
+    def progress(done: int, of: int) -> None:
+        if pace is not None:
+            pace()
+        if given.json:
+            _report_progress(done, of)
+
+    try:
+        with nullcontext() if given.rests is None else shrinking(given.journal, given.rests):
+            sealed = seal(given.journal, overwrite=given.force, progress=progress)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except (ErtisError, OSError, MemoryError) as error:
+        line = " ".join(str(error).split()) or type(error).__name__
+        in_use = isinstance(error, JournalInUseError)
+        if given.json:
+            _emit_event({"error": line, "in_use": in_use})
+        else:
+            _say(line, sys.stderr)
+        return IN_USE if in_use else FAILED
+    if given.json:
+        _emit_event({name: str(value) if isinstance(value, Path) else value for name, value in asdict(sealed).items()})
+    else:
+        if sealed.recording is not None:
+            _say(str(sealed.recording), sys.stdout)
+        if sealed.remark:
+            _say(sealed.remark, sys.stderr)
+    return _code_of(sealed)
+
+
+def _code_of(sealed: Sealed) -> int:
+    if sealed.refused:
+        return FAILED
+    return NOTHING if sealed.recording is None else 0
+
+
+def _report_progress(done: int, of: int) -> None:
+    if done == of or done % max(1, of // _STEPS) == 0:
+        _emit_event({"done": done, "of": of})
+
+
+def _emit_event(report: dict[str, object]) -> None:
+    _say(json.dumps(report), sys.stdout)
+
+
+def _say(text: str, stream: TextIO) -> None:
+    with suppress(OSError):  # who listened may have been killed: the recording is made all the same
+        stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # file names may be no text at all
+        stream.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""Say which runs of which sensors recordings hold, and up to which number, as JSON.
+
+In a process of its own, for who may not load HDF5.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ertis_numba.errors import DataError
+from ertis_numba.storage._reader import file_kind, sensor_names
+from ertis_numba.storage.recording import open_recording
+
+__all__ = ["main", "runs_of"]
+
+
+def runs_of(path: Path) -> list[tuple[str, int, int]]:
+    """Return the runs in a recording: sensor, epoch, and the highest number that is held or noted to be missing."""
+    found: list[tuple[str, int, int]] = []
+    for sensor in sensor_names(path):
+        with open_recording(path, sensor=sensor) as reader:
+            numbers = [(gap.session_id, gap.last) for gap in reader.gaps]
+            numbers += [(stamp.session_id, stamp.sequence) for stamp in reader.stamps()]
+        last: dict[int, int] = {}
+        for session_id, number in numbers:
+            last[session_id] = max(number, last.get(session_id, -1))
+        found += [(sensor, session_id, number) for session_id, number in last.items()]
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print ``[[sensor, session_id, last], …]`` of all recordings given, and return an exit code.
+
+    Files that are no recordings are left out; a recording that cannot be read is an error, told in a line on stderr.
+    """
+    parser = argparse.ArgumentParser("python -m ertis_numba.storage.sessions_process", description=__doc__)
+    parser.add_argument("recordings", type=Path, nargs="*")
+    try:
+        found = [
+            run
+            for path in parser.parse_args(arguments).recordings
+            if file_kind(path) == "recording"
+            for run in runs_of(path)
+        ]
+    except (DataError, OSError) as error:
+        sys.stderr.write(f"{' '.join(str(error).split())}\n")
+        return 1
+    sys.stdout.write(json.dumps(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,279 @@
+"""Images of a file along its time: recordings are processed while they are shown."""
+
+import atexit
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, Literal, Self
+
+from ertis_numba import kernels
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.storage import (
+    EnergyscapeReader,
+    RecordingReader,
+    file_kind,
+    open_energyscapes,
+    open_recording,
+    sensor_names,
+)
+from ertis_numba.storage.recording import Mounting
+from ertis_numba.viewer._shapes import Pose, ReceivedImage
+from ertis_numba.viewer._time_steps import UNTIMED_S, SensorTimeline, TimeStep, time_steps_of
+
+__all__ = ["Playback", "TimeStep"]
+
+_LOOK_S: Final = 1 / 60
+
+
+class Playback:
+    """A recording or an energyscape file as moments, one of which is shown.
+
+    Parameters
+    ----------
+    path : str or Path
+    sensors : str or sequence of str, optional
+        All by default.
+    device : {"auto", "cpu", "cuda", "numpy"}
+        What processes recordings.
+    loop : bool
+        Begin anew at the end.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Poses of sensors on their platform, in place of those in the file.
+
+    Attributes
+    ----------
+    path : Path
+    time_steps : tuple of Moment
+    place, shown : int
+        Number of the moment that is due, and of the one that was taken last.
+    anew : bool
+        What was taken last stands alone: what was taken before is of another time, as after `seek`.
+    playing : bool
+    held : bool
+        Time does not begin, as nobody sees it yet; the first moment is made all the same.
+    received, skipped : int
+        How many images were made, and moments of which nothing was shown, as there was no time while this played.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read or holds nothing.
+    ArgumentError
+        There is no such sensor.
+    DeviceError
+        There is no such device to process recordings.
+    """
+
+    is_playback: Literal[True] = True
+    dropped = 0
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        sensors: Sequence[str] | None = None,
+        device: Literal["auto", "cpu", "cuda", "numpy"] = "auto",
+        loop: bool = False,
+        mounting: Mapping[str, Mounting] | None = None,
+    ) -> None:
+        self._given = {sensor: Pose.of(*place) for sensor, place in (mounting or {}).items()}
+        self.path = Path(path)
+        self.title = self.path.name
+        self._device, self._loop = device, loop
+        self._pipelines: dict[str, Pipeline] = {}
+        self._readers: dict[str, RecordingReader | EnergyscapeReader] = {}
+        self._stack = ExitStack()
+        opened: Callable[..., RecordingReader | EnergyscapeReader] = (
+            open_energyscapes if file_kind(path) == "energyscape" else open_recording
+        )
+        with self._stack:
+            for name in [sensors] if isinstance(sensors, str) else sensors or sensor_names(path):
+                self._readers[name] = reader = opened(path, sensor=name)
+                self._stack.callback(reader.close)
+            if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):
+                kernels.load(device)  # what is not there is told before anything is shown
+            self.time_steps, self._notes = time_steps_of(
+                {name: reader.stamps() for name, reader in self._readers.items()}
+            )
+            if not self.time_steps:
+                raise DataError(f"{path} holds no measurement; give a file with one")
+            self._stack = self._stack.pop_all()
+        self._tracks = {name: SensorTimeline.of(name, self.time_steps) for name in self._readers}
+        self.playing, self.place, self.shown, self.anew = True, 0, 0, True
+        self.held = False
+        self.received = self.skipped = 0
+        self._begun: tuple[float, int] | None = None  # when which moment was due
+        self._made: int | None = None  # None where what is made next stands alone
+        self._jumps = self._plays = self._made_in = 0  # how often somebody went elsewhere, or began or ended a play
+        self._ready: dict[str, ReceivedImage] = {}
+        self._ready_for, self._ready_anew = 0, True
+        self._turn = threading.Lock()
+        self._closed = threading.Event()
+        self._failure: Exception | None = None
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+        for pipeline in self._pipelines.values():
+            pipeline.close()
+        self._stack.close()
+
+    def _end(self) -> None:
+        """End the thread; while kernels are being compiled that takes some seconds.
+
+        An interpreter that ends while a thread is in the compiler crashes: LLVM is taken apart under it.
+        """
+        self._closed.set()
+        if self._thread is not None:
+            self._thread.join()
+        atexit.unregister(self._end)
+
+    @property
+    def state(self) -> str:
+        """What to tell of the film."""
+        return f"{self.time_steps[self.shown].time_s:.2f} s of {self.time_steps[-1].time_s:.2f} s"
+
+    @property
+    def clock_s(self) -> float:
+        """The time of the moment that is shown and, while this plays, what has passed since, until the next one."""
+        with self._turn:
+            shown_s, after = self.time_steps[self.shown].time_s, self.shown + 1
+            if not self.playing or self._begun is None:
+                return shown_s
+            next_s = self.time_steps[after].time_s if after < len(self.time_steps) else shown_s + UNTIMED_S
+            return min(max(self._due_s(self._begun, time.monotonic()), shown_s), next_s)
+
+    def notes(self) -> list[str]:
+        """Return what there is to know of the times in the file, once."""
+        reported, self._notes = self._notes, []
+        return reported
+
+    def play(self, *, playing: bool) -> None:
+        """Go on, from the beginning where this is at the end; or stay."""
+        with self._turn:
+            if playing and self.place == len(self.time_steps) - 1:
+                self._jump(0)
+            self.playing, self._begun = playing, None
+            self._plays += 1
+
+    def seek(self, place: int) -> None:
+        """Show a moment next, and go on from there."""
+        with self._turn:
+            self._jump(min(max(place, 0), len(self.time_steps) - 1))
+
+    def _jump(self, place: int) -> None:
+        self.place, self._begun, self._made = place, None, None
+        self._jumps += 1
+        self._plays += 1
+
+    def take(self) -> list[ReceivedImage]:
+        """Return the images of the moment that was due last, nothing where they were taken.
+
+        At recorded speed: moments for which there was no time are skipped and counted. Of a sensor that measured in
+        them the last image is returned; after `seek`, of each sensor the last one at or before the moment. Images are
+        made in a thread, as the first takes long where kernels are to be compiled.
+
+        Raises
+        ------
+        DataError
+            The file cannot be read.
+        """
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="ertis-film", daemon=True)
+            self._thread.start()
+            atexit.register(self._end)  # where nobody closes this
+        with self._turn:
+            if self._failure is not None:
+                raise self._failure
+            ready, self._ready = [*self._ready.values()], {}
+            if ready:
+                self.shown, self.anew = self._ready_for, self._ready_anew
+        return ready
+
+    def at(self, place: int) -> list[ReceivedImage]:
+        """Return the images of a moment."""
+        return [self._taken(name, place, number) for name, number in self.time_steps[place].measurements]
+
+    def latency_s(self, _: Sequence[ReceivedImage]) -> float | None:
+        """Return None: what was recorded is as old as it is."""
+        return None
+
+    def _run(self) -> None:
+        """Make images of the moment that is due, until this is closed."""
+        try:
+            while not self._closed.is_set():
+                with self._turn:
+                    if self.playing:
+                        self._advance(time.monotonic())
+                    place, made, jumps, plays = self.place, self._made, self._jumps, self._plays
+                if place == made:
+                    self._closed.wait(_LOOK_S)
+                    continue
+                last = {name: track.last(-1 if made is None else made, place) for name, track in self._tracks.items()}
+                due = {name: each for name, each in last.items() if each is not None}
+                taken = {name: self._taken(name, *each) for name, each in due.items()}
+                with self._turn:
+                    if made is not None and plays == self._made_in:
+                        self.skipped += place - made - len({at for at, _ in due.values()})
+                        self.skipped += bool(self._ready.keys() & taken.keys())  # which nobody took in time
+                    self._put(place, taken, anew=made is None)
+                    self._made_in = plays
+                    if jumps == self._jumps:
+                        self._made = place
+        except Exception as error:  # noqa: BLE001  whoever looks is to know
+            self._failure = error
+
+    def _put(self, place: int, taken: dict[str, ReceivedImage], *, anew: bool) -> None:
+        """Have images ready, with those that nobody took yet where they are of the same play."""
+        self.received += len(taken)
+        self._ready_anew = anew or (bool(self._ready) and self._ready_anew)
+        self._ready = taken if anew else self._ready | taken
+        self._ready_for = place
+
+    def _due_s(self, begun: tuple[float, int], now_s: float) -> float:
+        """Return the time of the film that it is now, of a play that began then and there."""
+        begun_s, first = begun
+        return self.time_steps[first].time_s + now_s - begun_s
+
+    def _advance(self, now_s: float) -> None:
+        """Go to the moment that is due."""
+        if self._begun is None:
+            # Time begins when it is shown, which may take long where kernels are compiled.
+            if self.held or self._made != self.place:
+                return
+            self._begun = now_s, self.place
+        due_s = self._due_s(self._begun, now_s)
+        last = len(self.time_steps) - 1
+        while self.place < last and self.time_steps[self.place + 1].time_s <= due_s:
+            self.place += 1
+        if self.place < last or due_s < self.time_steps[last].time_s + UNTIMED_S:
+            return
+        if self._loop:
+            if self._made is not None and self._made_in == self._plays:
+                self.skipped += last - self._made
+            self.place, self._begun, self._made = 0, (now_s, 0), None
+        else:
+            self.playing = False
+
+    def _taken(self, name: str, place: int, number: int) -> ReceivedImage:
+        reader = self._readers[name]
+        item = reader[number]
+        image = item if isinstance(item, Energyscape) else self._processed(name, item)
+        pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
+        return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
+
+    def _processed(self, name: str, measurement: Measurement) -> Energyscape:
+        """Return the image of a measurement; other air makes other ranges, and another pipeline."""
+        pipeline = self._pipelines.get(name)
+        if pipeline is None or pipeline.settings.air != measurement.settings.air:
+            if pipeline is not None:
+                pipeline.close()
+            pipeline = self._pipelines[name] = Pipeline(measurement.settings, device=self._device, predict=False)
+        return pipeline.process(measurement)
