@@ -1,4 +1,4 @@
-"""Where options come from that are not given: environment variables, then a file, then their defaults."""
+"""Sources of options that are not given: environment variables, then a file, then defaults."""
 
 import difflib
 import os
@@ -22,14 +22,14 @@ __all__ = [
 ]
 
 _GENERAL = frozenset({"device", "quiet", "threads"})
-"""Options that mean the same in every command: ``ERTIS_THREADS`` is of all."""
+"""Options with one meaning in all commands: ``ERTIS_THREADS`` applies to each."""
 
 _NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
-"""What others of this package read, and what its benchmark knows its processes by."""
+"""Variables of other parts of this package, and of its benchmarks."""
 
-_FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`
+_FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # Keys of click's `Context.meta`.
 _WITHOUT = frozenset({"completion", "doctor"})
-"""What runs where the configuration is at fault: every new shell asks for the one, whoever is at a loss the other."""
+"""Commands that run despite a faulty configuration file: shell completion and help."""
 
 
 def variable(path: Iterable[str], option: str) -> str:
@@ -38,13 +38,13 @@ def variable(path: Iterable[str], option: str) -> str:
 
 
 def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
-    """Let the options of a command, and of those in it, come from the environment, too.
+    """Let environment variables set the options of a command and of its subcommands.
 
     Parameters
     ----------
     command : click.Command
     path : tuple of str
-        Its name, after those of the groups it is in.
+        Name of the command, after those of its groups.
     """
     for option, parameter in _options(command).items():
         if parameter.envvar is None:
@@ -56,11 +56,11 @@ def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
 
 
 def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
-    """Yield a line for each variable that begins like those of commands and is of none, with the one that may be meant.
+    """Yield a line for each variable that resembles an option's but matches none, with the closest match.
 
-    Others' may begin so, too: those of a service in a cluster are named after it.
+    Variables of other programs may begin alike, such as those of a service in a cluster.
     """
-    # Commands are imported only where a variable begins like one of theirs.
+    # A command is imported only if a variable begins like one of its options.
     commands = {variable((name,), ""): name for name in group.list_commands(ctx)}
     general = {variable((), option) for option in _GENERAL}
     for name in sorted(os.environ):

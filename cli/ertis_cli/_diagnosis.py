@@ -43,7 +43,7 @@ _RUNS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class InstallationFinding:
-    """Something that was looked at.
+    """Result of one check.
 
     Attributes
     ----------

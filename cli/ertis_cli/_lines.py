@@ -1,4 +1,4 @@
-"""Lines for somebody who may be slow to read them, or has stopped."""
+"""Non-blocking output to streams with slow or absent readers."""
 
 import os
 import queue
@@ -12,21 +12,21 @@ _CLOSED_S = 5.0
 
 
 class JsonLines:
-    """A stream whose writer never waits for its reader: a thread writes, in order.
+    """Stream whose writer never waits for its reader: a thread writes the lines in order.
 
-    When too many wait, new ones are left out and counted. A stream that is no file of the system, as in tests, is
-    written to at once.
+    The stream discards and counts new lines if too many wait. A stream without a file descriptor, as in tests, is
+    written directly.
 
     Parameters
     ----------
     stream : file
     largest : int
-        Texts that may wait.
+        Limit on waiting texts.
 
     Attributes
     ----------
     lost : int
-        Texts that were left out.
+        Number of discarded texts.
     """
 
     def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:
@@ -36,14 +36,14 @@ class JsonLines:
         try:
             stream.flush()
             self._descriptor: int | None = stream.fileno()
-        except (OSError, ValueError):  # it has none
+        except (OSError, ValueError):  # It has no descriptor.
             self._descriptor = None
         self._writer = threading.Thread(target=self._write, name="lines", daemon=True)
         if self._descriptor is not None:
             self._writer.start()
 
     def write(self, text: str) -> int:
-        """Take text; returns at once."""
+        """Queue text, and return at once."""
         if self._descriptor is None:
             return self._stream.write(text)
         try:
@@ -53,10 +53,10 @@ class JsonLines:
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: text is written as soon as it can be."""
+        """Do nothing: the thread writes text as soon as possible."""
 
     def close(self, timeout_s: float = _CLOSED_S) -> None:
-        """Wait until all is written, but not for ever."""
+        """Wait, with a timeout, until all text is written."""
         if self._writer.ident is None:
             return
         try:
@@ -66,12 +66,12 @@ class JsonLines:
         self._writer.join(timeout_s)
 
     def _write(self) -> None:
-        # Not by the stream itself: its lock would be held for ever where the reader has stopped.
+        # The stream itself would hold its lock for ever if its reader has stopped.
         descriptor = -1 if self._descriptor is None else self._descriptor
         while (text := self._waiting.get()) is not None:
             data = memoryview(text.encode(errors="backslashreplace"))
             try:
                 while data:
                     data = data[os.write(descriptor, data) :]
-            except OSError:  # nobody reads any more
+            except OSError:  # The reader has closed the stream.
                 continue

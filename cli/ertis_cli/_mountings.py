@@ -37,12 +37,12 @@ def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mou
 
     known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
     if not known:
-        raise ArgumentError(f"{path} does not hold the mounting of any sensor; give a scene, or its [[sensors]]")
+        raise ArgumentError(f"{path} contains no mounting; give a scene, or its [[sensors]]")
     wanted = [*known] if sensors is None else [*sensors]
     for name in wanted:
         if name not in known:
             raise ArgumentError(
-                f"{path} does not hold sensor {name!r}; add it, or choose one of {', '.join(known)} by --name"
+                f"{path} does not contain sensor {name!r}; add it, or choose one of {', '.join(known)} with --name"
             )
     return {name: known[name] for name in wanted}
 

@@ -1,4 +1,4 @@
-"""What the library calls by the names of its parameters, called as typed: ``--min-level``, not ``min_level_db``."""
+"""Translation of parameter names in errors to typed options: ``--min-level``, not ``min_level_db``."""
 
 import functools
 import re
@@ -15,9 +15,9 @@ _UNITS = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_m", "_ms", "_s")
 _NAMED = re.compile(r"(?P<before>option )?(?P<quote>'?)(?P<name>[a-z_]+)(?P=quote)(?= (?:is|holds|runs from)\b)")
 
 
-@functools.cache  # once for each command
+@functools.cache  # Each command has its own names.
 def name_options(command: click.Command) -> None:
-    """Let what refuses the options of a command, and of those in it, call them by their names."""
+    """Make errors about the parameters of a command and of its subcommands name the typed options."""
     if isinstance(command, click.Group):
         for each in command.commands.values():
             name_options(each)
@@ -30,7 +30,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any, **options: Any) -> Any:
         try:
             return callback(*arguments, **options)
-        except ValueError as error:  # which the package need not be imported to know
+        except ValueError as error:  # The base class of the package's errors, which need not be imported here.
             from ertis_numba.errors import ArgumentError
 
             if isinstance(error, ArgumentError):
@@ -41,7 +41,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _named(message: str, ctx: click.Context) -> str:
-    """Return a message that begins with the name of a parameter with that of the option, if it was given."""
+    """Return a message with the typed option in place of the parameter at its start, if the option was given."""
     found = _NAMED.match(message)
     if found is None:
         return message

@@ -1,4 +1,4 @@
-"""Options of the commands that speak over the network."""
+"""Options of the network commands."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,41 +21,43 @@ key: Decorator = click.option(
 server_key: Decorator = click.option(
     "--server-key",
     metavar="FILE|NAME|KEY",
-    help="Public key of the central node; no other is spoken to.",
+    help="Public key of the central node, which must prove it.",
 )
 allow: Decorator = click.option(
     "--allow",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="List of the keys that are let in; that of 'ertis keys allow' by default.",
+    help="Allow list of keys; that of 'ertis keys allow' by default.",
 )
 
 
 def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
-    """Return what a central node needs, or None if no keys were given.
+    """Return the keys of a central node, or None if no keys were given.
 
     Raises
     ------
     SettingsError
-        They cannot be used.
+        The keys cannot be used.
     """
     from ertis_numba.network.allow_list import ALLOW_LIST
     from ertis_numba.network.keys import KeyPair, ServerKeys, default_folder
 
     if key is None:
         if allow is not None:
-            raise click.UsageError("--allow says who is let in and nobody has to show a key; give --key, too")
+            raise click.UsageError(
+                "--allow lists allowed keys, but the central node has no key of its own; give --key, too"
+            )
         return None
     return ServerKeys(KeyPair.load(_file(key, "secret")), allow or default_folder() / ALLOW_LIST)
 
 
 def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
-    """Return what a sensor or application node needs, or None if no keys were given.
+    """Return the keys of a sensor node or an application node, or None if no keys were given.
 
     Raises
     ------
     SettingsError
-        They cannot be used.
+        The keys cannot be used.
     """
     from ertis_numba.errors import SettingsError
     from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
@@ -64,7 +66,7 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
         return None
     if key is None or server_key is None:
         given, other = ("--server-key", "--key") if key is None else ("--key", "--server-key")
-        raise click.UsageError(f"{given} is given without {other}; give both, or none on this machine alone")
+        raise click.UsageError(f"{given} is given without {other}; give both, or neither for nodes on this machine")
     pair = KeyPair.load(_file(key, "secret"))
     try:
         return ClientKeys(pair, public_key(_file(server_key, "public"))[0])
@@ -73,12 +75,12 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
 
 
 def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | None":
-    """Return what serves metrics, to be started; None where that was not asked for.
+    """Return a metrics server, not yet started, or None without the option.
 
     Raises
     ------
     ArgumentError
-        They cannot be served there.
+        The address cannot be used.
     """
     from ertis_numba.errors import ArgumentError
     from ertis_numba.network.addresses import endpoint
@@ -94,12 +96,12 @@ def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | Non
 
 
 def require_duration(given: float | None) -> None:
-    """Refuse a time that cannot pass, before anything is opened.
+    """Refuse an impossible duration before anything is opened.
 
     Raises
     ------
     ArgumentError
-        It is not above zero.
+        The duration is not above zero.
     """
     from ertis_numba import checks
 

@@ -1,4 +1,4 @@
-"""What a plan is, what it is expected to err by and to take, and what it does err by, in words."""
+"""Text descriptions of plans, with predicted and measured errors and times."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 __all__ = ["require_plan", "said_of", "wavefront_note"]
 
 _INTERPOLATIONS = {
-    "fitted": "made of {n} of them by weights that err least",
+    "fitted": "computed from {n} of them with least-squares weights",
     "nearest": "the nearest of them",
-    "carrier": "the nearest of them, its carrier turned to the right phase",
-    "linear": "made of two of them along a straight line",
-    "cubic": "made of four of them along Lagrange's cubic",
+    "carrier": "the nearest of them, with its carrier rotated to the correct phase",
+    "linear": "interpolated linearly between two of them",
+    "cubic": "interpolated by Lagrange's cubic through four of them",
 }
 _MIN_MS = 0.005
 _PART = "  {name:52}  {safe:>8}  {texture:>14}"
@@ -29,11 +29,11 @@ def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error
     context = click.get_current_context()
     for name, given in asked.items():
         if given and settings.processing.method == "paper":
-            raise click.UsageError(f"{name} is for --method fast; the paper's method has no plan", context)
+            raise click.UsageError(f"{name} needs --method fast; the paper's method has no plan", context)
 
 
 def said_of(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
-    """Yield in words what the examination of a sensor's plan has told."""
+    """Yield lines on the examination of a sensor's plan."""
     if "plan" in reported:
         yield from _explained(sensor, reported["plan"])
     if "wavefront_error_db" in reported:
@@ -59,53 +59,53 @@ def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
 
 
 def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
-    """Yield a plan in words, then its errors and times as a table."""
+    """Yield a plan as text, then its errors and times as a table."""
     from ertis_numba.settings import Accuracy
 
     accuracy = Accuracy(**plan["accuracy"])
     sample = _INTERPOLATIONS[accuracy.interpolation].format(n=accuracy.delay_taps)
-    yield f"plan of {sensor}, for an error of {accuracy.max_error_db:g} dB at the most:"
+    yield f"plan of {sensor}, with an error budget of {accuracy.max_error_db:g} dB:"
     if plan["budget_applies_to"] == "beams":
         yield (
-            "  no plan keeps this budget for every image of this adaptive beamformer; "
-            "this one keeps it for delay-and-sum beams of the same signals"
+            "  no plan keeps this budget for every image of this adaptive beamformer; this one keeps it for "
+            "delay-and-sum beams of the same signals"
         )
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
-    yield f"  {precision}, {kept} kept per range, a delayed one is {sample}"
+    yield f"  {precision}, {kept} kept per range; a delayed sample is {sample}"
     if accuracy.beam_taps:
         yield (
-            f"  beams interpolated from {accuracy.beam_taps} nodes along each axis of the array, "
-            f"{accuracy.beam_density:g} of them by what it resolves"
+            f"  beams interpolated from a beam grid: {accuracy.beam_taps} grid points along each axis of the "
+            f"array, {accuracy.beam_density:g} per resolution cell"
         )
     else:
-        yield "  every direction's own beam is summed"
+        yield "  beams summed for every direction, without a beam grid"
     if plan["decimated"]:
-        yield f"  decimation with a stop band of {accuracy.stopband_attenuation_db:g} dB"
+        yield f"  decimation with a stopband attenuation of {accuracy.stopband_attenuation_db:g} dB"
     else:
-        yield "  PCM as it is, without decimation"
+        yield "  PCM without decimation"
     if plan["plane_waves"] is None:
         zones = options.counted(accuracy.focal_zones or 1, "zone")
-        yield f"  spherical wavefronts, with delays of their own in {zones} of ranges"
+        yield f"  spherical wavefronts, with separate delays in {zones} of ranges"
     else:
         ends = " and ".join(f"{end['error_db']:.1f} dB at {end['range_m']:g} m" for end in plan["plane_waves"])
-        yield f"  plane wavefronts, which are wrong by {ends} against spherical ones, on top of the rest"
+        yield f"  plane wavefronts, whose error relative to spherical ones is {ends}, in addition to the rest"
     yield _PART.format(name="predicted error", safe="planned", signal_model="this recording")
     total = {"due_to": "in total", **plan}
     for part in (*plan["parts"], total):
         cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("texture", "predicted"))}
         yield _PART.format(name=f"  {part['due_to']}", **cells)
     stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _MIN_MS)
-    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; by the costs in {plan['costs']}"
+    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; from the costs in {plan['costs']}"
     if plan["predicted_db"] > accuracy.max_error_db:
         yield (
-            f"  beware: this recording is quieter than was planned for, and its images may err by more than "
+            "  warning: this recording is quieter than the plan assumes, and its images may exceed an error of "
             f"{accuracy.max_error_db:g} dB; give a lower --max-error"
         )
 
 
 def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
-    """Yield what was measured against what was predicted."""
+    """Yield the measured error beside the predicted one."""
     yield (
         f"measurement {verified['sequence']} of {sensor}: error {verified['error_db']:.1f} dB in "
         f"{options.counted(verified['directions'], 'direction')}; predicted {verified['predicted_db']:.1f} dB for this "

@@ -23,9 +23,9 @@ __all__ = [
 ]
 
 _SIGNALS: Final = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-_TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
+_TWICE_S = 0.5  # Shorter intervals between signals are repetitions of the first by a shell or terminal.
 _RETRY_INTERVAL_S = 0.05
-_ENDED = 128  # and the number of the signal
+_ENDED = 128  # Exit code of a signal: this and its number.
 
 
 class Interruption:
@@ -102,9 +102,9 @@ class Interruption:
         main = threading.main_thread().ident or 0
         while not self._over.wait(_RETRY_INTERVAL_S) and error is self._errors[-1]:
             handled: Any = sys._current_exceptions().get(main)  # noqa: SLF001  nothing else says what unwinds
-            if isinstance(handled, tuple):  # until Python 3.11
+            if isinstance(handled, tuple):  # Python before 3.12 gives a tuple here.
                 handled = handled[1]
-            if self.caused(handled):  # clearing up takes as long as it takes
+            if self.caused(handled):  # Clean-up takes as long as it needs.
                 continue
             if hasattr(signal, "pthread_kill"):
                 signal.pthread_kill(main, number)
@@ -161,7 +161,7 @@ class Signals:
         now_s = time.monotonic()
         if self._stop is None:
             return
-        if now_s - self._first_s > _TWICE_S:  # who asks again means it
+        if now_s - self._first_s > _TWICE_S:  # A second signal by the user ends the program.
             self.end()
         self._first_s = min(self._first_s, now_s)
         self._stop()

@@ -26,8 +26,9 @@ STABLE_S: Final = 60.0
 """Age of a process from which its end starts a new series of restarts."""
 
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
-_PR_SET_PDEATHSIG: Final = 1  # of prctl(2)
-_SI_USER: Final = 0  # of sigaction(2): sent by kill, so that the process group did not get it as well
+_PR_SET_PDEATHSIG: Final = 1  # Constant of prctl(2).
+# Constant of sigaction(2): the signal was sent by kill, so that the rest of the process group did not get it.
+_SI_USER: Final = 0
 
 _allowed = False
 

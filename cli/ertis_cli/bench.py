@@ -1,4 +1,4 @@
-"""``ertis bench``: the tables of the README, measured here and now."""
+"""Implementation of ``ertis bench``, which generates the performance and accuracy tables of the docs."""
 
 import os
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-# The NumPy backends are compared on one thread; NumPy's BLAS reads this when it is loaded.
+# The NumPy backends are compared on one thread. NumPy's BLAS reads this variable when it is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import click
@@ -23,12 +23,12 @@ def _count(default: int) -> Callable[..., Any]:
         default=default,
         show_default=True,
         metavar="N",
-        help="Measurements each.",
+        help="Number of measurements for each case.",
     )
 
 
 def _seed(about: str, *, default: int = 0) -> Callable[..., Any]:
-    """Return the option of a seed that is the same in every run unless it is given."""
+    """Return the option ``--seed``, which has a fixed default."""
     return click.option(
         "--seed", type=click.IntRange(min=0), default=default, show_default=True, metavar="S", help=about
     )
@@ -42,7 +42,7 @@ def _random_settings(default: int) -> Callable[..., Any]:
         default=default,
         show_default=True,
         metavar="N",
-        help="Random settings to try.",
+        help="Number of random settings.",
     )
     seed = _seed("Seed of the first setting.")
     return lambda command: count(seed(command))
@@ -54,7 +54,7 @@ _update = click.option(
     multiple=True,
     type=click.Path(path_type=Path, dir_okay=False, exists=True, writable=True),
     metavar="FILE",
-    help="Replace the table between the markers of a Markdown file; may be given again.",
+    help="Replace the table between the markers of a Markdown file; repeatable.",
 )
 
 
@@ -69,7 +69,7 @@ def bench() -> None:
 @options.quiet
 @options.as_json
 def paper(**given: Any) -> None:
-    """Bits to energyscape at the paper's 90, 1850 and 3000 directions."""
+    """Time the chain from bits to energyscape at the paper's 90, 1850 and 3000 directions."""
     from ertis_bench import paper as benchmark
 
     _run("paper", benchmark, **given)
@@ -77,23 +77,24 @@ def paper(**given: Any) -> None:
 
 @bench.command()
 @_count(20)
-@click.option("--directions", metavar="GRID", default="3000", show_default=True, help="As in 'ertis process'.")
+@click.option("--directions", metavar="GRID", default="3000", show_default=True, help="Same as in 'ertis process'.")
 @click.option(
     "--plot",
     "picture",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FRONT.png",
-    help="Draw error against time into this file, whether it is there or not.",
+    help="Plot error against time into this file, overwriting it.",
 )
 @_update
 @options.quiet
 @options.as_json
 def accuracy(*, picture: Path | None, **given: Any) -> None:
-    """Error of the image against time, for some forty plans and the paper's method."""
+    """Compare accuracy and processing time of about forty plans and the paper's method."""
     from ertis_bench import accuracy as benchmark
 
-    if picture and not picture.absolute().parent.is_dir():  # refused now rather than after minutes
-        raise click.BadParameter(f"{picture.parent} is no folder; make it first", param_hint="--plot")
+    # A missing folder is reported now rather than after minutes.
+    if picture and not picture.absolute().parent.is_dir():
+        raise click.BadParameter(f"folder {picture.parent} does not exist; create it first", param_hint="--plot")
     report = _run("accuracy", benchmark, **given)
     if picture:
         benchmark.plot(report, picture)
@@ -105,7 +106,7 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 @options.quiet
 @options.as_json
 def verification(**given: Any) -> None:
-    """Compare --verify with a slow float64 reference computation over random settings; nothing is timed."""
+    """Compare --verify with a slow float64 reference for random settings; nothing is timed."""
     from ertis_bench import verification as benchmark
 
     _run("verification", benchmark, **given)
@@ -125,14 +126,19 @@ def budgets(**given: Any) -> None:
 
 @bench.command()
 @click.option(
-    "--count", type=click.IntRange(min=1), default=400, show_default=True, metavar="N", help="Points of each cell."
+    "--count",
+    type=click.IntRange(min=1),
+    default=400,
+    show_default=True,
+    metavar="N",
+    help="Number of points for each cell.",
 )
-@_seed("Of the places.")
+@_seed("Seed of the reflector positions.")
 @_update
 @options.quiet
 @options.as_json
 def points(**given: Any) -> None:
-    """Compare errors of points with their uncertainties, over grids, budgets and noise; nothing is timed."""
+    """Compare the errors of points with their uncertainties over grids, budgets and noise; nothing is timed."""
     from ertis_bench import points as benchmark
 
     _run("points", benchmark, **given)
@@ -144,7 +150,7 @@ def points(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def scaling(**given: Any) -> None:
-    """Time against directions, ranges, microphones and threads."""
+    """Time the chain for different numbers of directions, ranges, microphones and threads."""
     from ertis_bench import scaling as benchmark
 
     _run("scaling", benchmark, **given)
@@ -156,13 +162,13 @@ def scaling(**given: Any) -> None:
     "--verdicts",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Instead of timing, add each effect that was left out of N random scenes; fail if it changes an image.",
+    help="Instead of timing, add each omitted effect to N random scenes; fail if one changes an image.",
 )
 @_update
 @options.quiet
 @options.as_json
 def simulation(*, verdicts: int | None, **given: Any) -> None:
-    """Scene to bits, with the effects that a scene calls for and with all."""
+    """Time the simulation of scenes, with the necessary effects and with all effects."""
     from ertis_bench import simulation as benchmark
 
     if verdicts is None:
@@ -183,19 +189,24 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
             f"effects left out that change an image by more than the tolerance: {len(report['wrong'])}"
         )
     if report["wrong"]:
-        raise DataError(f"effects left out in error: {report['wrong']}; report these scenes")
+        raise DataError(f"effects omitted in error: {report['wrong']}; report these scenes")
 
 
 @bench.command()
 @click.option("--count", type=click.IntRange(min=2), default=24, show_default=True, metavar="N", help="Recordings.")
 @click.option(
-    "--rounds", type=click.IntRange(min=1), default=5, show_default=True, metavar="N", help="Of all in turns."
+    "--rounds",
+    type=click.IntRange(min=1),
+    default=5,
+    show_default=True,
+    metavar="N",
+    help="Number of rounds; all variants run in turn in each round.",
 )
 @_update
 @options.quiet
 @options.as_json
 def many(**given: Any) -> None:
-    """Many recordings by one worker, several, and a dask cluster; all files are compared."""
+    """Time many recordings with one worker, several workers and a dask cluster; all output files are compared."""
     from ertis_bench import many as benchmark
 
     _run("many", benchmark, **given)
@@ -206,7 +217,7 @@ def many(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def factorisation(**given: Any) -> None:
-    """Products per place of an image, with sub-arrays and without; nothing is timed."""
+    """Count the multiplications per image point, with and without sub-arrays; nothing is timed."""
     from ertis_bench import factorisation as benchmark
 
     _run("factorisation", benchmark, **given)
@@ -217,34 +228,36 @@ def factorisation(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def ptx(**given: Any) -> None:
-    """Machine code of the GPU's kernels, and what it would take on an H200; no GPU is needed, nothing is timed."""
+    """Analyse the GPU kernels' machine code and estimate its time on an H200; no GPU is needed, nothing is timed."""
     from ertis_bench import ptx as benchmark
 
     _run("ptx", benchmark, **given)
 
 
 @bench.command("health")
-@click.option("--long", is_flag=True, help="1,000 healthy arrays and 30 trials of each fault rather than 40 and one.")
-@_seed("Of the scenes.")
+@click.option(
+    "--long", is_flag=True, help="Test 1,000 healthy arrays and 30 trials of each fault rather than 40 and one."
+)
+@_seed("Seed of the scenes.")
 @_update
 @options.quiet
 @options.as_json
 def of_health(**given: Any) -> None:
-    """Count false alarms of the health checks in healthy arrays, and the faults that they name."""
+    """Count false alarms of the health checks on healthy arrays, and correctly named faults."""
     from ertis_bench import health as benchmark
 
     _run("health", benchmark, **given)
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="An hour rather than a minute.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")
-@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. sustained, chain, wire, …")
+@click.option("--long", is_flag=True, help="Run for an hour rather than a minute.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the faults; random by default.")
+@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. sustained, chain, wire, …")
 @_update
 @options.quiet
 @options.as_json
 def reliability(*, only: tuple[str, ...], **given: Any) -> None:
-    """Try what goes wrong: faults on the wire, pulled plugs, kill -9, full disks; nothing is timed."""
+    """Test recovery from wire faults, pulled plugs, kill -9 and full disks; nothing is timed."""
     from ertis_bench import reliability as benchmark
 
     from ertis_numba import checks
@@ -260,21 +273,21 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
     "duration_s",
     type=float,
     metavar="S",
-    help="Of each part; five minutes of storage and one of all else by default.",
+    help="Seconds for each part; 300 for storage and 60 for each other part by default.",
 )
-@_seed("Of the words.", default=1)
-@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. storage, processing, …")
+@_seed("Seed of the samples.", default=1)
+@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. storage, processing, …")
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     metavar="DIR",
-    help="Where there is room for what is stored, 220 MB for each second.",
+    help="Folder with room for the stored data, 220 MB per second.",
 )
 @_update
 @options.quiet
 @options.as_json
 def network(*, only: tuple[str, ...], **given: Any) -> None:
-    """Store and make images of what sensor nodes send, with keys; every word and image is checked."""
+    """Measure a network of sensor nodes and a central node with keys; every sample and image is checked."""
     from ertis_bench.network import figures as benchmark
 
     from ertis_numba import checks
@@ -287,14 +300,14 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="Two hours rather than two minutes.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides what goes wrong; drawn by default.")
-@click.option("--only", multiple=True, metavar="PART", help="Only this; may be given again. centrals, nodes, keys, …")
+@click.option("--long", is_flag=True, help="Run for two hours rather than two minutes.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the faults; random by default.")
+@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. centrals, nodes, keys, …")
 @_update
 @options.quiet
 @options.as_json
 def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
-    """Try what goes wrong in a network: kill -9, bad disks and cables, wrong keys, overload; nothing is timed."""
+    """Test recovery from network faults: kill -9, bad disks and cables, wrong keys, overload; nothing is timed."""
     from ertis_bench.network import faults as benchmark
 
     from ertis_numba import checks
@@ -311,16 +324,16 @@ def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
     default=Path("bench/results"),
     show_default=True,
     metavar="FOLDER",
-    help="Where results go, a file for each run.",
+    help="Folder for results, one file per run.",
 )
 @click.option(
-    "--newest", is_flag=True, help="Measure nothing: make the tables of the newest results; no GPU is needed."
+    "--newest", is_flag=True, help="Measure nothing; generate the tables from the newest results. No GPU is needed."
 )
 @_update
 @options.quiet
 @options.as_json
 def gpu(*, newest: bool, **given: Any) -> None:
-    """Test and time this machine's NVIDIA GPU, beside other libraries and its ceilings, in less than ten minutes."""
+    """Test and time this machine's NVIDIA GPU, other libraries and the hardware limits, in under ten minutes."""
     from ertis_bench import gpu as benchmark
 
     _run("gpu", benchmark, measure=not newest, **given)
@@ -332,7 +345,8 @@ def _run(
     from ertis_bench import tables
 
     parts = given.get("only", ())
-    places = [(target, *tables.place(target, name, parts)) for target in targets]  # refused before minutes of work
+    # A missing marker is reported before minutes of work.
+    places = [(target, *tables.place(target, name, parts)) for target in targets]
     report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)
     for target, form, marker in places:
         tables.update(target, marker, tables.FORMS[name][form](report))

@@ -1,4 +1,4 @@
-"""``ertis capture``: sensors to a recording."""
+"""Implementation of ``ertis capture``, which records measurements from sensors."""
 
 import errno
 import re
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["capture"]
 
-_LOOK_S = 0.1  # interval between searches for ports
+_LOOK_S = 0.1  # Interval between searches for ports.
 
 
 @click.command()
@@ -38,29 +38,34 @@ _LOOK_S = 0.1  # interval between searches for ports
     multiple=True,
     required=True,
     metavar="PORT",
-    help="Path, serial number or name of a sensor; several times for several sensors.",
+    help="Path, serial number or name of a sensor; repeatable for several sensors.",
 )
 @options.output("Recording to write; SERIAL_TIME.h5 by default.")
-@click.option("--to", "address", metavar="ADDRESS", help="Central node to send to, instead of writing a recording.")
+@click.option(
+    "--to", "address", metavar="ADDRESS", help="Central node to send measurements to, instead of a recording."
+)
 @click.option(
     "--spool",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="With --to: keep measurements there until the central node has them; in memory by default.",
+    help="With --to: folder that keeps measurements until the central node has them; memory by default.",
 )
 @click.option(
     "--spool-size",
     "spool_mb",
     type=click.FloatRange(min=0, min_open=True),
     metavar="MB",
-    help="Of measurements in the spool, above which new ones are refused; what the disk has room for by default.",
+    help="Limit on the size of the spool, above which new measurements are refused; limited by the disk by default.",
 )
 @click.option(
     "--ring",
     "ring_mb",
     type=click.FloatRange(min=0, min_open=True),
     metavar="MB",
-    help="With --to: of measurements in memory; 64 by default. Without --spool, the oldest are lost when it is full.",
+    help=(
+        "With --to: number of measurements kept in memory; 64 by default. Without --spool, a full ring discards the "
+        "oldest."
+    ),
 )
 @_network.key
 @_network.server_key
@@ -75,21 +80,28 @@ _LOOK_S = 0.1  # interval between searches for ports
     help="Seconds to wait for ports that do not exist yet.",
 )
 @click.option(
-    "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor, or SYNC pulses."
+    "-n",
+    "--count",
+    "n",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Number of measurements of each sensor, or of SYNC pulses.",
 )
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--trigger",
     type=click.Choice(["command", "sync"]),
     default="command",
     show_default=True,
-    help="What starts a measurement: this program, or pulses of the SYNC chain.",
+    help="Trigger of a measurement: this program, or pulses of the SYNC chain.",
 )
-@click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Of commands.")
-@click.option("--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="Input of the SYNC pulses.")
+@click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Rate of measurements.")
+@click.option("--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="SYNC input of the sensors.")
 @click.option("--passive", is_flag=True, help="Record without emitting the call.")
-@click.option("--listen-only", is_flag=True, help="Send nothing: another program has set up the sensor.")
-@click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Calls per measurement.")
+@click.option("--listen-only", is_flag=True, help="Send no settings; another program has configured the sensor.")
+@click.option(
+    "--emissions", type=int, default=1, show_default=True, metavar="N", help="Number of calls per measurement."
+)
 @click.option(
     "--preset",
     metavar="NAME",
@@ -100,25 +112,27 @@ _LOOK_S = 0.1  # interval between searches for ports
     "--layout",
     metavar="NAME",
     shell_complete=options.complete_layouts,
-    help="Array: eRTIS_v3D1, the default, and others, or a .toml or .csv file.",
+    help="Array layout: eRTIS_v3D1 (default) or another name, or a .toml or .csv file.",
 )
-@click.option("--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings as TOML.")
+@click.option(
+    "--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings file (TOML)."
+)
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
-@click.option("--name", "names", multiple=True, metavar="NAME", help="Of the sensors, in the order of the ports.")
+@click.option("--name", "names", multiple=True, metavar="NAME", help="Names of the sensors, in the order of the ports.")
 @click.option(
     "--patience",
     type=float,
     default=30.0,
     show_default=True,
     metavar="S",
-    help="How long a sensor may be silent or away; how long to wait for the central node at the end.",
+    help="Timeout for a silent or unplugged sensor, and for the central node at the end.",
 )
-@click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse words that cannot be PDM.")
-@click.option("--refuse-splices", is_flag=True, help="Refuse words that seem cut and joined, too.")
-@click.option("--dry-run", is_flag=True, help="Print the commands that the sensor would get, and end.")
+@click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse data that cannot be PDM.")
+@click.option("--refuse-splices", is_flag=True, help="Also refuse data with missing or misplaced parts.")
+@click.option("--dry-run", is_flag=True, help="Print the commands for the sensor, and exit.")
 @options.force
 @options.quiet
-@options.as_json_of("one object a line for each measurement and each event, the last of all of them")
+@options.as_json_of("one object per line for each measurement and event, and a summary at the end")
 def capture(
     *,
     ports: tuple[str, ...],
@@ -152,15 +166,15 @@ def capture(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Take measurements of sensors into a recording.
+    """Record measurements from sensors.
 
-    Each measurement is durable, in a journal beside the recording, before it is told of; the recording appears
-    complete at the end. Ctrl-C ends a capture after the measurement that has begun. What a crash leaves,
-    'ertis recover' seals. With --json there is a line for each measurement.
+    Each measurement is written to a journal beside the recording before it is reported. The complete recording appears
+    at the end. Ctrl-C ends a capture after the current measurement. 'ertis recover' recovers measurements after a
+    crash. --json prints a line for each measurement.
 
-    With --to, measurements are sent to a central node ('ertis record' or 'ertis serve') instead, and kept until it has
-    them. With --spool they are durable before they are told of, and what a crash leaves there is sent by the next
-    capture.
+    With --to, measurements go to a central node ('ertis record' or 'ertis serve') instead. They are kept until the
+    central node has stored them. With --spool, each measurement is on disk before it is reported, and the next capture
+    sends measurements left by a crash.
     """
     from ertis_numba.devices.setup import Setup
 
@@ -173,7 +187,7 @@ def capture(
     _require_one_each(ports, names)
     _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, key, server_key))
     if spool_mb is not None and spool is None:
-        raise click.UsageError("--spool-size is given without --spool; give its folder, too")
+        raise click.UsageError("--spool-size is given without --spool; give the folder with --spool")
     _network.require_duration(duration)
     from ertis_numba.atomic_files import check_target
     from ertis_numba.capture import Session
@@ -235,7 +249,7 @@ def _record(
     stack: ExitStack,
     overwrite: bool,
 ) -> Exception | None:
-    """Capture into a recording, and return what has ended that before its time."""
+    """Capture into a recording, and return the error that ended the capture early, if any."""
     from ertis_numba.journal import SUFFIX, Journal
 
     path = target.with_name(f"{target.name}{SUFFIX}")
@@ -244,7 +258,7 @@ def _record(
     )
     if journal.remark:
         click.echo(f"ertis: warning: {journal.remark}", err=True)
-    where = f"the measurements so far are safe in {path}; seal them by 'ertis recover {path}'"
+    where = f"the measurements so far are safe in {path}; recover them with 'ertis recover {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):
         journal.remove()
@@ -255,14 +269,14 @@ def _record(
 
 
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
-    """Make the recording, whatever has ended the capture; what that was is told last."""
+    """Seal the recording, and report the error that ended the capture last."""
     from ertis_numba.errors import DataError
     from ertis_numba.journal import seal_apart
 
     try:
         sealed = seal_apart(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        reported = f"{error}; the measurements are safe in {path}, seal them by 'ertis recover {path}'"
+        reported = f"{error}; the measurements are safe in {path}, recover them with 'ertis recover {path}'"
         if failure is None:
             raise DataError(reported) from error
         click.echo(f"ertis: error: {reported}", err=True)
@@ -284,7 +298,7 @@ def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) 
 
 
 def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
-    """Wait until all ports exist; raise an error for the first that does not in time."""
+    """Wait until all ports exist; raise an error for the first one that is missing after the timeout."""
     from ertis_numba.devices.ports import resolve
     from ertis_numba.errors import SonarError
 
@@ -305,7 +319,7 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
 
 @contextmanager
 def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
-    """Yield a function that returns True once a signal has arrived; a dialogue that fails then ends the command."""
+    """Yield a function that returns True after a signal; a failed dialogue then ends the command."""
     from ertis_numba.errors import SonarError
 
     try:
@@ -332,7 +346,7 @@ def _configured(
     check_bits: bool,
     splices: bool,
 ) -> "dict[str, BitCheck]":
-    """Tell sensors how to measure, and return what looks at the words of each."""
+    """Configure the sensors, and return the bit check of each."""
     import numpy as np
 
     from ertis_numba.devices.bits import BitCheck
@@ -354,19 +368,17 @@ def _configured(
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
     if address is None and any(for_address):
-        raise click.UsageError(
-            "--spool, --spool-size, --ring, --key and --server-key are about a central node; give --to, too"
-        )
+        raise click.UsageError("--spool, --spool-size, --ring, --key and --server-key need a central node; give --to")
     if address is not None and target is not None:
-        raise click.UsageError("--to and --output both say where measurements go; give one of them")
+        raise click.UsageError("--to and --output exclude each other; give one of them")
 
 
 def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
     for port in ports:
         if ports.count(port) > 1:
-            raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
+            raise click.UsageError(f"--port {port} is given {ports.count(port)} times; give each sensor once")
     if names and len(names) != len(ports):
-        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one for each")
+        raise click.UsageError(f"--name is given {len(names)} times for {len(ports)} ports; give one name per port")
     from ertis_numba import checks
 
     for name in names:
@@ -376,11 +388,11 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
 def _settings(
     preset: str | None, layout: str | None, settings_file: Path | None, temperature: float | None
 ) -> "Settings":
-    """Return settings from a preset or a file, with the array and the air that were named."""
+    """Return settings from a preset or a file, with the given array and air."""
     from ertis_numba.settings import Air, Array, Settings
 
     if settings_file is not None and preset is not None:
-        raise click.UsageError("--preset and --settings both say how to record; give one of them")
+        raise click.UsageError("--preset and --settings exclude each other; give one of them")
     settings = Settings.load(settings_file) if settings_file else Settings.from_preset(preset or "default_25_50")
     if layout is not None:
         settings = settings.replace(array=Array(layout=layout))
@@ -391,7 +403,7 @@ def _settings(
 
 
 def _print_commands(setup: "Setup", *, as_json: bool) -> None:
-    """Print what a sensor would be told; the samples of the call as one line."""
+    """Print the commands for a sensor; the samples of the call take one line."""
     before, call, after = setup.before_call(), setup.call(), setup.after_call()
     if as_json:
         lines = [command.encode().decode().strip() for command in (*before, *call, *after)]
@@ -405,12 +417,14 @@ def _print_commands(setup: "Setup", *, as_json: bool) -> None:
 
 
 def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[SonarDriver]") -> "dict[str, SonarDriver]":
-    """Return sensors by the names that they are to have: their serial numbers, or else those of the ports."""
+    """Return the sensors by name: the given names, the serial numbers, or the names of the ports."""
     known = [sonar.serial_number or Path(port).name for port, sonar in zip(ports, opened, strict=True)]
     chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]
     for name in chosen:
         if chosen.count(name) > 1:
-            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; name each differently by --name")
+            raise click.UsageError(
+                f"{chosen.count(name)} sensors have the name {name!r}; give each its own with --name"
+            )
     return dict(zip(chosen, opened, strict=True))
 
 

@@ -1,4 +1,4 @@
-"""``ertis demo``: the whole system without hardware."""
+"""Implementation of ``ertis demo``, which runs the whole system without hardware."""
 
 import functools
 import json
@@ -56,26 +56,32 @@ _GAPS: Final = 3
     help="Folder to write to.",
 )
 @click.option(
-    "-n", "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="SYNC pulses."
+    "-n",
+    "--count",
+    type=click.IntRange(min=1),
+    default=50,
+    show_default=True,
+    metavar="N",
+    help="Number of SYNC pulses.",
 )
 @click.option("--force", is_flag=True, help="Replace the files of an earlier demo.")
 @options.quiet
 def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     """Run four emulated sensors, a central node and an application.
 
-    A sensor node sends the measurements of four sensors on one SYNC chain to a central node, which stores them and
-    publishes images to an application. Then a recording becomes an image, a list of reflectors and a picture. The
-    commands are printed. All files go to one folder.
+    A sensor node sends the measurements of four sensors on one SYNC chain to a central node. The central node stores
+    them and publishes images to an application. A recording then becomes an image, a list of reflectors and a picture.
+    The demo prints each command, and writes all files to one folder.
     """
     _make(folder, force=force)
     scene = folder / _SCENE
     (item,) = _examples.named(_SCENE).values()
     scene.write_bytes(item.read_bytes())
-    sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # links to the emulated sensors
+    sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # Links to the emulated sensors go there.
     run = _DemoRun(os.environ | sensors, quiet=quiet)
     ports = [word for name in _SENSORS for word in ("--port", name)]
     with ExitStack() as nodes:
-        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
+        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # stderr is inherited, to show its progress.
         nodes.enter_context(run.node(*emulating, output=folder / "emulate.jsonl"))
         serving = ("serve", "--listen", _ANY_PORT, "--publish", _ANY_PORT, "--record", folder / "recordings")
         central = nodes.enter_context(run.node(*serving, "--json", "--quiet", output=folder / "serve.jsonl"))
@@ -89,14 +95,14 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
         run("status", central["address"], "--once")
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
-    run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse
+    run("verify", *recordings, allowed=(_GAPS,))  # A busy machine may miss a pulse.
     run("process", recordings[0], "--sensor", _SENSORS[0], "--output", image, "--directions", "2d:181")
     run("peaks", image, "--measurement", "0")
     run("plot", image, "--output", folder / "image.png")
 
 
 def _make(folder: Path, *, force: bool) -> None:
-    """Make the folder, and remove the files of an earlier demo.
+    """Create the folder, and remove the files of an earlier demo.
 
     Raises
     ------
@@ -107,7 +113,7 @@ def _make(folder: Path, *, force: bool) -> None:
 
     there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
     if there and not force:
-        raise ArgumentError(f"output {there[0]} exists; give another folder (-o), or ask to overwrite it (--force)")
+        raise ArgumentError(f"output {there[0]} exists; give another folder (-o), or overwrite it (--force)")
     for path in there:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

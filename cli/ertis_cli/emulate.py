@@ -1,4 +1,4 @@
-"""``ertis emulate``: devices that answer and measure like real ones, on pseudo terminals."""
+"""Implementation of ``ertis emulate``, which emulates devices on pseudo terminals."""
 
 import json
 import sys
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["emulate"]
 
-_LOOK_S = 0.5  # how often devices are looked after
+_LOOK_S = 0.5  # Interval between checks of the devices.
 
 
 class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -37,27 +37,30 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
         try:
             return kind, float(share if equals else "")
         except ValueError:
-            return self.fail(f"{value!r} is no fault, give a kind and a probability as in lose=0.01", param, ctx)
+            return self.fail(f"{value!r} is not a fault; give a kind and a probability, such as lose=0.01", param, ctx)
 
 
 @click.command()
 @options.input_file("SCENE.toml|REC.h5")
 @options.sensor("Emulate this sensor only; all by default.")
 @click.option(
-    "--count", type=click.IntRange(min=1), metavar="N", help="Measurements of a scene; the scene's own by default."
+    "--count",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Number of measurements of a scene; the scene's own by default.",
 )
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides the noise of a scene, and faults.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the scene's noise and of the faults.")
 @click.option(
     "--sync-rate",
     type=click.FloatRange(0.001, 1000.0),
     metavar="HZ",
-    help="Connect the devices to a SYNC line with so many pulses per second.",
+    help="Connect the devices to a SYNC line with this many pulses per second.",
 )
 @click.option(
     "--link",
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="Link that leads to the port of a single device; by default 'ertis devices' finds it by the sensor's name.",
+    help="Link to the port of a single device; by default 'ertis devices' finds it by the sensor's name.",
 )
 @click.option(
     "--fault",
@@ -76,7 +79,7 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     help="Unplug the devices after AT seconds, for FOR seconds.",
 )
 @click.option(
-    "--log", "log_path", type=click.Path(path_type=Path), metavar="FILE", help="Append a line of JSON per measurement."
+    "--log", "log_path", type=click.Path(path_type=Path), metavar="FILE", help="Append one JSON line per measurement."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per device on stdout.")
 @options.quiet
@@ -94,15 +97,15 @@ def emulate(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Be the sensors of a scene or of a recording, until interrupted.
+    """Emulate the sensors of a scene or of a recording.
 
-    Each sensor is a device of its own, on a pseudo terminal whose path is printed when it is ready. It takes the
-    commands of a real one, and measures what the scene lets it hear, or what was recorded, over and over.
-    Measurements without emission are those of the scene while all sensors are silent.
+    Each sensor is a separate device on a pseudo terminal. The command prints the path of each device that is ready. A
+    device accepts the commands of a real one, and repeats the measurements of the scene or recording. Measurements
+    without emission are simulated with all sensors silent.
 
     A scene is rendered for the call that 'ertis capture' uploads: the scene's own or that of a preset. Without
     --sync-rate, all measurements with the scene's call are rendered first. With it, each is rendered at its pulse, and
-    the first pulses are slower. A recording has one call only; with any other, the sensor does not measure.
+    the first pulses are slower. A recording has one call only; the sensor refuses to measure with any other.
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
@@ -111,20 +114,22 @@ def emulate(
     from ertis_numba.devices.links import HeldLink, emulated_folder
 
     kinds = dict(faults)
-    Faults(0, kinds)  # refused before a scene is rendered
+    Faults(0, kinds)  # A wrong fault is reported before a scene is rendered.
     is_scene = path.suffix.lower() == ".toml"
     if count is not None and not is_scene:
-        raise click.UsageError("--count is of scenes; a recording has its own", ctx=click.get_current_context())
+        raise click.UsageError(
+            "--count applies to scenes; a recording has a fixed number of measurements", ctx=click.get_current_context()
+        )
     with ExitStack() as stack:
         stack.enter_context(broken_off_by_signals())
         names = _names(path, sensor, is_scene=is_scene)
         if link is not None and len(names) > 1:
             raise click.UsageError(
-                f"--link is of one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
+                f"--link applies to one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
                 ctx=click.get_current_context(),
             )
         links = {name: link or emulated_folder() / name for name in names}
-        for each in links.values():  # the same
+        for each in links.values():  # A link that exists is reported before a scene is rendered.
             HeldLink(each).release()
         renderer = _renderer(path, names, count=count, seed=seed, quiet=quiet) if is_scene else None
         if renderer is not None and sync_rate is None:
@@ -155,7 +160,7 @@ def emulate(
         if sync_rate is not None:
             if renderer is not None:
                 measurements = f"{options.counted(renderer.count, 'measurement')} of each sensor"
-                options.say(f"rendering {measurements} as pulses come; the first round is slower", quiet=quiet)
+                options.say(f"rendering {measurements} at the pulses; the first round is slower", quiet=quiet)
             stack.enter_context(SyncChain(devices, sync_rate, before=partial(_get_ready, devices, given)))
         _look_after(devices, sorted(absences), ended)
     options.say("the emulated sensors have ended", quiet=quiet)
@@ -163,7 +168,7 @@ def emulate(
 
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
-    """Return the sensors to emulate, none of which measures what no device can."""
+    """Return the sensors to emulate; raise an error for one that no device can emulate."""
     from ertis_numba.devices.setup import Setup
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import open_recording
@@ -184,7 +189,7 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
 def _renderer(
     path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool
 ) -> "SceneRenderer":
-    """Return the scene, ready to be rendered; the first run compiles kernels."""
+    """Return the simulator of a scene, ready to render; the first run compiles kernels."""
     from ertis_cli._emulation import SceneRenderer
     from ertis_numba.simulation import limits, load_scene
     from ertis_numba.simulation.snapshot import snapshot
@@ -204,7 +209,7 @@ def _renderer(
 
 
 def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: bool) -> None:
-    """Render the measurements for the scene's call in advance, so that none is late."""
+    """Render all measurements with the scene's call in advance, so that none is late."""
     options.say(f"rendering {options.counted(renderer.count * len(names), 'measurement')} ...", quiet=quiet)
     todo = ((name, index) for index in range(renderer.count) for name in names)
     with options.progress(todo, length=renderer.count * len(names), label="rendering", quiet=quiet) as shown:
@@ -233,7 +238,7 @@ def _accepts(refusal: "Refusal", name: str, config: "DeviceConfig") -> bool:
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
-    """Render the measurements of a pulse in advance, also for devices that are about to be armed."""
+    """Render the measurements of a pulse in advance, also for devices that are not yet armed."""
     from ertis_numba.errors import ErtisError
 
     registers = {device.name: device.registers for device in devices if device.error is None}
@@ -252,7 +257,7 @@ def _emit_event(name: str, port: str, *, quiet: bool) -> None:
 
 
 def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, float]]", ended: threading.Event) -> None:
-    """Unplug devices when that is due, until one fails or the user has seen enough."""
+    """Unplug devices when due, until one fails or the user interrupts."""
     began_s = time.monotonic()
     while not ended.is_set():
         for device in devices:

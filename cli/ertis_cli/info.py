@@ -1,4 +1,4 @@
-"""``ertis info``: what a file holds."""
+"""Implementation of ``ertis info``, which shows the contents of files."""
 
 import re
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ __all__ = ["info"]
 
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
 _LOOKED_AT = 8
-_WIDTH = 7  # at least
-_COLUMNS = {  # name: digits, of the report and of the table
+_WIDTH = 7  # Minimum width of a column.
+_COLUMNS = {  # Name and digits of each column, in the report and in the table.
     "offset": (6, 4),
     "changes": (6, 3),
     "overload": (6, 4),
@@ -32,16 +32,15 @@ _COLUMNS = {  # name: digits, of the report and of the table
 
 @click.command()
 @options.input_file("FILE")
-@click.option("--health", "of_health", is_flag=True, help="The state of the microphones of a recording instead.")
+@click.option("--health", "of_health", is_flag=True, help="Show array health of a recording instead.")
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Say what a recording or an energyscape file holds.
+    """Show the contents of a recording or an energyscape file.
 
-    In JSON, "sensors" lists what each sensor has; if there is one only, the same also stands beside
-    what is said of the file.
+    In JSON, "sensors" lists the content of each sensor. For a single sensor, the same keys also stand at the top level.
 
-    With --health, say of each microphone of a recording whether it is ok, dead, stuck, saturated, or has an offset or
-    an idle tone. At most 8 measurements are looked at, evenly spaced. The exit code is 0 whatever is found.
+    --health reports each microphone of a recording as ok, dead, stuck, saturated, with an offset, or with an idle tone.
+    It examines at most 8 measurements, evenly spaced. The exit code is 0 even if a microphone is faulty.
     """
     if of_health:
         _report_health(path, as_json=as_json)
@@ -75,7 +74,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _label(name: str) -> tuple[str, str]:
-    """Return a key in words, and its unit after a space."""
+    """Return a key as a label, with its unit after a space."""
     from ertis_numba.units import unit_of
 
     suffix, unit = unit_of(name)
@@ -165,7 +164,7 @@ def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
-    """Return the predicted error and the budget, where a file has them."""
+    """Return the predicted error and the budget, if the file contains them."""
     if reader.predicted_error_db is None:
         return {}
     texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}
@@ -223,15 +222,15 @@ def _health(report: "Health") -> dict[str, Any]:
 
 
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
-    """Yield what is known of an array."""
+    """Yield the lines of an array's health report."""
     yield f"sensor         {section['sensor']}"
-    yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
+    yield f"measurements   {section['measurements']}, of which {section['looked_at']} examined"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
     yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
     if section["tones_hz"]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
-        yield f"cannot tell    {text}"
+        yield f"not testable   {text}"
 
 
 def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
@@ -258,7 +257,7 @@ def _microphones(section: dict[str, Any]) -> _tables.TextTable:
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits) + 0.0  # which turns -0.0 into 0.0
+    return None if value is None else round(value, digits) + 0.0  # Adding 0.0 turns -0.0 into 0.0.
 
 
 def _cell(value: float | None, digits: int) -> str:

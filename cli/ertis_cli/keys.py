@@ -1,4 +1,4 @@
-"""``ertis keys``: who is who, and who may do what."""
+"""Implementation of ``ertis keys``, which manages keys and permissions."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,32 +14,29 @@ __all__ = ["keys"]
 
 _FILE = click.Path(path_type=Path)
 _list_file = click.option(
-    "--list", "listed", type=_FILE, metavar="FILE", help="The list; allow.toml beside the keys by default."
+    "--list", "listed", type=_FILE, metavar="FILE", help="Allow list; allow.toml beside the keys by default."
 )
 
 
 @click.group()
 def keys() -> None:
-    """Make keys, and say who may do what.
+    """Create keys and grant permissions.
 
-    Each machine makes keys of its own by 'ertis keys new'. Its public file goes to the central node, where 'ertis keys
-    allow' lists it, and the public file of the central node goes to each machine (--server-key).
+    Each machine creates its own keys with 'ertis keys new'. The central node adds the public file of each machine to
+    its allow list with 'ertis keys allow'. Each machine gets the public file of the central node (--server-key).
 
-    \b
-    central$  ertis keys new central
-    sensor$   ertis keys new robot
-    central$  ertis keys allow robot.public.toml --role sensor --serial front
-    central$  ertis record --listen tcp://0.0.0.0:5601 -o DIR --key central
-    sensor$   ertis capture --port front --to tcp://central:5601 --key robot --server-key central.public.toml
+     central$  ertis keys new central sensor$   ertis keys new robot central$  ertis keys allow robot.public.toml
+    --role sensor --serial front central$  ertis record --listen tcp://0.0.0.0:5601 -o DIR --key central sensor$   ertis
+    capture --port front --to tcp://central:5601 --key robot --server-key central.public.toml
     """
 
 
 @keys.command()
 @click.argument("name")
-@click.option("--dir", "folder", type=_FILE, metavar="DIR", help="Folder for them; that of this user by default.")
+@click.option("--dir", "folder", type=_FILE, metavar="DIR", help="Folder for the keys; the user's own by default.")
 @options.as_json
 def new(*, name: str, folder: Path | None, as_json: bool) -> None:
-    """Make keys: NAME.secret.toml, which stays where it is, and NAME.public.toml for others."""
+    """Create keys: NAME.secret.toml, which stays on this machine, and NAME.public.toml for other machines."""
     from ertis_numba.network.keys import KeyPair, default_folder
 
     pair = KeyPair.new(name)
@@ -49,8 +46,8 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
             {"name": name, "public": pair.public, "secret_file": str(secret), "public_file": str(public)}
         )
         return
-    click.echo(f"{secret}: keep it, and nobody else may read it")
-    click.echo(f"{public}: for the other side, {pair.public}")
+    click.echo(f"{secret}: keep this file secret")
+    click.echo(f"{public}: give this file to the other side, {pair.public}")
 
 
 @keys.command()
@@ -61,20 +58,22 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
     type=click.Choice(["sensor", "application", "admin"]),
     help="A sensor sends, an application receives, an admin may do both.",
 )
-@click.option("--serial", "serials", multiple=True, metavar="S", help="Of a sensor that it may send for; repeatable.")
-@click.option("--name", metavar="NAME", help="In the list; that of the file by default.")
+@click.option(
+    "--serial", "serials", multiple=True, metavar="S", help="Sensor serial that the key may send for; repeatable."
+)
+@click.option("--name", metavar="NAME", help="Name in the list; the name in the file by default.")
 @_list_file
 @options.as_json
 def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
-    """Let a key in, from the next second on; what it was allowed before is replaced."""
+    """Allow a key within one second, and replace its earlier permissions."""
     from ertis_numba.network.allow_list import ROLES, AllowList, Permission
     from ertis_numba.network.keys import public_key
 
     public, named = public_key(key)
     if not (name or named):
-        raise click.UsageError("a key that is not given by its file has no name; give --name")
+        raise click.UsageError("a key that is not read from a file has no name; give --name")
     (chosen,) = (known for known in ROLES if known == role)
     permission = Permission(name=name or named, public=public, role=chosen, serials=serials)
     path = _path(listed)
@@ -88,7 +87,7 @@ def allow(
 @_list_file
 @options.as_json
 def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
-    """Let a key in no more, from the next second on, connected or not."""
+    """Remove a key within one second, even if it is connected."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
@@ -104,7 +103,7 @@ def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
 @_list_file
 @options.as_json
 def list_(*, listed: Path | None, as_json: bool) -> None:
-    """Show who is let in, and as what."""
+    """List allowed keys and their roles."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
@@ -127,7 +126,7 @@ def _print(path: Path, permissions: "list[Permission]", *, as_json: bool) -> Non
         options.print_json({"list": str(path), "keys": [_report(permission) for permission in permissions]})
         return
     if not permissions:
-        click.echo(f"{path}: nobody is let in; list keys by 'ertis keys allow'", err=True)
+        click.echo(f"{path}: no key is allowed; add keys with 'ertis keys allow'", err=True)
     widest = max((len(permission.name) for permission in permissions), default=0)
     for each in permissions:
         click.echo(f"{each.name:{widest}}  {each.role:11}  {each.public}  {' '.join(each.serials)}".rstrip())

@@ -1,4 +1,4 @@
-"""``ertis listen``: what a central node publishes, shown or saved."""
+"""Implementation of ``ertis listen``, which prints or saves published products."""
 
 import importlib
 import math
@@ -28,24 +28,28 @@ _LOOK_S = 0.1
 
 @click.command()
 @click.argument("address", metavar="ADDRESS")
-@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Of these only; of all by default.")
+@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Sensors to receive; all by default.")
 @click.option(
     "--product",
     "products",
     multiple=True,
     type=click.Choice(_PRODUCTS),
-    help="What to receive; energyscape by default.",
+    help="Products to receive; energyscape by default.",
 )
-@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="End after so many.")
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="End after this many products.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
-    "--save", "target", type=click.Path(path_type=Path), metavar="FILE.h5", help="Write energyscapes, or a recording."
+    "--save",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="FILE.h5",
+    help="Write energyscapes, or a recording, to this file.",
 )
 @_network.key
 @_network.server_key
 @options.force
 @options.quiet
-@options.as_json_of("one object a line for each event, the last when it ends")
+@options.as_json_of("one object per line for each event, and a summary at the end")
 def listen(
     *,
     address: str,
@@ -60,20 +64,20 @@ def listen(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show or save what a central node publishes at ADDRESS.
+    """Print or save the products of the central node at ADDRESS.
 
-    There is a line for each product, with its nearest reflector, how long ago the sound was emitted and how long the
-    central node had it. What this is too slow for is dropped there and counted. With --save, the energyscapes, or
-    with --product raw the measurements, become a file that appears complete at the end. A central node that goes
-    away is waited for. With --json there is a line for each event, the first when it is connected.
+    Each product takes a line with its nearest reflector, its age since the emission, and its processing time in the
+    central node. The central node drops and counts products that this command is too slow to receive. --save writes the
+    energyscapes, or with --product raw the measurements, to a file that appears complete at the end. The command
+    reconnects to a central node that was away. --json prints a line for each event, the first when it is connected.
     """
     products = tuple(dict.fromkeys(products)) or ("energyscape",)
     if target is not None and (len(products) > 1 or products[0] not in FILED):
-        raise click.UsageError(f"--save makes a file of one product; give --product {' or '.join(FILED)} alone")
+        raise click.UsageError(f"--save writes one product; give --product {' or '.join(FILED)} alone")
     _network.require_duration(duration)
     from ertis_numba.network.subscriber import Subscriber
 
-    if "energyscape" in products:  # takes half a second, in which the first images would be dropped
+    if "energyscape" in products:  # Loading takes half a second, in which the first images would be dropped.
         importlib.import_module("ertis_numba.analysis.points")
     keys = _network.client_keys(key, server_key)
     notes: deque[str] = deque()
@@ -105,11 +109,13 @@ def listen(
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     if n is not None and subscriber.counts.received < n:
-        raise click.ClickException(f"{subscriber.counts.received} of {n} came in {duration:g} s; give it more time")
+        raise click.ClickException(
+            f"{subscriber.counts.received} of {n} came in {duration:g} s; give a longer --duration"
+        )
 
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:
-    """Save a product; return why it does not fit to those before, which are kept."""
+    """Save a product; return the reason if it does not fit the earlier ones, which are kept."""
     from ertis_numba.errors import ArgumentError
 
     try:

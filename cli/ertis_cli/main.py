@@ -1,4 +1,4 @@
-"""The ``ertis`` command: finds its commands by name, and turns errors into one line and an exit code."""
+"""Entry point of the ``ertis`` command: command lookup by name, one-line errors and exit codes."""
 
 import errno
 import gc
@@ -16,36 +16,36 @@ __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
-    "capture": ("ertis_cli.capture:capture", "Take measurements of sensors into a recording."),
-    "compare": ("ertis_cli.compare:compare", "Say how far an energyscape file is from the truth."),
-    "completion": ("ertis_cli.completion:completion", "Print what makes a shell complete commands and options."),
+    "capture": ("ertis_cli.capture:capture", "Record measurements from sensors."),
+    "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
+    "completion": ("ertis_cli.completion:completion", "Print shell completion for commands and options."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
-    "devices": ("ertis_cli.devices:devices", "List the eRTIS devices that are plugged in or emulated."),
-    "doctor": ("ertis_cli.doctor:doctor", "Look whether this machine has what it takes, and say what to do."),
+    "devices": ("ertis_cli.devices:devices", "List eRTIS devices, real and emulated."),
+    "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),
     "emulate": (
         "ertis_cli.emulate:emulate",
-        "Be the sensors of a scene or of a recording, until interrupted.",
+        "Emulate the sensors of a scene or of a recording.",
     ),
     "example": ("ertis_cli.example:example", "List or copy shipped scenes, recordings and scripts."),
-    "export": ("ertis_cli.export:export", "Write a file for other programs."),
-    "import": ("ertis_cli.import_raw:import_raw", "Turn raw eRTIS words, or PCM of other arrays, into a recording."),
-    "info": ("ertis_cli.info:info", "Say what a recording or an energyscape file holds."),
-    "keys": ("ertis_cli.keys:keys", "Make keys, and say who may do what."),
+    "export": ("ertis_cli.export:export", "Export to the formats of other programs."),
+    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS words, or PCM of other arrays."),
+    "info": ("ertis_cli.info:info", "Show the contents of a recording or an energyscape file."),
+    "keys": ("ertis_cli.keys:keys", "Create keys and grant permissions."),
     "layout": ("ertis_cli.layout:layout", "List the shipped layouts, or print one as TOML."),
-    "listen": ("ertis_cli.listen:listen", "Show or save what a central node publishes at ADDRESS."),
+    "listen": ("ertis_cli.listen:listen", "Print or save the products of the central node at ADDRESS."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
-    "process": ("ertis_cli.process:process", "Turn a recording into energyscapes."),
-    "record": ("ertis_cli.record:record", "Be the central node that stores what sensors send."),
+    "process": ("ertis_cli.process:process", "Process a recording into energyscapes."),
+    "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
-    "serve": ("ertis_cli.serve:serve", "Be the central node that makes images of what sensors send."),
+    "serve": ("ertis_cli.serve:serve", "Run a central node that stores, processes and publishes measurements."),
     "settings": ("ertis_cli.settings:settings", "Print every key of a settings, scene, layout or mounting file."),
-    "simulate": ("ertis_cli.simulate:simulate", "Turn a scene into a recording."),
-    "status": ("ertis_cli.status:status", "Show how the central node at ADDRESS is, live on a terminal."),
-    "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and what is missing."),
-    "view": ("ertis_cli.view:view", "Show what sensors see on a page in the browser."),
+    "simulate": ("ertis_cli.simulate:simulate", "Simulate a scene and write a recording."),
+    "status": ("ertis_cli.status:status", "Show the live status of the central node at ADDRESS."),
+    "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and list missing ones."),
+    "view": ("ertis_cli.view:view", "Show images and points in the browser."),
 }
-"""Where each command is, and what its help says first: commands are imported when they are run."""
+"""Module of each command and first sentence of its help; a command is imported only when it runs."""
 
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
 
@@ -83,7 +83,7 @@ class _Commands(click.Group):
         standalone_mode: bool = True,  # noqa: FBT001, FBT002  as click has it
         **extra: Any,
     ) -> Any:
-        """Run, and leave with an exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
+        """Run the command line and exit: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
         try:
             code = super().main(args, prog_name or "ertis", complete_var, standalone_mode=False, **extra)
         except click.exceptions.NoArgsIsHelpError as error:
@@ -109,7 +109,7 @@ def _is_interruption(error: Exception) -> bool:
 
 
 def _reported(error: Exception) -> tuple[int, str]:
-    """Return the exit code of an error and the line to tell it; raise again what is a mistake in the program."""
+    """Print an error and return its exit code; re-raise programming errors."""
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "ertis"
         return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
@@ -123,7 +123,7 @@ def _reported(error: Exception) -> tuple[int, str]:
 
 
 def _of_system(error: Exception) -> str:
-    """Return an error of the system as ours are told: what it is about, what came, the remedy; empty if it is ours."""
+    """Return a one-line message with the remedy for an expected operating-system error, otherwise an empty string."""
     from ertis_numba.atomic_files import remedy
     from ertis_numba.errors import ErtisError
 
@@ -131,12 +131,12 @@ def _of_system(error: Exception) -> str:
         return ""
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}; {remedy(error)}"
-    # What has no name but could be full is what stdout goes to.
+    # Only stdout has no name but can be full.
     return f"the output is full ({error.strerror}); {remedy(error)}" if error.errno == errno.ENOSPC else ""
 
 
 def _is_expected(error: Exception) -> bool:
-    """Whether an error is one to tell in a line, rather than a mistake in the program."""
+    """Return True for an error that users can fix, and False for a programming error."""
     from ertis_numba.errors import ErtisError
 
     return isinstance(error, ErtisError | OSError | MemoryError)
@@ -162,11 +162,11 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 @_config.config
 @click.pass_context
 def cli(ctx: click.Context) -> None:
-    """Imaging sonar in air: from one-bit microphones to energyscapes.
+    """Process in-air imaging sonar: from one-bit microphones to energyscapes.
 
-    Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage,
-    130 interrupted. Options come from the command line, then from variables such as ERTIS_PROCESS_MAX_ERROR,
-    then from the file of --config.
+    Commands print results on stdout and everything else on stderr. Exit codes: 0 done, 1 failed, 2 wrong usage, 130
+    interrupted. An option on the command line overrides its variable, such as ERTIS_PROCESS_MAX_ERROR. A variable
+    overrides the file of --config.
     """
     fault = _config.require_config(ctx)
     if fault:
@@ -179,7 +179,7 @@ def main() -> None:
     """Run the command line."""
     obey_signals()
     _supervisor.allow()
-    # Libraries make a hundred thousand objects that stay: to look through them is a twentieth of a command's time.
+    # Imported libraries create 100,000 permanent objects. Scanning them takes 5 % of the time of a command.
     gc.set_threshold(100_000)
     try:
         cli.main()

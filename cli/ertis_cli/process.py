@@ -1,4 +1,4 @@
-"""``ertis process``: recordings to energyscapes."""
+"""Implementation of ``ertis process``, which processes recordings into energyscapes."""
 
 import functools
 from contextlib import ExitStack, closing, contextmanager
@@ -30,13 +30,13 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "target",
     type=click.Path(),
     metavar="FILE|DIR",
-    help="Energyscape file to write, REC.energy.h5 beside the recording by default; of several recordings a folder.",
+    help="Energyscape file to write; REC.energy.h5 beside the recording by default. For several recordings, a folder.",
 )
-@options.sensor("One sensor only; all of the recording by default.")
+@options.sensor("Process one sensor only; all sensors of the recording by default.")
 @click.option(
     "--without",
     type=options.CHANNELS,
-    help="Channels to leave out, such as those of faulty microphones, counted from 0, as in 5,12.",
+    help="Channels to exclude, such as faulty microphones, counted from 0: 5,12.",
 )
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Limits of 2d:N and 3d:N in °.")
@@ -46,7 +46,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--beamformer",
     type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
-    help="How microphones are combined; the recording's own choice by default.",
+    help="Beamformer; the recording's own choice by default.",
 )
 @click.option(
     "--array-weights",
@@ -56,35 +56,37 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--wavefront",
     type=click.Choice(["plane", "spherical", "auto"]),
-    help="What an echo looks like to the array; the recording's own choice by default.",
+    help="Wavefront model of an echo; the recording's own choice by default.",
 )
 @click.option(
     "--max-error",
     "max_error_db",
     type=options.ERROR_BUDGET,
     metavar="DB|PRESET",
-    help="Error that images may have, as in -40, or draft, standard, fine, exact; the settings' own by default.",
+    help="Error budget of images: dB, such as -40, or draft, standard, fine, exact; the settings' own by default.",
 )
-@click.option("--explain", is_flag=True, help="Tell the plan first: what it does, its predicted error and time.")
+@click.option("--explain", is_flag=True, help="Print the plan first: its steps, predicted error and time.")
 @click.option(
     "--verify",
     is_flag=True,
-    help="Measure the error of each sensor's first measurement; write nothing if it is beyond --max-error.",
+    help="Measure the error of each sensor's first measurement; write nothing if it exceeds --max-error.",
 )
 @click.option(
     "--settings",
     "settings_file",
     metavar="FILE.toml",
     type=click.Path(path_type=Path),
-    help="TOML whose keys replace the recording's.",
+    help="Settings file (TOML) whose keys replace the recording's.",
 )
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help="float16 halves the file; it keeps three digits down to -84 dB of full scale, fewer below, and netCDF "
-    "programs cannot read it.",
+    help=(
+        "Type of the amplitudes. float16 halves the file; it keeps three digits down to -84 dBFS, fewer below, and "
+        "netCDF programs cannot read it."
+    ),
 )
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
@@ -95,18 +97,18 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     default=8,
     show_default=True,
     metavar="N",
-    help="Measurements worked on at the same time, fewer where images are large; 1 is one after the other.",
+    help="Number of measurements in progress at once, fewer if images are large; 1 processes one after the other.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Processes that share several recordings; one for each core by default.",
+    help="Number of processes for several recordings; one per core by default.",
 )
 @click.option(
     "--scheduler",
     metavar="tcp://HOST:PORT",
-    help="Let the workers of this dask scheduler process several recordings.",
+    help="dask scheduler whose workers process several recordings.",
 )
 @_mountings.mounting
 @options.force
@@ -142,18 +144,18 @@ def process(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Turn a recording into energyscapes.
+    """Process a recording into energyscapes.
 
-    Settings come from the recording, then from the settings file, then from the options. The same
-    recording gives the same energies, bit by bit, whatever the number of threads and the batch. All
-    sensors of a recording go into one file, each with its own settings.
+    Settings come from the recording, then from the settings file, then from the options. The same recording gives the
+    same amplitudes, bit by bit, for any number of threads and any batch. All sensors of a recording go into one file,
+    each with its own settings.
 
-    Several recordings, a pattern in quotes or a folder go into the folder -o, a file each, on all cores.
-    Processed again, what was made of the same recording by the same settings is left alone. One that
-    fails does not stop the others. --json then prints an object for each as it ends, and one at the end.
+    For several recordings, a quoted pattern or a folder, -o names a folder for one output file each, processed on all
+    cores. Existing output from the same recording and settings is kept. A failed recording does not stop the others.
+    --json then prints an object per recording and a summary at the end.
 
-    The fast method plans how exact to be: it takes the fastest way whose predicted error keeps --max-error.
-    The error is that of the image against the exact one, over all directions and ranges.
+    The fast method chooses the fastest plan whose predicted error is within --max-error. The error is relative to the
+    exact image, over all directions and ranges.
     """
 
     def changed(recorded: "Settings") -> "Settings":
@@ -197,13 +199,14 @@ def process(
     for name in ("workers", "scheduler"):
         if typed(name):
             raise click.UsageError(
-                f"--{name} is for several recordings; give more, a folder or a pattern, or an -o that ends in /",
+                f"--{name} applies to several recordings; give more, a folder or a pattern, or an -o that ends in /",
                 click.get_current_context(),
             )
     path = Path(paths[0])
     if target is not None and Path(target).suffix.lower() in _PICTURES:
         raise click.UsageError(
-            f"-o {target} is a picture, and process writes energyscapes; give a .h5 file, and draw it by 'ertis plot'",
+            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file, and draw it with "
+            "'ertis plot'",
             click.get_current_context(),
         )
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
@@ -224,7 +227,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
             if images.translation_m is None:
                 unknown.append(name)
     _mountings.note_unknown(
-        unknown, "images are in the frame of their sensor; give --mounting FILE for that of the platform", quiet=quiet
+        unknown, "images are in the sensor frame; give --mounting FILE for the frame of the platform", quiet=quiet
     )
 
 

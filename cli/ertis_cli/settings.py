@@ -1,4 +1,4 @@
-"""``ertis settings``: the keys of TOML files."""
+"""Implementation of ``ertis settings``, which prints the keys of TOML files."""
 
 import textwrap
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ def settings(*, document: str, as_json: bool) -> None:
     """Print every key of a settings, scene, layout or mounting file.
 
     KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and remove the # from
-    the keys to set. Each key has its meaning, its type, its unit, its default and an example.
+    the keys to set. Each key has its description, type, unit, default and an example.
     """
     from ertis_numba.toml_reference import reference
 
@@ -38,7 +38,7 @@ def settings(*, document: str, as_json: bool) -> None:
 
 
 def _lines(section: "TableReference") -> Iterator[str]:
-    """Yield the lines of a table; all but its header are comments."""
+    """Yield the lines of a table, all commented out except its header."""
     yield from textwrap.wrap(section.about, _WIDTH, initial_indent="# ", subsequent_indent="# ")
     if section.header:
         yield f"# {section.header}"

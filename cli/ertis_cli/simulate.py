@@ -1,4 +1,4 @@
-"""``ertis simulate``: a scene to a recording."""
+"""Implementation of ``ertis simulate``, which simulates a scene."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["simulate"]
 
-_FOLLOWED = 0.6  # of full scale, by the modulators
-_COLUMN_BYTES = 72  # of a measurement, in addition to its samples: stamp, CRC-32 and air
-_REFLECTOR_BYTES = 200  # of a reflector, in the recording and in the temporary file
+_FOLLOWED = 0.6  # Fraction of full scale that the modulators follow.
+_COLUMN_BYTES = 72  # Bytes of a measurement in addition to its samples: stamp, CRC-32 and air.
+_REFLECTOR_BYTES = 200  # Bytes of a reflector, in the recording and in the temporary file.
 _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
 
@@ -29,18 +29,23 @@ _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 @options.input_file("SCENE.toml")
 @options.output("Recording to write; SCENE.h5 beside the scene by default.")
 @click.option(
-    "--count", type=click.IntRange(min=1), metavar="N", help="Measurements of each sensor; the scene's own by default."
+    "--count",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Number of measurements of each sensor; the scene's own by default.",
 )
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Decides noise; the scene's own by default.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the noise; the scene's own by default.")
 @options.sensor("Render this sensor only; all by default.")
 @click.option(
     "--tolerance-db",
     type=float,
     metavar="DB",
-    help="Leave out effects that no key requests and that change no image by more; 0 keeps all. The scene's "
-    "own, 0.1, by default.",
+    help=(
+        "Omit effects that no key requests and that change no image by more than this; 0 keeps all. The scene's "
+        "own, 0.1, by default."
+    ),
 )
-@click.option("--explain", is_flag=True, help="Print a table of effects: on or off, why, and what they cost.")
+@click.option("--explain", is_flag=True, help="Print a table of effects: state, reason and cost.")
 @options.force
 @options.quiet
 @options.as_json
@@ -57,11 +62,10 @@ def simulate(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Turn a scene into a recording.
+    """Simulate a scene and write a recording.
 
-    The recording holds the words that the scene's sensors would record, the scene itself, and where an
-    image should show each reflector. Only the effects that the scene calls for are simulated. Scene, seed,
-    sensor and number of the measurement decide every bit.
+    The recording contains the samples of the scene's sensors, the scene itself, and the ground truth of each reflector.
+    Only effects that change an image are simulated. Scene, seed, sensor and measurement number determine every bit.
     """
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import check_target, write_recording
@@ -78,10 +82,10 @@ def simulate(
         from ertis_numba.simulation.render import Simulator, compile_kernels
 
         compile_kernels()
-    with options.note_when_slow("deciding which effects matter ...", quiet=quiet, after_s=3.0):
+    with options.note_when_slow("determining the relevant effects ...", quiet=quiet, after_s=3.0):
         plan = make_plan(scene)
         simulators = [Simulator(scene, sensor=name, plan=plan) for name in names]
-        if explain:  # costs are those of calls that compile nothing
+        if explain:  # Costs exclude compilation.
             for simulator in simulators:
                 simulator.render(0)
                 simulator.clock.cost_ms.clear()
@@ -109,15 +113,16 @@ def simulate(
     options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
     if plan.left_out:
         options.say(
-            f"left out: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps all effects",
+            f"omitted effects: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps "
+            "all effects",
             quiet=quiet,
         )
     for simulator in simulators:
         followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
         if simulator.loudest > followed:
             options.say(
-                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, and {by} "
-                f"follow up to {followed:g}; lower emitter.level_db or move things away",
+                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
+                f"follow up to {followed:g}; lower emitter.level_db or move objects away",
                 quiet=quiet,
             )
     for note in plan.notes:
@@ -157,18 +162,19 @@ def _measurements(
 def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "TruthLog":
     from ertis_numba.storage import TruthLog
 
-    # With the verdicts written out, so that the words can be made again where a rehearsal would come out otherwise.
+    # The stored scene contains the decisions, so that the samples stay reproducible even if an A/B render would decide
+    # differently.
     decided = scene.replace(effects={verdict.name: verdict.on for verdict in plan.verdicts})
     return TruthLog(decided.to_toml(), scene.seed, left_out=plan.left_out, folder=folder)
 
 
 def _mounting(simulator: "Simulator") -> Any:
-    """Return where a sensor is when the first measurement begins, and how it is turned."""
+    """Return the position and orientation of a sensor at the start of the first measurement."""
     return simulator.sensor.path().position_at(0.0), simulator.sensor.quaternion()
 
 
 def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
-    """Return what ``--explain`` tells of each effect; costs are those of one measurement of one sensor."""
+    """Return the rows of ``--explain``; costs are those of one measurement of one sensor."""
     rendered = len(simulators) * simulators[0].scene.count
     return [
         {
@@ -199,7 +205,7 @@ def _print(effects: list[dict[str, Any]]) -> None:
             )
         )
     if any(effect["forced"] for effect in effects):
-        click.echo("* as the scene says, whatever the estimate")
+        click.echo("* set by the scene, regardless of the estimate")
 
 
 def _summary(target: Path, scene: "Scene", *, n_sensors: int, n_reflectors: int) -> str:
@@ -223,6 +229,6 @@ def _report(target: Path, scene: "Scene", plan: "EffectPlan", firsts: "dict[str,
 
 def _row(reflector: "Reflector") -> dict[str, Any]:
     row = {name: getattr(reflector, name) for name in reflector.__slots__}
-    if not reflector.emitter:  # the sensor's own call, as almost always
+    if not reflector.emitter:  # Nearly all reflectors return the sensor's own call.
         del row["emitter"]
     return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}

@@ -1,4 +1,4 @@
-"""``ertis verify``: whether all of a file is there, and as it was written."""
+"""Implementation of ``ertis verify``, which checks files for damage and gaps."""
 
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -23,11 +23,11 @@ _FAILED, _INCOMPLETE = 1, 3
 @options.as_json
 @click.pass_context
 def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
-    """Check every measurement of a file, and what is missing.
+    """Check every measurement of a file, and list missing ones.
 
-    In recordings and in journals, each measurement is read and compared with its checksum. The exit code is 0 if all is
-    there and as it was written; 3 if measurements are missing, damaged or out of order; 1 if a file cannot be read
-    at all.
+    The command compares each measurement of a recording or a journal with its checksum. The exit code is 0 if all
+    measurements are present and intact; 3 if some are missing, damaged or out of order; 1 if a file cannot be read at
+    all.
     """
     from ertis_numba.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified
@@ -55,7 +55,7 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
 
 
 def _line(report: "SensorReport") -> str:
-    """Return what was found of a sensor."""
+    """Return the result for a sensor in one line."""
     if report.fault:
         return f"{report.sensor}: {report.fault}"
     reported = [options.counted(report.measurements, "measurement")]
@@ -72,7 +72,7 @@ def _line(report: "SensorReport") -> str:
 
 
 def _places(places: Iterable[int]) -> str:
-    """Return numbers in words, where neighbours are told together."""
+    """Return numbers as text, with neighbours as ranges."""
     runs: list[list[int]] = []
     for place in places:
         if runs and place == runs[-1][1] + 1:

@@ -144,7 +144,7 @@ FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_sessio
 """Variables that have another name in files of format version 1."""
 
 
-class SensorGroup(h5py.Group):
+class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
     """Group of a sensor whose variables answer to their present names, in files of all format versions.
 
     Parameters
