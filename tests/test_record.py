@@ -162,10 +162,10 @@ def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):
     given = entries(1, first=0, settings=settings)
     n_bytes = given[0].measurement.data.nbytes
     for max_bytes in (n_bytes - 1, n_bytes):
-        with Recording(tmp_path, "--most-bytes", str(max_bytes)) as central, Node(central.address) as node:
+        with Recording(tmp_path, "--max-bytes", str(max_bytes)) as central, Node(central.address) as node:
             answer = node.hello(first=0, settings=settings)
             if max_bytes < n_bytes:
-                assert "let it take more (--most-bytes)" in answer.reason
+                assert "(--max-bytes)" in answer.reason
                 continue
             node.measure(*given)
             node.hear_settled(0)

@@ -72,12 +72,12 @@ def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
         known = general | _NO_OPTIONS | set(_variables(command) if command else ())
         if name not in known:
             close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.8)
-            meant = f"did you mean {close[0]!r}?" if close else "unset it if nobody needs it"
-            yield f"the variable {name} is known to no command; {meant}"
+            meant = f"did you mean {close[0]!r}?" if close else "unset it if no program needs it"
+            yield f"no command has an option for the variable {name}; {meant}"
 
 
 def _variables(command: click.Command) -> Iterator[str]:
-    """Yield the variables of a command, and of those in it."""
+    """Yield the variables of a command and of its subcommands."""
     for option in _options(command).values():
         yield from [option.envvar] if isinstance(option.envvar, str) else option.envvar or ()
     if isinstance(command, click.Group):
@@ -95,12 +95,12 @@ def _options(command: click.Command) -> dict[str, click.Option]:
 
 
 def long_name(option: click.Option) -> str:
-    """Return the name of an option that says most, without dashes."""
+    """Return the longest name of an option, without dashes."""
     return max(option.opts, key=len).lstrip("-")
 
 
 def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
-    """Take the defaults of all commands from a file; whoever needs them is told what is wrong with it."""
+    """Read the defaults of all commands from a file; errors are kept for commands that need the file."""
     if path is not None:
         try:
             _take(ctx, path)
@@ -109,7 +109,7 @@ def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
 
 
 def require_config(ctx: click.Context) -> str:
-    """Refuse to go on without the file of `config`; return what is wrong with it for commands that need none."""
+    """Refuse to continue without the file of `config`; return its error for commands that do not need it."""
     error: click.ClickException | None = ctx.meta.get(_BROKEN)
     if error is None:
         return ""
@@ -129,15 +129,15 @@ def _take(ctx: click.Context, path: Path) -> None:
 
 
 def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the defaults of a group's commands, by the names that click has for their parameters."""
+    """Return the defaults of a group's commands, by click's parameter names."""
     found: dict[str, Any] = {}
     names = group.list_commands(ctx)
     for name, table in tables.items():
         command = group.get_command(ctx, name)
         if command is None:
-            raise click.ClickException(f"{where}{name!r} is no command; {instead(name, names)}")
+            raise click.ClickException(f"{where}{name!r} is not a command; {instead(name, names)}")
         if not isinstance(table, dict):
-            raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, as in [{name}]")
+            raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, such as [{name}]")
         if isinstance(command, click.Group):
             found[name] = _defaults(ctx, command, table, f"{where}{name} ")
             continue
@@ -150,30 +150,31 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
 
 
 def _value(value: Any) -> Any:
-    """Return a value as click wants it: what is no list is as it would be typed."""
+    """Return a value as click expects it: as typed text, unless it is a list."""
     if isinstance(value, list):
         return [_value(each) for each in value]
     return value if isinstance(value, bool) else str(value)
 
 
 def instead(name: str, known: Iterable[str]) -> str:
-    """Return what a name that is not known may mean."""
+    """Return a suggestion for an unknown name."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
 
 
 def typed(name: str) -> bool:
-    """Return whether an option of the running command was typed, by its Python name.
+    """Return True if an option of the running command was typed, by its Python name.
 
-    A default of the user's own holds where it fits: whoever always wants two workers can still process one recording.
+    A configured default applies only if it fits the command: with two workers as default, a single recording can still
+    be processed.
     """
     source = click.get_current_context().get_parameter_source(name)
     return source is click.core.ParameterSource.COMMANDLINE
 
 
 def origin(error: click.UsageError) -> str:
-    """Return where a value came from that is not on the command line; empty where it is."""
+    """Return the source of a value that is not on the command line, or an empty text."""
     ctx, parameter = error.ctx, getattr(error, "param", None)
     if ctx is None or not isinstance(parameter, click.Option) or parameter.name is None:
         return ""
@@ -194,5 +195,5 @@ config = click.option(
     is_eager=True,
     expose_value=False,
     callback=_load,
-    help="Options of commands, in tables of their names; what is given, or in a variable, comes first.",
+    help="Configuration file with a table of options per command; typed options and variables override it.",
 )

@@ -25,9 +25,12 @@ def keys() -> None:
     Each machine creates its own keys with 'ertis keys new'. The central node adds the public file of each machine to
     its allow list with 'ertis keys allow'. Each machine gets the public file of the central node (--server-key).
 
-     central$  ertis keys new central sensor$   ertis keys new robot central$  ertis keys allow robot.public.toml
-    --role sensor --serial front central$  ertis record --listen tcp://0.0.0.0:5601 -o DIR --key central sensor$   ertis
-    capture --port front --to tcp://central:5601 --key robot --server-key central.public.toml
+    \b
+    central$  ertis keys new central
+    sensor$   ertis keys new robot
+    central$  ertis keys allow robot.public.toml --role sensor --serial front
+    central$  ertis record --listen tcp://0.0.0.0:5601 -o DIR --key central
+    sensor$   ertis capture --port front --to tcp://central:5601 --key robot --server-key central.public.toml
     """
 
 

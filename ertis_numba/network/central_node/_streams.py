@@ -61,7 +61,7 @@ def _source(
     if source.n_bytes > max_bytes:
         raise SettingsError(
             f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {max_bytes}; record fewer "
-            "samples, or let it take more (--most-bytes)"
+            "samples, or raise its limit (--max-bytes)"
         )
     return source
 
