@@ -1,4 +1,4 @@
-"""Nodes that speak over the network: sensors send, a central node stores and processes, applications subscribe.
+"""Network nodes: sensor nodes send, a central node stores and processes, applications subscribe.
 
-The only door to ZeroMQ.
+This package is the only one that imports ZeroMQ.
 """

@@ -1,4 +1,4 @@
-"""The connection of an application to a publisher: what is asked for, what comes, and when to begin anew."""
+"""Connection of an application to a publisher: requests, products and reconnection."""
 
 import time
 from collections import deque
@@ -37,28 +37,28 @@ __all__ = ["SubscriberCounts", "Subscription"]
 _EXPECTED: Final = (Description, Image, Points, Raw, Group, Report, Pong, Refused)
 _BEAT_S: Final = 1.0
 _DEAD_S: Final = 3.0
-_UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, of which word may come before anybody listens
+_UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, whose event may precede the monitor.
 _AGAIN_S: Final = 0.5
 _MAX_AGAIN_S: Final = 5.0
-_REFUSALS: Final = 3  # before the first answer, after which it is no use to go on
+_REFUSALS: Final = 3  # Limit on refusals before the first answer, after which retrying is useless.
 _AT_ONCE: Final = 64
 
 
 @dataclass(slots=True)
 class SubscriberCounts:
-    """What has come to an application.
+    """Counts of an application's products.
 
     Attributes
     ----------
     received : int
         Products that the application has taken.
     dropped : int
-        Those that were dropped for it because it was slow, as the publisher counts them.
+        Products that the publisher dropped because the application was slow.
     missed : int
-        Numbers that never came; equal to ``dropped`` but for those that still wait.
+        Numbers that never arrived; equal to ``dropped`` except for those still on their way.
     reconnects : int
     damaged : int
-        Messages that were not what they should be; each ends a connection.
+        Invalid messages; each ends a connection.
     """
 
     received: int = 0
@@ -70,7 +70,7 @@ class SubscriberCounts:
 
 @dataclass(slots=True)
 class _Connection:
-    """What counts from when a connection was made."""
+    """Counts since a connection was made."""
 
     number: int
     begun_s: float
@@ -84,7 +84,7 @@ class _Connection:
 
 
 class Subscription:
-    """Asks for products and reads them, in one thread; `taken` alone is called by another.
+    """Client that requests products and reads them in one thread; another thread may call only `taken`.
 
     Parameters
     ----------
@@ -128,11 +128,11 @@ class Subscription:
 
     @property
     def connected(self) -> bool:
-        """Whether the publisher has answered on this connection."""
+        """Return True if the publisher has answered on this connection."""
         return self._connection.heard_s is not None
 
     def taken(self, arrival: Arrival) -> None:
-        """Note that the application has a product, so that another may come."""
+        """Register that the application has taken a product, so that another may be sent."""
         self._taken.append(arrival.connection)
 
     @contextmanager
@@ -146,12 +146,12 @@ class Subscription:
             self._close()
 
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
-        """Do what there is to do, or wait until there is; not for longer than a tenth of a second.
+        """Process what is due, or wait up to a tenth of a second.
 
         Raises
         ------
         RefusedError
-            The publisher does not let this in, and never has.
+            The publisher refuses this application, and has never accepted it.
         """
         if self._socket is None:
             if now_s < self._wait_until_s:
@@ -196,7 +196,7 @@ class Subscription:
         self._connection = _Connection(self._connection.number, now_s)
 
     def _again(self, text: str, now_s: float, *, wait_s: float = 0.0) -> None:
-        """Begin a connection anew, whose numbers count from 0."""
+        """Start a new connection, whose numbers count from 0."""
         if self.connected:
             self._counts.reconnects += 1
         self._emit_event(text)
@@ -205,13 +205,13 @@ class Subscription:
         self._wait_until_s = now_s + wait_s
 
     def _count_anew(self) -> None:
-        """Go on from what was dropped and missed so far."""
+        """Add the dropped and missed products of the ended connection to the totals."""
         self._dropped_before, self._missed_before = self._counts.dropped, self._counts.missed
 
     def _restarted(self) -> None:
-        """Begin anew on a connection that ZeroMQ has made again, to another publisher at the same address.
+        """Start again on a connection that ZeroMQ has re-established with another publisher at the same address.
 
-        What was consumed goes on: a publisher counts from what it hears first.
+        The consumed count continues: a publisher counts from the first value that it receives.
         """
         connection = self._connection
         connection.reader, connection.received, connection.next_number = ProductReader(), 0, 0
@@ -225,13 +225,13 @@ class Subscription:
         self._again(text, now_s, wait_s=min(_MAX_AGAIN_S, _AGAIN_S * len(self._refusals)))
 
     def _emit_event(self, text: str) -> None:
-        """Call back, once for the same text until the publisher answers again."""
+        """Call back with a text, once until the publisher answers again."""
         if text and text != self._reported:
             self._reported = text
             self._note(text)
 
     def _subscribe(self, now_s: float) -> None:
-        """Say what is wanted, each second and when something was taken."""
+        """Send the subscription, each second and after a product was taken."""
         connection = self._connection
         while self._taken:
             if self._taken.popleft() == connection.number:
@@ -251,7 +251,7 @@ class Subscription:
                 self._send(Ping())
 
     def _send(self, message: Message) -> bool:
-        """Send a message if there is a connection with room for it."""
+        """Send a message if the connection has room for it."""
         if self._socket is None:
             return False
         with suppress(zmq.Again):
@@ -296,9 +296,9 @@ class Subscription:
             self._take(message, frames[1:])
 
     def _take(self, header: Header, payload: list[memoryview]) -> None:
-        """Deliver a product and count what did not come before it."""
+        """Deliver a product, and count the missing ones before it."""
         connection = self._connection
-        if header.number < connection.next_number:  # they rise
+        if header.number < connection.next_number:  # Numbers must rise.
             self._restarted()
         item = connection.reader.read(header, payload)
         arrived_ns, arrived_utc_ns = time.monotonic_ns(), time.time_ns()

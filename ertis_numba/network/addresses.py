@@ -1,4 +1,4 @@
-"""Addresses of nodes, and which of them may be used without keys."""
+"""Addresses of nodes, and their use without keys."""
 
 import ipaddress
 import re
@@ -18,27 +18,27 @@ __all__ = [
 ]
 
 DEFAULT_LISTEN: Final = "tcp://127.0.0.1:5601"
-"""Where sensor nodes find a central node."""
+"""Default address for sensor nodes."""
 DEFAULT_PUBLISH: Final = "tcp://127.0.0.1:5602"
-"""Where applications find it."""
+"""Default address for applications."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*):(\*|[0-9]{1,5})", re.ASCII)
 _HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(?::[0-9]{1,5})?", re.ASCII)
 
 
 def endpoint(text: str) -> str:
-    """Return an address as ZeroMQ takes it.
+    """Return an address in the form of ZeroMQ.
 
     Parameters
     ----------
     text : str
-        ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for any that is free, and host ``*`` for all
-        of its own.
+        ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for all
+        interfaces.
 
     Raises
     ------
     ArgumentError
-        It is no such address.
+        The text is not an address.
     """
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
@@ -54,17 +54,17 @@ def endpoint(text: str) -> str:
 
 
 def at_port(given: str, bound: str) -> str:
-    """Return an address as it was given to be listened at, with the port that it has come to."""
+    """Return the address that a server was given, with the port that it listens at."""
     return f"{given.rpartition(':')[0]}:{bound.rpartition(':')[2]}"
 
 
 def host_of(endpoint: str) -> str:
-    """Return the host of what `endpoint` has returned, without brackets."""
+    """Return the host of an `endpoint` address, without brackets."""
     return endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an address cannot be reached from another machine, which is sure of literal ones only."""
+    """Return True if other machines cannot reach an address; only literal addresses are certain."""
     host = host_of(endpoint)
     if host == "localhost":
         return True
@@ -81,9 +81,9 @@ def is_own_host(given: str, host: str) -> bool:
     Parameters
     ----------
     given : str
-        As the request has it, with or without a port.
+        Host of the request, with or without a port.
     host : str
-        Of the server, without brackets.
+        Host of the server, without brackets.
     """
     found = _HTTP_HOST.fullmatch(given)
     if found is None:
@@ -93,15 +93,15 @@ def is_own_host(given: str, host: str) -> bool:
 
 
 def require_keys(endpoint: str, *, keys: object | None) -> None:
-    """Refuse an address that others can reach if there are no keys.
+    """Refuse an address that other machines can reach if there are no keys.
 
     Raises
     ------
     ArgumentError
-        It is not of this machine alone, and ``keys`` is None.
+        Other machines can reach the address, and ``keys`` is None.
     """
     if keys is None and not is_loopback(endpoint):
         raise ArgumentError(
-            f"address {endpoint} can be reached from other machines, and there are no keys; make some by "
+            f"address {endpoint} can be reached from other machines, but there are no keys; create keys with "
             "'ertis keys new' and give --key, or use tcp://127.0.0.1:PORT"
         )

@@ -1,4 +1,4 @@
-"""Who is let in, and as what."""
+"""Allow list of keys with their roles."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,11 +19,11 @@ __all__ = ["ALLOW_LIST", "ROLES", "AllowList", "Permission", "Role"]
 Role: TypeAlias = Literal["sensor", "application", "admin"]
 ROLES: Final[tuple[Role, ...]] = get_args(Role)
 ALLOW_LIST: Final = "allow.toml"
-"""Name of the list of permissions in a folder of keys."""
+"""Name of the allow list in a folder of keys."""
 
 
 class Permission(TomlTable, frozen=True, kw_only=True):
-    """What the owner of a key may do.
+    """Permissions of a key.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Permission(TomlTable, frozen=True, kw_only=True):
     role : {"sensor", "application", "admin"}
         A sensor sends measurements of its serials, an application receives products, an admin may do both.
     serials : tuple of str
-        Of a sensor: the names of those that it may send for, each of them.
+        Sensors that a key with the role ``sensor`` may send for.
     """
 
     name: str
@@ -47,24 +47,26 @@ class Permission(TomlTable, frozen=True, kw_only=True):
         require_key(self.public)
         checks.choice("role", self.role, ROLES)
         if self.role == "sensor" and not self.serials:
-            raise ArgumentError(f"{self.name} is a sensor without serials; name those that it may send for (--serial)")
+            raise ArgumentError(
+                f"{self.name} is a sensor without serials; name the sensors that it may send for (--serial)"
+            )
         if self.role != "sensor" and self.serials:
-            raise ArgumentError(f"{self.name} has serials and is no sensor; give serials to sensors only")
+            raise ArgumentError(f"{self.name} has serials but is not a sensor; give serials to sensors only")
         for serial in self.serials:
             checks.sensor_name(serial)
 
     def may_send(self, sensor: str) -> bool:
-        """Whether it may send measurements of a sensor."""
+        """Return True if the key may send measurements of a sensor."""
         return self.role == "admin" or (self.role == "sensor" and sensor in self.serials)
 
     @property
     def may_receive(self) -> bool:
-        """Whether it may receive products and status."""
+        """Return True if the key may receive products and status."""
         return self.role in ("application", "admin")
 
 
 class AllowList(Checked, frozen=True, kw_only=True):
-    """Who is let in, and as what.
+    """Allow list of keys.
 
     Attributes
     ----------
@@ -80,7 +82,7 @@ class AllowList(Checked, frozen=True, kw_only=True):
             for permission in self.keys:
                 value = getattr(permission, what)
                 if value in seen:
-                    raise ArgumentError(f"{what} {value!r} is listed twice; list each key once, by a name of its own")
+                    raise ArgumentError(f"{what} {value!r} is listed twice; list each key once, with its own name")
                 seen.add(value)
 
     @classmethod
@@ -90,37 +92,37 @@ class AllowList(Checked, frozen=True, kw_only=True):
         Raises
         ------
         SettingsError
-            It cannot be read or used, or others on this machine may change it.
+            The file cannot be read or used, or other users of this machine may change it.
         """
-        with suppress(OSError):  # which is told of below
+        with suppress(OSError):  # The reader below reports it.
             require_own(Path(path))
         return super().load(path)
 
     def save(self, path: str | Path) -> None:
-        """Write the list, as a whole or not at all; only its owner can change it.
+        """Write the whole list atomically; only its owner can change the file.
 
         Raises
         ------
         ArgumentError
-            There is no such folder.
+            The folder does not exist.
         """
         write(Path(path), self.to_toml(), mode=0o644, overwrite=True)
 
     @classmethod
     def change(cls, path: str | Path, how: Callable[["AllowList"], "AllowList"]) -> tuple["AllowList", "AllowList"]:
-        """Change a list, which is empty before it is made; two that do so at once lose nothing of each other's.
+        """Change a list, which is empty if the file does not exist; simultaneous changes are serialised.
 
         Returns
         -------
         tuple of AllowList
-            Before and after.
+            The list before and after.
 
         Raises
         ------
         SettingsError
             As `load`.
         NetworkError
-            Its folder cannot be written.
+            The folder cannot be written.
         """
         path = Path(path)
         with locked(path.with_name(f".{path.name}.lock")):
@@ -130,7 +132,7 @@ class AllowList(Checked, frozen=True, kw_only=True):
         return before, after
 
     def allow(self, permission: Permission) -> "AllowList":
-        """Return the list with a key in it, instead of what that key had before.
+        """Return the list with a key added; it replaces earlier permissions of the key.
 
         Raises
         ------
@@ -143,12 +145,12 @@ class AllowList(Checked, frozen=True, kw_only=True):
         return AllowList(keys=(*others, permission))
 
     def remove(self, who: str) -> "AllowList":
-        """Return the list without a key, given by its name or itself.
+        """Return the list without a key, given by its name or its text.
 
         Raises
         ------
         ArgumentError
-            It is not in the list.
+            The key is not in the list.
         """
         others = tuple(each for each in self.keys if who not in (each.name, each.public))
         if len(others) == len(self.keys):
@@ -156,5 +158,5 @@ class AllowList(Checked, frozen=True, kw_only=True):
         return AllowList(keys=others)
 
     def find(self, public: str) -> Permission | None:
-        """Return what a key may do; None if it is not in the list."""
+        """Return the permissions of a key; None if it is not in the list."""
         return next((each for each in self.keys if each.public == public), None)

@@ -1,4 +1,4 @@
-"""Documents with a checksum, for files in which a damaged character could go unnoticed."""
+"""TOML documents with a checksum, for files in which a damaged character could go unnoticed."""
 
 import zlib
 from typing import Any, Self
@@ -12,12 +12,12 @@ __all__ = ["Checked"]
 
 
 class Checked(TomlDocument, frozen=True, kw_only=True):
-    """A document with an optional CRC-32 of its content.
+    """TOML document with an optional CRC-32 of its content.
 
     Attributes
     ----------
     check : str
-        CRC-32 as the file has it; empty in a document in memory.
+        CRC-32 in the file; empty for a document in memory.
     """
 
     check: str = ""
@@ -32,13 +32,16 @@ class Checked(TomlDocument, frozen=True, kw_only=True):
             The text cannot be used, or its checksum is wrong.
         """
         if not text.strip():
-            raise SettingsError(f"{source or cls.label()} is empty; copy it again, or make a new one with 'ertis keys'")
+            raise SettingsError(
+                f"{source or cls.label()} is empty; copy it again, or create a new one with 'ertis keys'"
+            )
         read = super().from_toml(text, source, find_line=find_line)
         made = read.replace(check="")
         if read.check and read.check != _crc32(made):
             raise SettingsError(
-                f"{source or cls.label()}: check is {read.check[:16]!r}, the content has {_crc32(made)!r}: the file is "
-                "damaged or was edited by hand; review its content, then remove the line that begins with 'check'"
+                f"{source or cls.label()}: check is {read.check[:16]!r}, but the content has {_crc32(made)!r}: "
+                "the file is damaged or was edited by hand. Review its content, then remove the line that "
+                "begins with 'check'"
             )
         return made
 
@@ -48,9 +51,9 @@ class Checked(TomlDocument, frozen=True, kw_only=True):
 
 
 def _crc32(document: Checked) -> str:
-    """Return the CRC-32 over the content as JSON.
+    """Return the CRC-32 of the content as JSON.
 
-    What is empty is left out, so that fields that are added later change it only where they are used.
+    Empty fields are left out, so that fields added later change it only if they are used.
     """
     return f"{zlib.crc32(msgspec.json.encode(_without_empty(msgspec.to_builtins(document)))):08x}"
 

@@ -1,4 +1,4 @@
-"""Fields of messages: how long and how large what comes over the wire may be, and those of each measurement."""
+"""Field types of messages, with limits on length and size, and the fields of each measurement."""
 
 from typing import Annotated, Final, Literal
 
@@ -30,7 +30,7 @@ MAX_LINE_LENGTH: Final = 512
 Line = Annotated[str, Meta(max_length=MAX_LINE_LENGTH)]
 Reason = Annotated[str, Meta(min_length=1, max_length=64)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-MAX_SEQUENCE = 2**48  # half a million years at 20 Hz; sums of many still fit into 64 bits
+MAX_SEQUENCE = 2**48  # Half a million years at 20 Hz; sums of many still fit into 64 bits.
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQUENCE)]
 AckedThrough = Annotated[int, Meta(ge=-1, le=MAX_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -41,25 +41,25 @@ Quaternion = tuple[float, float, float, float]
 
 
 def as_line(text: str) -> str:
-    """Return text that fits a `Line`: cut to its length, and without the surrogates of names that are not UTF-8."""
+    """Return text that fits a `Line`: cut to its length, without surrogates of names that are not UTF-8."""
     return text.encode(errors="replace").decode()[:MAX_LINE_LENGTH]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
-    """The header of any message."""
+    """Header of a message."""
 
 
 class OfMeasurement(Message, frozen=True, kw_only=True):
-    """What every header says that is about a measurement.
+    """Header fields of a message about a measurement.
 
     Attributes
     ----------
     sensor, session_id, sequence, sync_count
         As in `ertis_numba.frames.Stamp`.
     timestamp_ns, uncertainty_ns : int
-        When the emission began, since 1970-01-01 UTC by the sensor node's clock.
+        Start of the emission, since 1970-01-01 UTC by the sensor node's clock.
     monotonic_ns : int
-        When all of it had arrived at the sensor node, by its clock that nobody sets.
+        Complete arrival at the sensor node, by its monotonic clock.
     """
 
     sensor: Name
@@ -72,7 +72,7 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
 
     @property
     def stamp(self) -> Stamp:
-        """The stamp of its frame."""
+        """Stamp of the measurement."""
         return Stamp(
             sensor=self.sensor,
             sequence=self.sequence,

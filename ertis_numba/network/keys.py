@@ -1,4 +1,4 @@
-"""Keys of nodes: what each proves by who it is."""
+"""CURVE keys of nodes."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from ertis_numba.network.own_files import OTHERS, mode_of, private_folder, requi
 __all__ = ["ClientKeys", "KeyPair", "ServerKeys", "default_folder", "public_key", "require_key", "require_name"]
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,63}", re.ASCII)
-_Z85: Final = re.compile(r"[0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # ZeroMQ RFC 32
+_Z85: Final = re.compile(r"[0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # Pattern of ZeroMQ RFC 32.
 
 
 class _Public(Checked, frozen=True, kw_only=True):
@@ -33,14 +33,14 @@ class _Secret(Checked, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """What a node proves by who it is.
+    """CURVE key pair that proves the identity of a node.
 
     Attributes
     ----------
     public : str
-        Z85 (ZeroMQ RFC 32), 40 characters; others may know it.
+        Public key, Z85 (ZeroMQ RFC 32), 40 characters.
     secret : str
-        The same; nobody else may.
+        Secret key, in the same form.
     name : str
     """
 
@@ -52,7 +52,7 @@ class KeyPair:
         require_name(self.name)
         require_key(self.public)
         if not _is_key(self.secret) or zmq.curve_public(self.secret.encode()).decode() != self.public:
-            raise ArgumentError(f"the secret key of {self.name} does not belong to its public key; make new ones")
+            raise ArgumentError(f"the secret key of {self.name} does not belong to its public key; create new keys")
 
     @classmethod
     def new(cls, name: str) -> Self:
@@ -61,10 +61,10 @@ class KeyPair:
         Raises
         ------
         ArgumentError
-            The name cannot be that of a file.
+            The name cannot be a file name.
         """
         public, secret = zmq.curve_keypair()
-        while public.startswith(b"-"):  # as one in 85 does, and a command would take it for an option
+        while public.startswith(b"-"):  # 1 key in 85 does, and a command would take it for an option.
             public, secret = zmq.curve_keypair()
         return cls(public.decode(), secret.decode(), name)
 
@@ -75,31 +75,31 @@ class KeyPair:
         Parameters
         ----------
         path : str or Path
-            Of the file with the secret key.
+            File with the secret key.
 
         Raises
         ------
         SettingsError
-            It cannot be read or used, or others on this machine may use it or its folder, too.
+            The file cannot be read or used, or other users of this machine may use it or its folder.
         """
         path = Path(path)
         if path.name.endswith(".public.toml"):
-            raise SettingsError(f"{path} holds a public key; give the file .secret.toml of the same name")
+            raise SettingsError(f"{path} contains a public key; give the file .secret.toml of the same name")
         try:
             mode, folder_mode = mode_of(path), mode_of(path.parent)
         except OSError as error:
-            raise SettingsError(f"{path}: {error.strerror}; make keys by 'ertis keys new'") from error
+            raise SettingsError(f"{path}: {error.strerror}; create keys with 'ertis keys new'") from error
         if mode & OTHERS:
             raise SettingsError(
-                f"{path} holds a secret and others may use it (mode {mode:04o}); "
-                f"run 'chmod 600 {path}', and make new keys if somebody has read it"
+                f"{path} contains a secret, but other users may read it (mode {mode:04o}); run 'chmod 600 "
+                f"{path}', and create new keys if somebody has read it"
             )
         if folder_mode & OTHERS:
             raise SettingsError(
-                f"{path} holds a secret and others may use its folder (mode {folder_mode:04o}); "
-                f"run 'chmod 700 {path.parent}', or move it to a folder of its own"
+                f"{path} contains a secret, but other users may use its folder (mode {folder_mode:04o}); run "
+                f"'chmod 700 {path.parent}', or move it to a separate folder"
             )
-        require_own(path, "holds a secret")
+        require_own(path, "contains a secret")
         read = _Secret.load(path)
         try:
             return cls(read.public, read.secret, read.name)
@@ -112,23 +112,23 @@ class KeyPair:
         Parameters
         ----------
         folder : str or Path
-            It is made if it is not there, for its owner alone.
+            Folder of the files; created for its owner alone if it does not exist.
 
         Returns
         -------
         tuple of Path
-            Of the secret and of the public key.
+            Files of the secret and of the public key.
 
         Raises
         ------
         ArgumentError
-            There are keys of this name already, or others may use the folder.
+            Keys of this name exist, or other users may use the folder.
         """
         folder = private_folder(Path(folder))
         secret, public = folder / f"{self.name}.secret.toml", folder / f"{self.name}.public.toml"
         for path in (secret, public):
             if path.exists():
-                raise ArgumentError(f"{path} exists; give another name, or take it away if nothing uses it")
+                raise ArgumentError(f"{path} exists; give another name, or remove the file if nothing uses it")
         write(secret, _Secret(name=self.name, public=self.public, secret=self.secret).to_toml(), mode=0o600)
         write(public, _Public(name=self.name, public=self.public).to_toml(), mode=0o644)
         return secret, public
@@ -136,13 +136,13 @@ class KeyPair:
 
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
-    """What a central node needs.
+    """Keys of a central node.
 
     Attributes
     ----------
     pair : KeyPair
     allow : Path
-        Of the `AllowList`; who is not in it gets nothing in or out.
+        File of the `AllowList`. Other keys are refused.
     """
 
     pair: KeyPair
@@ -151,13 +151,13 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """What a sensor or application node needs.
+    """Keys of a sensor node or an application node.
 
     Attributes
     ----------
     pair : KeyPair
     server : str
-        Public key of the central node, Z85: no other is spoken to.
+        Public key of the central node, Z85. The node talks to no other.
     """
 
     pair: KeyPair
@@ -168,7 +168,7 @@ class ClientKeys:
 
 
 def default_folder() -> Path:
-    """Return the folder of the keys of this user; ``ERTIS_KEYS_DIR`` names another."""
+    """Return the folder of this user's keys; ``ERTIS_KEYS_DIR`` names another."""
     given = os.environ.get("ERTIS_KEYS_DIR")
     return Path(given) if given else Path(platformdirs.user_config_dir("ertis", appauthor=False)) / "keys"
 
@@ -185,11 +185,13 @@ def public_key(given: str | Path) -> tuple[str, str]:
         return str(given), ""
     path = Path(given)
     if path.name.endswith(".secret.toml"):
-        raise SettingsError(f"{path} holds a secret key, which nobody else needs; give the file .public.toml beside it")
+        raise SettingsError(
+            f"{path} contains a secret key, which must stay on its machine; give the file .public.toml beside it"
+        )
     if not path.is_file():
         raise SettingsError(
-            f"{str(given)!r} is neither a public key nor a file of one; give NAME.public.toml from 'ertis keys new', "
-            "or the 40 characters that 'ertis keys list' shows"
+            f"{str(given)!r} is neither a public key nor a file with one; give NAME.public.toml from 'ertis keys "
+            "new', or the 40 characters from 'ertis keys list'"
         )
     read = _Public.load(path)
     try:
@@ -201,19 +203,19 @@ def public_key(given: str | Path) -> tuple[str, str]:
 
 
 def require_name(name: str) -> None:
-    """Refuse what cannot be the name of a key.
+    """Refuse a name that a key cannot have.
 
     Raises
     ------
     ArgumentError
-        It cannot.
+        The name cannot be used.
     """
     if not _NAME.fullmatch(name):
-        raise ArgumentError(f"name {name!r} cannot be that of a key; give up to 64 letters, digits and _ . @ + -")
+        raise ArgumentError(f"key name {name!r} cannot be used; give up to 64 letters, digits and _ . @ + -")
 
 
 def _is_key(key: str) -> bool:
-    """Whether a text is a key in Z85: five characters for each four bytes, which not every five are."""
+    """Return True if a text is a key in Z85; some groups of five characters encode no four bytes."""
     try:
         return bool(_Z85.fullmatch(key)) and len(z85.decode(key)) == 32
     except Exception:  # noqa: BLE001  whatever it is that cannot be decoded
@@ -221,12 +223,12 @@ def _is_key(key: str) -> bool:
 
 
 def require_key(key: str) -> None:
-    """Refuse what is no key.
+    """Refuse a text that is not a key.
 
     Raises
     ------
     ArgumentError
-        It is none.
+        The text is not a key.
     """
     if not _is_key(key):
-        raise ArgumentError(f"key {key[:48]!r} is none; give the 40 characters that 'ertis keys list' shows")
+        raise ArgumentError(f"{key[:48]!r} is not a key; give the 40 characters from 'ertis keys list'")

@@ -1,4 +1,4 @@
-"""Log lines that both people and programs read: one event each, with its fields."""
+"""Log lines for people and programs: one event each, with its fields."""
 
 import json
 import logging
@@ -15,22 +15,22 @@ _BARE: Final = re.compile(r"[^\s\"=\\]+")
 
 
 class Writable(Protocol):
-    """Where lines go."""
+    """Destination of lines."""
 
     def write(self, text: str, /) -> object:
-        """Take text."""
+        """Write text."""
 
     def flush(self) -> object:
-        """Bring out what was taken."""
+        """Write buffered text."""
 
 
 class EventLog:
-    """Logs events of a part of a node.
+    """Logger of one part of a node.
 
     ::
 
         log = logger("central_node")
-        log.warning("conflict", sensor="front", epoch=7, sequence=41, text="held with another checksum; both are kept")
+        log.warning("conflict", sensor="front", session_id=7, sequence=41, text="stored with another checksum; both are kept")
 
     Parameters
     ----------
@@ -41,19 +41,19 @@ class EventLog:
         self._logger = logging.getLogger(f"{_ROOT}.{name}")
 
     def debug(self, event: str, **fields: Any) -> None:
-        """Log what only who looks for a mistake wants to know."""
+        """Log details for debugging."""
         self._log(logging.DEBUG, event, fields)
 
     def info(self, event: str, **fields: Any) -> None:
-        """Log what happened as it should."""
+        """Log normal events."""
         self._log(logging.INFO, event, fields)
 
     def warning(self, event: str, **fields: Any) -> None:
-        """Log what somebody should look at."""
+        """Log events that need attention."""
         self._log(logging.WARNING, event, fields)
 
     def error(self, event: str, **fields: Any) -> None:
-        """Log what does not work."""
+        """Log failures."""
         self._log(logging.ERROR, event, fields)
 
     def _log(self, level: int, event: str, fields: dict[str, Any]) -> None:
@@ -61,12 +61,12 @@ class EventLog:
 
 
 def logger(name: str) -> EventLog:
-    """Return what logs events of a part of a node, such as ``"publisher"``."""
+    """Return the logger of a part of a node, such as ``"publisher"``."""
     return EventLog(name)
 
 
 def show(*, as_json: bool = False, level: str = "INFO", stream: Writable | None = None) -> None:
-    """Write events as lines to ``stream``, stderr by default; what was shown before is not any more."""
+    """Write events as lines to ``stream``, stderr by default, instead of the earlier stream."""
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(NDJson() if as_json else Logfmt())
     root = logging.getLogger(_ROOT)
@@ -76,7 +76,7 @@ def show(*, as_json: bool = False, level: str = "INFO", stream: Writable | None 
 
 
 class Logfmt(logging.Formatter):
-    """Formats an event as ``TIME level event key=value …``; a value with spaces in it is quoted."""
+    """Formatter for ``TIME level event key=value …``; values with spaces are quoted."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -85,7 +85,7 @@ class Logfmt(logging.Formatter):
 
 
 class NDJson(logging.Formatter):
-    """Formats an event as one JSON object."""
+    """Formatter for one JSON object per event."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -111,6 +111,6 @@ def _key(name: str) -> str:
 
 
 def _word(value: object) -> str:
-    """Return a value so that it is one word, whatever a stranger has put into it."""
+    """Return a value as one word, also if it comes from an untrusted peer."""
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
     return text if _BARE.fullmatch(text) and text.isprintable() else json.dumps(text)

@@ -1,8 +1,8 @@
-"""The wire format: what nodes say to each other, as a table of messages with a version.
+"""Wire format: versioned messages between nodes.
 
 A message is a list of frames. The first is the header: `MAGIC`, one byte for the `VERSION`, and a MessagePack map of at
-most `HEADER_BYTES` in all, whose ``kind`` names the message. What follows it are its payloads, raw bytes. Nothing on
-the wire is code, and nothing in a header is as long as its sender likes.
+most `HEADER_BYTES` in all, whose ``kind`` names the message. The payloads follow as raw bytes. Messages contain no
+code, and every field of a header has a maximum length.
 """
 
 from collections.abc import Sequence
@@ -81,14 +81,14 @@ class Hello(Message, frozen=True, kw_only=True):
     ----------
     sensor : str
     session_id : int
-        Run of the sensor: with its sequence numbers, the identity of a measurement.
+        Session of the sensor; with its sequence numbers, the identity of a measurement.
     next_sequence : int
-        The oldest number that the node still has, or the next that it will have.
+        Oldest number that the node still has, or the next one.
     settings_crc32 : int
-        Of the payload.
+        CRC-32 of the payload.
     firmware : str
     translation_m, rotation_xyzw
-        Where the sensor is on its platform; None if its mounting is unknown.
+        Mounting of the sensor on its platform; None if it is unknown.
     """
 
     sensor: Name
@@ -101,18 +101,18 @@ class Hello(Message, frozen=True, kw_only=True):
 
 
 class Welcome(Message, frozen=True, kw_only=True):
-    """The central node takes measurements of a sensor.
+    """The central node accepts measurements of a sensor.
 
     Attributes
     ----------
     sensor, session_id
     state : {"storage", "processing", "fault", "closing"}
     acks : {"stored", "accepted"}
-        What an `Ack` will mean: on the disk, or in memory.
+        Meaning of an `Ack`: on disk, or in memory.
     window : int
-        Measurements that may be under way without an ack.
+        Limit on unacknowledged measurements.
     acked_through : int
-        The highest number up to which every one is stored, or known to be missing; -1 if there is none.
+        Highest number up to which each measurement is stored, or known to be missing; -1 if there is none.
     """
 
     sensor: Name
@@ -124,14 +124,14 @@ class Welcome(Message, frozen=True, kw_only=True):
 
 
 class Data(OfMeasurement, frozen=True, kw_only=True):
-    """A measurement. Payload: its words, little-endian.
+    """A measurement. Payload: its samples, little-endian.
 
     Attributes
     ----------
     temperature_c, humidity_percent, pressure_pa : float
-        The air.
+        State of the air.
     crc32 : int
-        Of the payload.
+        CRC-32 of the payload.
     """
 
     temperature_c: float
@@ -141,14 +141,14 @@ class Data(OfMeasurement, frozen=True, kw_only=True):
 
     @property
     def air(self) -> Air:
-        """The air; raises an `ArgumentError` where there is none like it."""
+        """Air of the measurement; raises an `ArgumentError` for impossible values."""
         return Air(
             temperature_c=self.temperature_c, humidity_percent=self.humidity_percent, pressure_pa=self.pressure_pa
         )
 
 
 class Gap(Message, frozen=True, kw_only=True):
-    """Sequence numbers that no measurement has, ``first`` and ``last`` included, and why."""
+    """Missing sequence numbers, ``first`` and ``last`` included, and the reason."""
 
     sensor: Name
     session_id: Count
@@ -158,7 +158,7 @@ class Gap(Message, frozen=True, kw_only=True):
 
 
 class Ack(Message, frozen=True, kw_only=True):
-    """What the central node has of a sensor's run; it can be said again and come late, and does no harm.
+    """Cumulative acknowledgement of a sensor's session; a repeated or late one is harmless.
 
     Attributes
     ----------
@@ -166,9 +166,9 @@ class Ack(Message, frozen=True, kw_only=True):
     acked_through : int
         As in `Welcome`.
     status : {"stored", "accepted"}
-        What is settled is on the disk, or in memory.
+        Place of the acknowledged measurements: on disk, or in memory.
     dropped : tuple of (sequence, reason)
-        Those that the node has thrown away since the ack before.
+        Measurements that the node has discarded since the previous ack.
     """
 
     sensor: Name
@@ -179,31 +179,31 @@ class Ack(Message, frozen=True, kw_only=True):
 
 
 class Ping(Message, frozen=True, kw_only=True):
-    """A node is alive; sent each second. The answer is a `Pong`, and an `Ack` of every run that was greeted."""
+    """Sign of life of a node, sent each second; answered by a `Pong`, and by an `Ack` of every greeted session."""
 
 
 class Pong(Message, frozen=True, kw_only=True):
-    """The central node is alive, and how it is."""
+    """Sign of life of the central node, with its state."""
 
     state: State
     text: Line = ""
 
 
 class Bye(Message, frozen=True, kw_only=True):
-    """A node leaves, and nothing is wrong."""
+    """A node disconnects normally."""
 
 
 class Refused(Message, frozen=True, kw_only=True):
-    """A message was not taken.
+    """The central node refused a message.
 
     Attributes
     ----------
     code : {"version", "message", "role", "serial", "hello", "settings", "size"}
-        For programs. ``hello``: the node is not known (any more), and should greet.
+        Reason, for programs. ``hello``: the session is unknown; the node should send `Hello` again.
     reason : str
-        A line for people: what came, what was wanted, the remedy.
+        Reason, for people: what was got, what is accepted, the remedy.
     sensor : str
-        Which it is about, if one.
+        Sensor that the message was about, if any.
     session_id : int
     """
 
@@ -214,7 +214,7 @@ class Refused(Message, frozen=True, kw_only=True):
 
 
 class AskStatus(Message, frozen=True, kw_only=True):
-    """Asks for a `Report`."""
+    """Request for a `Report`."""
 
 
 _MESSAGES = (
@@ -238,30 +238,30 @@ def decode(header: "bytes | memoryview", wanted: Sequence[type[Message]] | None 
     ----------
     header : bytes or memoryview
     wanted : sequence of type, optional
-        Those that are expected here; any by default.
+        Accepted messages; any by default.
 
     Raises
     ------
     FormatVersionError
-        It was sent by another version.
+        Another version sent the message.
     DataError
-        It is no header of this protocol, or not one that is expected.
+        The frame is not a header of this protocol, or not an accepted message.
     """
     if len(header) > HEADER_BYTES:
-        raise DataError(f"a header has {len(header)} bytes; send {HEADER_BYTES} at most")
+        raise DataError(f"a header has {len(header)} bytes; the limit is {HEADER_BYTES}")
     beginning = bytes(header[: len(_BEGINNING)])
     if beginning[:-1] != MAGIC:
-        raise DataError(f"a header begins with {beginning[:4]!r}; send {MAGIC!r}, which begins all of this protocol")
+        raise DataError(f"a header begins with {beginning[:4]!r}; messages of this protocol begin with {MAGIC!r}")
     if beginning != _BEGINNING:
         raise FormatVersionError(
-            f"a header has version {beginning[-1]} of the protocol, this node speaks {VERSION}; use the same release "
+            f"a header has protocol version {beginning[-1]}, but this node uses {VERSION}; use the same release "
             "of ertis-numba on both"
         )
     try:
         message = _decoder.decode(header[len(_BEGINNING) :])
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(
-            f"a header cannot be read ({' '.join(str(error).split())[:200]}); send one of this protocol"
+            f"a header cannot be decoded ({' '.join(str(error).split())[:200]}); send a header of this protocol"
         ) from error
     if wanted is not None and not isinstance(message, tuple(wanted)):
         raise DataError(

@@ -1,4 +1,4 @@
-"""How a central node is, for Prometheus."""
+"""Prometheus metrics of a central node."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import TracebackType
@@ -20,24 +20,24 @@ __all__ = ["Metrics"]
 _STATES: Final = ("storage", "processing", "fault", "closing")
 _QUANTILES: Final = (("0.5", "p50_ms"), ("0.9", "p90_ms"), ("0.99", "p99_ms"), ("1", "max_ms"))
 _OF_SENSOR: Final = {
-    "received": "Measurements received, each once",
+    "received": "Measurements received, each counted once",
     "received_bytes": "Bytes of measurements received",
-    "stored": "Measurements that are durable",
-    "published": "Measurements that were published",
-    "repeated": "Measurements that came again",
-    "conflicts": "Measurements that came again and were not the same",
+    "stored": "Measurements stored on disk",
+    "published": "Measurements published",
+    "repeated": "Duplicate measurements received",
+    "conflicts": "Duplicates that differ from the stored measurement",
 }
 _NOW_OF_SENSOR: Final = {
-    "connected": "Whether its sensor node is there",
-    "rate_hz": "Measurements a second",
+    "connected": "1 if the sensor node is connected",
+    "rate_hz": "Measurements per second",
     "in_flight": "Measurements being processed",
-    "queue": "Measurements that wait",
-    "acked_through": "Highest sequence number up to which all is known",
+    "queue": "Measurements waiting",
+    "acked_through": "Highest sequence number acknowledged through",
 }
 
 
 class Metrics:
-    """Serves the status of a central node as metrics, over HTTP and on this machine only.
+    """Server of a central node's status as metrics, over HTTP and on this machine only.
 
     Requests whose Host is not a loopback name or address are refused with 421.
 
@@ -49,19 +49,19 @@ class Metrics:
     Parameters
     ----------
     address : str
-        ``HOST:PORT``; port 0 for any that is free.
+        ``HOST:PORT``; port 0 selects a free one.
     latest : callable
-        Returns the status. It is called from other threads.
+        Returns the status. Other threads call it.
 
     Attributes
     ----------
     address : str
-        ``HOST:PORT``, with the port that it was, once it is started.
+        ``HOST:PORT`` with the actual port, once the server has started.
 
     Raises
     ------
     ArgumentError
-        The address is not of this machine alone, or prometheus-client is not installed.
+        Other machines can reach the address, or prometheus-client is not installed.
     """
 
     def __init__(self, address: str, latest: Callable[[], Status]) -> None:
@@ -77,7 +77,7 @@ class Metrics:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Serve from now on.
+        """Start serving.
 
         Raises
         ------
@@ -92,13 +92,11 @@ class Metrics:
             self._server, self._thread = start_http_server(int(self._port), addr=self._host, registry=registry)
             self._server.set_app(_of_own_hosts(self._server.get_app(), self._host))
         except OSError as error:
-            raise NetworkError(
-                f"{self.address} cannot be served at ({error.strerror}); give another address"
-            ) from error
+            raise NetworkError(f"cannot listen at {self.address} ({error.strerror}); give another address") from error
         self.address = f"{self.address.rpartition(':')[0]}:{self._server.server_port}"
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop serving."""
         if self._server is not None:
             self._server.shutdown()
             self._server.server_close()
@@ -116,11 +114,11 @@ class Metrics:
         self.close()
 
     def describe(self) -> "list[Metric]":
-        """Return nothing: what there is, is known when it is asked for."""
+        """Return nothing: the set of metrics is known only at each request."""
         return []
 
     def collect(self) -> "Iterator[Metric]":
-        """Yield the metrics, as Prometheus asks for them."""
+        """Yield the metrics, in the form of Prometheus."""
         from prometheus_client.core import (  # noqa: PLC0415  an extra
             CounterMetricFamily,
             GaugeMetricFamily,
@@ -140,29 +138,31 @@ class Metrics:
             return family
 
         status = self._latest()
-        node = InfoMetricFamily("ertis_node", "The central node")
+        node = InfoMetricFamily("ertis_node", "Central node")
         node.add_metric((), {"version": status.version, "host": status.host, "address": status.address})
         yield node
-        yield gauge("state", "What it does", {(state,): status.state == state for state in _STATES}, "state")
-        yield gauge("uptime_seconds", "Since it was started", {(): status.uptime_s})
-        yield gauge("memory_bytes", "Resident memory of the process that takes in", {(): status.memory_bytes})
-        yield gauge("peers", "Sensor nodes that are there", {(): status.peers})
-        yield counter("refused", "Who was not let in, and what was not taken", _by(status.refused), "reason")
+        yield gauge(
+            "state", "State of the central node", {(state,): status.state == state for state in _STATES}, "state"
+        )
+        yield gauge("uptime_seconds", "Time since the start", {(): status.uptime_s})
+        yield gauge("memory_bytes", "Resident memory of the receiving process", {(): status.memory_bytes})
+        yield gauge("peers", "Sensor nodes connected", {(): status.peers})
+        yield counter("refused", "Refused connections and messages", _by(status.refused), "reason")
         sensors = status.sensors.items()
         for field, text in _OF_SENSOR.items():
             yield counter(field, text, {(name,): getattr(each, field) for name, each in sensors}, "sensor")
         for field, text in _NOW_OF_SENSOR.items():
             yield gauge(field, text, {(name,): getattr(each, field) for name, each in sensors}, "sensor")
-        for field, text in (("dropped", "Measurements thrown away"), ("missing", "Sequence numbers never seen")):
+        for field, text in (("dropped", "Measurements discarded"), ("missing", "Sequence numbers never received")):
             rows = {(name, why): n for name, each in sensors for why, n in getattr(each, field).items()}
             yield counter(field, text, rows, "sensor", "reason")
         latency = {(name, q): s for name, each in sensors for q, s in _quantiles(each.image_latency)}
-        yield gauge("image_latency_seconds", "From arrival to image, of the latest", latency, "sensor", "quantile")
+        yield gauge("image_latency_seconds", "Time from arrival to image, of the latest", latency, "sensor", "quantile")
         yield from self._rest(status, counter, gauge)
 
     @staticmethod
     def _rest(status: Status, counter: "Callable[..., Metric]", gauge: "Callable[..., Metric]") -> "Iterator[Metric]":
-        """Yield those of storage and of processing, as far as there are any."""
+        """Yield the metrics of storage and of processing, if present."""
         archive, processing = status.archive, status.processing
         if archive is not None:
             for field in ("journal_bytes", "free_bytes", "room_bytes", "sealing"):
@@ -177,15 +177,17 @@ class Metrics:
             for field in ("respawned", "retried", "quarantined", "publisher_respawned"):
                 yield counter(field, f"Processing: {field}", {(): getattr(processing, field)})
             rows = {(q,): s for q, s in _quantiles(processing.process_time)}
-            yield gauge("process_seconds", "Time of a measurement in a worker, of the latest", rows, "quantile")
-            yield gauge("subscribers", "Applications that are there", {(): len(processing.subscribers)})
+            yield gauge(
+                "process_seconds", "Processing time of a measurement in a worker, of the latest", rows, "quantile"
+            )
+            yield gauge("subscribers", "Applications connected", {(): len(processing.subscribers)})
             yield counter("groups", "Groups of simultaneous measurements", _by(processing.groups), "kind")
 
 
 def _of_own_hosts(app: "WSGIApplication", host: str) -> "WSGIApplication":
     """Return an application that refuses requests for other host names, as DNS rebinding sends them.
 
-    A browser that fetches from ``evil.example`` names it as Host, even if that name has the address of this machine.
+    A browser that fetches from ``evil.example`` names it as Host, even if that name resolves to this machine.
     """
 
     def guarded(environ: "WSGIEnvironment", start_response: "StartResponse") -> "Iterable[bytes]":

@@ -21,44 +21,44 @@ else:
 __all__ = ["OTHERS", "locked", "mode_of", "private_folder", "require_own", "write"]
 
 OTHERS: Final = 0o077
-"""What a mode must not have where nobody else may use a file."""
+"""Permission bits of group and others."""
 
 _OTHERS_WRITE: Final = 0o022
-_MAX_LINKS: Final = 40  # that a path leads through, as on Linux
+_MAX_LINKS: Final = 40  # Limit on symbolic links of a path, as on Linux.
 
 
 def private_folder(folder: Path) -> Path:
-    """Return a folder that only its owner can use, made if it is not there."""
+    """Return a folder that only its owner can use; create it if necessary."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = mode_of(folder)
     except OSError as error:
-        raise NetworkError(f"{folder}: {error.strerror}; give a folder that can be written (--dir)") from error
+        raise NetworkError(f"{folder}: {error.strerror}; give a writable folder (--dir)") from error
     if mode & OTHERS:
         raise ArgumentError(
-            f"{folder} can be used by others (mode {mode:04o}); run 'chmod 700 {folder}', or give another (--dir)"
+            f"other users can access {folder} (mode {mode:04o}); run 'chmod 700 {folder}', or give another (--dir)"
         )
     return folder
 
 
-def require_own(path: Path, about: str = "lists who is let in") -> None:
+def require_own(path: Path, about: str = "is an allow list of keys") -> None:
     """Refuse a file that other users of this machine may change or replace.
 
-    Other users are all but this one and root. The function follows each link of the path and checks each folder of it,
-    as StrictModes of OpenSSH does with the folders above ``authorized_keys``.
+    Other users are all except this user and root. The function follows each link of the path and checks each folder, as
+    StrictModes of OpenSSH does for the folders above ``authorized_keys``.
 
     Parameters
     ----------
     path : Path
     about : str
-        What the file is for, in errors.
+        Description of the file in errors.
 
     Raises
     ------
     SettingsError
-        They may.
+        Other users may change or replace the file.
     OSError
-        There is no such file.
+        The file does not exist.
     """
     if os.name != "posix":
         return
@@ -69,15 +69,16 @@ def require_own(path: Path, about: str = "lists who is let in") -> None:
         what = "it" if where in (file, given) else "its folder" if where == given.parent else str(where)
         if status.st_uid not in (0, os.geteuid()):
             raise SettingsError(
-                f"{path} {about} and others may change {what} (owned by user {status.st_uid}); "
-                f"run 'chown {os.geteuid()} {where}', and review the file"
+                f"{path} {about}, but other users may change {what} (owned by user {status.st_uid}); run 'chown "
+                f"{os.geteuid()} {where}', and review the file"
             )
         mode = stat.S_IMODE(status.st_mode)
-        is_kept = where in links or (where in folders and mode & stat.S_ISVTX)  # others cannot put another in its place
+        # The sticky bit keeps other users from replacing it.
+        is_kept = where in links or (where in folders and mode & stat.S_ISVTX)
         if mode & _OTHERS_WRITE and not is_kept:
             raise SettingsError(
-                f"{path} {about} and others may change {what} (mode {mode:04o}); "
-                f"run 'chmod go-w {where}', and review the file"
+                f"{path} {about}, but other users may change {what} (mode {mode:04o}); run 'chmod go-w {where}', "
+                "and review the file"
             )
 
 
@@ -106,17 +107,17 @@ def _way_to(path: Path) -> tuple[list[Path], list[Path], Path]:
 
 
 def mode_of(path: Path) -> int:
-    """Return who may use a file or folder; nobody else, where a system does not say."""
+    """Return the permission bits of a file or folder; owner only, on systems without such bits."""
     return stat.S_IMODE(path.stat().st_mode) if os.name == "posix" else 0
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Wait until nobody else is in such a block; a process that ends leaves it."""
+    """Run the block while no other process is in such a block; a process that ends leaves it."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
     except OSError as error:
-        raise NetworkError(f"{path.parent}: {error.strerror}; give a folder that can be written") from error
+        raise NetworkError(f"{path.parent}: {error.strerror}; give a writable folder") from error
     try:
         if sys.platform == "win32":
             msvcrt.locking(descriptor, msvcrt.LK_LOCK, 1)
@@ -128,7 +129,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def write(path: Path, text: str, *, mode: int, overwrite: bool = False) -> None:
-    """Write a file that was never open to more than it is to be open to."""
+    """Write a file with its final permissions from the start."""
     with atomic_write(path, overwrite=overwrite) as part:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""What applications and the publisher say to each other; the other half of `ertis_numba.network.messages`."""
+"""Messages between publisher and applications; `ertis_numba.network.messages` contains the other half."""
 
 from typing import Annotated, Final, Literal, TypeAlias, get_args
 
@@ -10,11 +10,11 @@ __all__ = ["PRODUCTS", "Description", "Group", "Image", "Points", "Product", "Ra
 
 Product: TypeAlias = Literal["energyscape", "points", "raw", "group", "status"]
 PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
-"""What applications can ask for."""
+"""Products that applications can request."""
 
 
 class Subscribe(Message, frozen=True, kw_only=True):
-    """An application wants products; sent each second, and whenever it has consumed something.
+    """An application subscribes to products; sent each second, and whenever it has consumed a product.
 
     Attributes
     ----------
@@ -22,9 +22,9 @@ class Subscribe(Message, frozen=True, kw_only=True):
         All by default.
     products : tuple of {"energyscape", "points", "raw", "group", "status"}
     consumed : int
-        Products received since the connection was made, that the application has taken.
+        Products that the application has taken since the connection was made.
     credit : int
-        How many more may be sent unasked.
+        Number of further products that the publisher may send.
     """
 
     sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] | None = None
@@ -34,15 +34,15 @@ class Subscribe(Message, frozen=True, kw_only=True):
 
 
 class Description(Message, frozen=True, kw_only=True):
-    """What products of a sensor are about, sent before the first that refers to it.
+    """Sensor description, sent before the first product that refers to it.
 
-    Payloads: settings as TOML, then azimuth, elevation and range as little-endian float64, which are empty for
-    products that have no such axes.
+    Payloads: settings as TOML, then azimuth, elevation and range as little-endian float64, which are empty for products
+    without such axes.
 
     Attributes
     ----------
     number : int
-        By which products refer to it, until the connection ends.
+        Number by which products refer to it, until the connection ends.
     sensor, translation_m, rotation_xyzw
     """
 
@@ -54,22 +54,23 @@ class Description(Message, frozen=True, kw_only=True):
 
 class _Product(OfMeasurement, frozen=True, kw_only=True):
     number: Count
-    """Of the product, among all that this subscriber has asked for since it connected, from 0; it skips what was
-    dropped."""
+    """Number of the product among all that this subscriber has requested since it connected, from 0; dropped products
+    leave a gap.
+    """
     dropped: Count
-    """How many were dropped for this subscriber, for want of credit."""
+    """Number of products dropped for this subscriber, for want of credit."""
     description: Count
 
 
 class Image(_Product, frozen=True, kw_only=True):
-    """An energyscape. Payloads: its energy, little-endian, cut into frames.
+    """An energyscape. Payloads: its amplitudes, little-endian, cut into frames.
 
     Attributes
     ----------
     shape : (direction, range)
     dtype : {"float32", "float16"}
     received_ns, published_ns : int
-        When the measurement reached the central node, and the image left it, by a clock there that nobody sets.
+        Arrival of the measurement at the central node, and departure of the image, by a monotonic clock there.
     """
 
     shape: tuple[Count, Count]
@@ -79,7 +80,7 @@ class Image(_Product, frozen=True, kw_only=True):
 
 
 class Points(_Product, frozen=True, kw_only=True):
-    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the energy.
+    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the amplitude.
 
     Attributes
     ----------
@@ -94,7 +95,7 @@ class Points(_Product, frozen=True, kw_only=True):
 
 
 class Raw(_Product, frozen=True, kw_only=True):
-    """A measurement as it came. Payload: its words, little-endian.
+    """A measurement as received. Payload: its samples, little-endian.
 
     Attributes
     ----------
@@ -109,7 +110,7 @@ class Raw(_Product, frozen=True, kw_only=True):
 
 
 class Group(Message, frozen=True, kw_only=True):
-    """Measurements that were emitted together, when all have come or no more will.
+    """Simultaneous measurements, once all have arrived or no more are expected.
 
     Attributes
     ----------
@@ -117,15 +118,15 @@ class Group(Message, frozen=True, kw_only=True):
         As in `Image`.
     group : int
         Pulse of the SYNC chain, as all sensors count it.
-    members : tuple of (sensor, epoch, sequence)
-        Those that have come.
+    members : tuple of (sensor, session_id, sequence)
+        Measurements that have arrived.
     missing : tuple of str
-        Those that have not.
+        Sensors without a measurement.
     spread_ns : int
-        Between the first and the last timestamp.
+        Time between the first and the last timestamp.
     flags : tuple of {"incomplete", "clock", "pulse"}
-        What is wrong with it: sensors are missing; timestamps disagree although counters agree; a sensor has lost
-        a pulse or seen one twice.
+        Faults: sensors are missing; timestamps disagree although counters agree; a sensor has lost a pulse or seen one
+        twice.
     """
 
     number: Count
@@ -138,17 +139,17 @@ class Group(Message, frozen=True, kw_only=True):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of those that have come."""
+        """Names of the sensors whose measurements have arrived."""
         return tuple(sensor for sensor, _, _ in self.members)
 
 
 class Report(Message, frozen=True, kw_only=True):
-    """How the central node is. Payload: `ertis_numba.network.status.Status` as MessagePack.
+    """Status of the central node. Payload: `ertis_numba.network.status.Status` as MessagePack.
 
     Attributes
     ----------
     number, dropped
-        As in `Image`; 0 where it was asked for by `AskStatus`.
+        As in `Image`; 0 in the answer to `AskStatus`.
     """
 
     number: Count = 0

@@ -1,4 +1,4 @@
-"""What a publisher sends, read: from messages to frames."""
+"""Decoding of a publisher's messages to frames."""
 
 import zlib
 from collections.abc import Sequence
@@ -19,19 +19,19 @@ from ertis_numba.settings import Settings
 __all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader"]
 
 Item: TypeAlias = Energyscape | PointCloud | Measurement | Group | Status
-"""What an application gets."""
+"""Products that an application receives."""
 Header: TypeAlias = Image | Points | Raw | Group | Report
-"""What stands before it on the wire: its number, what was dropped, times."""
+"""Headers of products: number, drops, times."""
 Payload: TypeAlias = Sequence[bytes | memoryview]
 
 _AXES = 3
-_MAX_OF_SENSOR = 64  # descriptions
-_COLUMNS = 4  # of a point: x, y, z and energy
+_MAX_OF_SENSOR = 64  # Limit on descriptions.
+_COLUMNS = 4  # Columns of a point: x, y, z and amplitude.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
-    """A product, and what came with it.
+    """A received product.
 
     Attributes
     ----------
@@ -39,14 +39,14 @@ class Arrival:
     header : Image, Points, Raw, Group or Report
         As in `ertis_numba.network.messages`.
     arrived_ns : int
-        When all of it was here, by a clock that nobody sets (`time.monotonic_ns`); that of ``header.monotonic_ns``
-        if the sensor node is on this machine.
+        Complete arrival, by the monotonic clock (`time.monotonic_ns`). A sensor node on this machine uses the same
+        clock for ``header.monotonic_ns``.
     arrived_utc_ns : int
-        The same by the clock of the wall.
+        The same by the system clock.
     connection : int
-        Numbers of products count from 0 in each.
+        Number of the connection; product numbers count from 0 in each.
     translation_m, rotation_xyzw
-        Where the sensor is on its platform; None if its mounting is unknown.
+        Mounting of the sensor on its platform; None if it is unknown.
     """
 
     item: Item
@@ -59,16 +59,21 @@ class Arrival:
 
     @property
     def age_s(self) -> float | None:
-        """From the emission to its being here, as far as the clocks of both machines agree; None if it has no time.
+        """Time in s from the emission to the arrival here, if the clocks of both machines agree.
 
-        A sensor has none either whose clock was never set.
+        None without a timestamp.
+
+        A sensor whose clock was never set has no timestamp either.
         """
         stamp: Stamp | None = getattr(self.header, "stamp", None)
         return (self.arrived_utc_ns - stamp.timestamp_ns) / 1e9 if stamp is not None and stamp.is_timed else None
 
     @property
     def made_in_s(self) -> float | None:
-        """From the measurement reaching the central node to the product leaving it; None if it is not made there."""
+        """Time in s from the arrival of the measurement at the central node to the departure of the product.
+
+        None for products that it does not compute.
+        """
         if not isinstance(self.header, Image | Points):
             return None
         return (self.header.published_ns - self.header.received_ns) / 1e9
@@ -92,15 +97,15 @@ class _Described:
         for axis in payload[1:]:
             if len(axis) % 8:
                 raise DataError(f"an axis has {len(axis)} bytes; send float64")
-            axes.append(np.frombuffer(axis, dtype="<f8").astype(np.float64))  # a copy, which outlives its frame
+            axes.append(np.frombuffer(axis, dtype="<f8").astype(np.float64))  # The copy outlives its frame.
         return cls(header, settings, axes)
 
 
 @dataclass(slots=True)
 class ProductReader:
-    """Makes frames of what has come through one connection, whose descriptions it keeps.
+    """Decoder of the products of one connection, with its descriptions.
 
-    Arrays are copies of their own, which the caller may change.
+    Arrays are copies, which the caller may change.
     """
 
     _described: dict[int, _Described] = field(default_factory=dict)
@@ -109,14 +114,14 @@ class ProductReader:
         return number in self._described
 
     def describe(self, header: Description, payload: Payload) -> None:
-        """Take what later products refer to.
+        """Store a description for later products.
 
         Raises
         ------
         DataError
-            It cannot be used.
+            The description cannot be used.
         """
-        # Each change of settings brings one: a connection that lasts for months must not keep them all.
+        # Each change of settings brings a description. A connection that lasts for months must not keep them all.
         of_sensor = [number for number, kept in self._described.items() if kept.header.sensor == header.sensor]
         stale = of_sensor[: max(0, len(of_sensor) - _MAX_OF_SENSOR)]
         for number in stale:
@@ -124,7 +129,7 @@ class ProductReader:
         self._described[header.number] = _Described.of(header, payload)
 
     def description(self, number: int) -> Description:
-        """Return what a product refers to."""
+        """Return the description of a product."""
         return self._of(number).header
 
     def read(self, header: Header, payload: Payload) -> Item:
@@ -133,7 +138,7 @@ class ProductReader:
         Raises
         ------
         DataError
-            The payload is not what the header says, or nothing describes it.
+            The payload contradicts its header, or has no description.
         """
         if isinstance(header, Group):
             return header
@@ -148,7 +153,7 @@ class ProductReader:
 
     def _of(self, number: int) -> _Described:
         if number not in self._described:
-            raise DataError(f"a product refers to description {number}, which has not come; send it before")
+            raise DataError(f"a product refers to description {number}, which has not arrived; send it first")
         return self._described[number]
 
 
@@ -156,7 +161,7 @@ def _image(header: Image, payload: Payload, described: _Described, stamp: Stamp)
     azimuth_rad, elevation_rad, range_m = described.axes
     wanted = (len(azimuth_rad), len(range_m))
     if header.shape != wanted or len(elevation_rad) != len(azimuth_rad):
-        raise DataError(f"an image has shape {header.shape}, its axes {wanted}; send the same")
+        raise DataError(f"an image has shape {header.shape}, but its axes give {wanted}; send matching axes")
     amplitude = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
     return Energyscape(amplitude, azimuth_rad, elevation_rad, range_m, described.settings, stamp)
 
@@ -178,7 +183,10 @@ def _measurement(header: Raw, payload: Payload, described: _Described, stamp: St
     wanted = sample_format(settings)
     words = _array(payload, wanted.shape, wanted.dtype.name)
     if zlib.crc32(words.data) != header.crc32:
-        raise DataError(f"measurement {header.sequence} of sensor {header.sensor} has another CRC-32 than its header")
+        raise DataError(
+            f"measurement {header.sequence} of sensor {header.sensor} does not match the CRC-32 in its header; send "
+            "it again"
+        )
     air = settings.air.replace(
         temperature_c=header.temperature_c,
         humidity_percent=header.humidity_percent,
@@ -188,14 +196,14 @@ def _measurement(header: Raw, payload: Payload, described: _Described, stamp: St
 
 
 def _array(payload: Payload, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
-    """Return an array of what has come in one or more frames."""
+    """Return an array from the data of one or more frames."""
     came = sum(len(frame) for frame in payload)
     kind = np.dtype(dtype).newbyteorder("<")
     wanted = kind.itemsize
     for size in shape:
-        wanted *= size  # whole numbers of any size: nothing is allocated by what a header says
+        wanted *= size  # Python integers of any size: a header alone allocates nothing.
     if came != wanted:
-        raise DataError(f"{came} bytes came for {dtype} of shape {shape}; send {wanted}")
+        raise DataError(f"{came} bytes arrived for {dtype} of shape {shape}, which needs {wanted}; send all of it")
     made = np.empty(shape, kind)
     flat, start = made.reshape(-1).view(np.uint8), 0
     for frame in payload:

@@ -1,4 +1,4 @@
-"""Sockets as all nodes make them, and what is told of connections that come to nothing."""
+"""Sockets of all nodes, and monitors of failed connections."""
 
 import secrets
 import socket as names
@@ -19,34 +19,34 @@ __all__ = ["DOMAIN", "MAX_BYTES", "HandshakeMonitor", "Monitor", "bound", "clien
 
 MAX_BYTES: Final = 16 * 2**20
 DOMAIN: Final = b"ertis"
-"""What connections are let into, as ZAP (ZeroMQ RFC 27) names it."""
+"""ZAP domain (ZeroMQ RFC 27) of all connections."""
 
-_HIGH_WATER = 8  # messages, per peer and direction
-_SPARE_BYTES = 256  # what CURVE adds to a frame, and more
+_HIGH_WATER = 8  # Limit on queued messages, per peer and direction.
+_SPARE_BYTES = 256  # More than CURVE adds to a frame.
 _HANDSHAKE_MS = 3000
-_LONGEST_HANDSHAKE_S = 1e-3 * _HANDSHAKE_MS + 1.0  # and the time until its end is reported
-_SEND_TIMEOUT_MS = 30_000  # without it, TCP repeats what nobody confirms for a quarter of an hour
+_LONGEST_HANDSHAKE_S = 1e-3 * _HANDSHAKE_MS + 1.0  # Includes the time until its end is reported.
+_SEND_TIMEOUT_MS = 30_000  # Without it, TCP resends unacknowledged data for a quarter of an hour.
 _RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000
 _BACKLOG = 512
 _DESCRIPTORS = 8192
-_NO_ACCESS = 400  # of ZAP
+_NO_ACCESS = 400  # Status code of ZAP.
 _HUNG_UP = (
-    "the central node hung up before anything was said; if it wants a key, give --key and --server-key",
-    "the central node hung up: it has another key than --server-key says, or none; give what it has",
+    "the central node closed the connection before the handshake; if it requires a key, give --key and --server-key",
+    "the central node closed the connection: its key differs from --server-key, or it has none; give its actual key",
 )
 _DISAGREE = (
-    "the central node wants a key; give --key and --server-key",
-    "the central node speaks without keys; start it with keys, or leave --key out",
+    "the central node requires a key; give --key and --server-key",
+    "the central node has no keys; start it with keys, or leave out --key",
 )
 _CLIENT_EVENTS = (
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
-# Without EVENT_HANDSHAKE_FAILED_PROTOCOL: libzmq 4.3.5 loses errno while it sends that event, and then keeps a
-# connection for ever whose message cannot be decrypted, instead of closing it.
+# EVENT_HANDSHAKE_FAILED_PROTOCOL is excluded: libzmq 4.3.5 loses errno while it sends that event. It then keeps
+# a connection with an undecipherable message for ever, instead of closing it.
 _SERVER_EVENTS = (
     zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
-_EVENTS_KEPT = 20_000  # an I/O thread that finds more of them waits for them to be read
+_EVENTS_KEPT = 20_000  # An I/O thread with more events waits until they are read.
 _ALL = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # noqa: S104  to be told from others
 
 
@@ -58,7 +58,9 @@ def server(
     max_bytes: int = MAX_BYTES,
     option: str = "--listen",
 ) -> "zmq.Socket[bytes]":
-    """Return a ROUTER that listens; with keys, its context needs a `ertis_numba.network.zap_authenticator.Gate` made before.
+    """Return a ROUTER that listens.
+
+    With keys, its context needs a `ertis_numba.network.zap_authenticator.ZapAuthenticator` made before.
 
     Parameters
     ----------
@@ -67,16 +69,17 @@ def server(
     keys : ServerKeys or None
         None on loopback only.
     max_bytes : int
-        Longest frame. It also bounds what a stranger can have this node keep, so give what is needed.
+        Longest frame. It also bounds the memory that an unauthenticated peer can occupy, so give no more than
+        necessary.
     option : str
-        By which users give the address.
+        Option by which users give the address.
 
     Raises
     ------
     ArgumentError
-        The address cannot be used, or not without keys.
+        The address cannot be used, or requires keys.
     NetworkError
-        It cannot be listened at.
+        Another program uses the address.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -90,15 +93,15 @@ def server(
             made.setsockopt(zmq.CURVE_SERVER, 1)
             made.setsockopt(zmq.CURVE_SECRETKEY, keys.pair.secret.encode())
             made.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
-            made.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, no handler would mean no check
+            made.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # Without it, a missing handler would mean no check.
         made.bind(_own(endpoint))
     except (zmq.ZMQError, OSError) as error:
         made.close(linger=0)
         if isinstance(error, zmq.ZMQError) and error.errno == zmq.EADDRINUSE:
             raise NetworkError(
-                f"{endpoint} cannot be listened at, it is taken by another program; end that or give another {option}"
+                f"{endpoint} is in use by another program; end that program or give another {option}"
             ) from error
-        raise NetworkError(f"{endpoint} cannot be listened at ({error}); give another {option}") from error
+        raise NetworkError(f"cannot listen at {endpoint} ({error}); give another {option}") from error
     except BaseException:
         made.close(linger=0)
         raise
@@ -106,7 +109,7 @@ def server(
 
 
 def bound(socket: "zmq.Socket[bytes]") -> str:
-    """Return where a server listens, as clients of this machine connect to it."""
+    """Return the address of a server, as clients on this machine connect to it."""
     at = str(socket.getsockopt_string(zmq.LAST_ENDPOINT))
     host = addresses.host_of(at)
     return f"tcp://{_ALL[host]}:{at.rpartition(':')[2]}" if host in _ALL else at
@@ -115,9 +118,9 @@ def bound(socket: "zmq.Socket[bytes]") -> str:
 def client(
     context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, max_bytes: int = MAX_BYTES
 ) -> "zmq.Socket[bytes]":
-    """Return a DEALER that connects, and connects again after a connection was lost; a `Monitor` of it knows why.
+    """Return a DEALER that connects and reconnects; a `Monitor` of it reports failures.
 
-    It does not after a server has refused it: who wants to try again makes a new one.
+    It does not reconnect after a refusal: create a new one to try again.
 
     Parameters
     ----------
@@ -131,9 +134,9 @@ def client(
     Raises
     ------
     ArgumentError
-        The address cannot be used, or not without keys.
+        The address cannot be used, or requires keys.
     NetworkError
-        It cannot be connected to, ever.
+        The address can never be connected to.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -147,12 +150,12 @@ def client(
             made.setsockopt(zmq.CURVE_SERVERKEY, keys.server.encode())
             made.setsockopt(zmq.CURVE_PUBLICKEY, keys.pair.public.encode())
             made.setsockopt(zmq.CURVE_SECRETKEY, keys.pair.secret.encode())
-        made.get_monitor_socket(_CLIENT_EVENTS)  # before there is anything to tell
+        made.get_monitor_socket(_CLIENT_EVENTS)  # The monitor must exist before the first event.
         made.connect(endpoint)
     except zmq.ZMQError as error:
         Monitor(made).close()
         made.close(linger=0)
-        raise NetworkError(f"{endpoint} cannot be connected to ({error}); give another address") from error
+        raise NetworkError(f"cannot connect to {endpoint} ({error}); give another address") from error
     except BaseException:
         Monitor(made).close()
         made.close(linger=0)
@@ -161,18 +164,18 @@ def client(
 
 
 def was_chosen(routing_id: bytes) -> bool:
-    """Whether a peer has given itself its routing id, which it then could give to another, too."""
+    """Return True if a peer has chosen its own routing id, which another peer could choose, too."""
     return not routing_id.startswith(b"\0")
 
 
 class _Events:
-    """Events of a socket's connections."""
+    """Connection events of a socket."""
 
     def __init__(self, watched: "zmq.Socket[bytes]", socket: "zmq.Socket[bytes]") -> None:
         self._watched, self.socket = watched, socket
 
     def _events(self) -> Iterator[tuple[int, int]]:
-        """Yield event and value of what has happened since."""
+        """Yield event and value of all new events."""
         while True:
             try:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
@@ -182,19 +185,19 @@ class _Events:
             yield int(event["event"]), int(event["value"])
 
     def close(self) -> None:
-        """End it; close it before the socket that it watches."""
-        with suppress(zmq.ZMQError):  # which may be closed already
+        """Close the monitor; close it before its socket."""
+        with suppress(zmq.ZMQError):  # The socket may be closed already.
             self._watched.disable_monitor()
         self.socket.close(linger=0)
 
 
 class Monitor(_Events):
-    """Says why a client's connection comes to nothing.
+    """Monitor of a client's failed connections.
 
     Attributes
     ----------
     socket : zmq.Socket
-        To be polled; `read` when it can be read.
+        Socket to poll; call `read` when it is readable.
     final : bool
         The client has given up: only a new socket tries again.
     """
@@ -205,7 +208,7 @@ class Monitor(_Events):
         self.final = False
 
     def read(self) -> list[str]:
-        """Return what went wrong since, each once, as lines."""
+        """Return new failures as lines, each once."""
         return list(dict.fromkeys(self._reported(event, value) for event, value in self._events()))
 
     def _reported(self, event: int, value: int) -> str:
@@ -213,14 +216,14 @@ class Monitor(_Events):
         if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             self.final = True
             if value != _NO_ACCESS:
-                return f"the central node cannot check keys now (status {value}); look at its log"
-            return "the central node does not know this key; have it listed there by 'ertis keys allow'"
+                return f"the central node cannot check keys now (status {value}); see its log"
+            return "the central node does not know this key; add it there with 'ertis keys allow'"
         if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
             return _HUNG_UP[with_keys]
         self.final = True
         if value == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
             return _DISAGREE[with_keys]
-        return "what answers does not speak this protocol; give the address of a central node"
+        return "the peer does not use this protocol; give the address of a central node"
 
 
 class HandshakeMonitor(_Events):
@@ -232,7 +235,7 @@ class HandshakeMonitor(_Events):
 
     def __init__(self, server: "zmq.Socket[bytes]") -> None:
         super().__init__(server, _server_monitor(server))
-        self._open: dict[int, float] = {}  # when each connection was accepted, by descriptor
+        self._open: dict[int, float] = {}  # Time of acceptance of each connection, by descriptor.
         self._n_unfinished = self._n_counted = 0
 
     def read(self) -> int:
@@ -244,7 +247,7 @@ class HandshakeMonitor(_Events):
                 self._n_unfinished += 1
             elif event == zmq.EVENT_DISCONNECTED:
                 self._open.pop(value, None)
-            else:  # the peer was let in, or its key was refused
+            else:  # The peer was accepted, or its key was refused.
                 self._n_unfinished -= 1
         n_shaking_hands = sum(now_s - accepted_s < _LONGEST_HANDSHAKE_S for accepted_s in self._open.values())
         found = max(0, self._n_unfinished - n_shaking_hands - self._n_counted)
@@ -252,7 +255,7 @@ class HandshakeMonitor(_Events):
         return found
 
     def discount(self) -> None:
-        """Leave out one connection that fails: that of the server's own self-test."""
+        """Exclude one failed connection: that of the server's own self-test."""
         self._n_counted += 1
 
 
@@ -268,15 +271,15 @@ def _server_monitor(server: "zmq.Socket[bytes]") -> "zmq.Socket[bytes]":
 
 
 def _set(socket: "zmq.Socket[bytes]", endpoint: str, max_bytes: int) -> None:
-    """Set what clients and servers have in common."""
+    """Set the options of both clients and servers."""
     options = {
         zmq.SNDHWM: _HIGH_WATER,
         zmq.RCVHWM: _HIGH_WATER,
         zmq.MAXMSGSIZE: max_bytes + _SPARE_BYTES,
         zmq.LINGER: 0,
         zmq.HANDSHAKE_IVL: _HANDSHAKE_MS,
-        # libzmq 4.3.5 aborts the process when a heartbeat is due on a connection that was closed while its messages
-        # waited to be read. Nodes ping each other, and TCP finds peers that are gone.
+        # libzmq 4.3.5 aborts the process if a heartbeat is due on a closed connection with unread messages. The nodes
+        # send their own pings, and TCP detects lost peers.
         zmq.HEARTBEAT_IVL: 0,
         zmq.TCP_MAXRT: _SEND_TIMEOUT_MS,
         zmq.TCP_KEEPALIVE: 1,
@@ -290,9 +293,9 @@ def _set(socket: "zmq.Socket[bytes]", endpoint: str, max_bytes: int) -> None:
 
 
 def _allow_descriptors() -> None:
-    """Have this process accept more connections than strangers are likely to make.
+    """Let this process accept more connections than unauthenticated peers are likely to open.
 
-    At the usual 1024, a thousand that say nothing would keep everybody else out until they are hung up on.
+    At the usual limit of 1024, a thousand silent connections would block all others until their timeout.
     """
     if sys.platform == "win32":
         return
@@ -305,11 +308,11 @@ def _allow_descriptors() -> None:
 
 
 def _own(endpoint: str) -> str:
-    """Return an address to listen at, of which ZeroMQ wants the host as a number."""
+    """Return an address to listen at, with the numeric host that ZeroMQ requires."""
     host, port = addresses.host_of(endpoint), endpoint.rpartition(":")[2]
     if host == "*" or ":" in host:
         return endpoint
-    if host == "localhost":  # whatever else a file of hosts may say
+    if host == "localhost":  # The file of hosts may map it elsewhere.
         return f"tcp://127.0.0.1:{port}"
     found = names.getaddrinfo(host, None, names.AF_INET, names.SOCK_STREAM)
     return f"tcp://{found[0][4][0]}:{port}"

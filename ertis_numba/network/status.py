@@ -1,4 +1,4 @@
-"""How a central node is: what `ertis status` shows, applications subscribe to, and metrics are made of."""
+"""Status of a central node, for `ertis status`, applications and metrics."""
 
 from collections import deque
 from typing import Annotated, Any, Final, Literal, Self
@@ -23,7 +23,7 @@ _MAX: Final = 2**63 - 1
 
 
 class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
-    """How long something took, of the latest times that it happened; 0 where it never did."""
+    """Percentiles of recent durations; 0 if there are none."""
 
     p50_ms: float = 0.0
     p90_ms: float = 0.0
@@ -32,23 +32,23 @@ class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Latencies:
-    """Collects times, of which the latest count.
+    """Collector of recent durations.
 
     Parameters
     ----------
     size : int
-        How many count.
+        Number of durations to keep.
     """
 
     def __init__(self, size: int = 1024) -> None:
         self._times_ms: deque[float] = deque(maxlen=size)
 
     def add(self, time_ms: float) -> None:
-        """Take a time."""
+        """Add a duration."""
         self._times_ms.append(time_ms)
 
     def percentiles(self) -> Percentiles:
-        """Return what they come to."""
+        """Return the percentiles."""
         ordered = sorted(self._times_ms)
         if not ordered:
             return Percentiles()
@@ -58,11 +58,11 @@ class Latencies:
 
 
 class SensorStatus(msgspec.Struct, kw_only=True):
-    """One sensor, since the central node was started.
+    """Status of one sensor, since the start of the central node.
 
-    ``received`` counts each measurement once, however often it is sent. Where there is processing, each is under way
-    or has become something: ``received = published + sum(dropped.values()) + in_flight``, but for those that a mistake
-    in this package has cost, which is counted as ``refused["internal"]``.
+    ``received`` counts each measurement once, however often it is sent. With processing, ``received = published +
+    sum(dropped.values()) + in_flight``. The only exceptions are measurements lost to an error in this package, which
+    ``refused["internal"]`` counts.
     """
 
     connected: bool = False
@@ -76,39 +76,39 @@ class SensorStatus(msgspec.Struct, kw_only=True):
     in_flight: int = 0
     dropped: dict[str, int] = {}
     missing: dict[str, int] = {}
-    """Sequence numbers that the sensor node, or this one, says to be missing, by reason."""
+    """Sequence numbers reported as missing by the sensor node or this node, by reason."""
     repeated: int = 0
-    """Measurements that came again and were held already."""
+    """Duplicates of stored measurements."""
     conflicts: int = 0
-    """Of those, such that were not the same; both are kept."""
+    """Duplicates with other content; both are kept."""
     queue: int = 0
-    """Waiting for a worker, or for the disk."""
+    """Measurements that wait for a worker or for the disk."""
     image_latency: Percentiles = Percentiles()
-    """From its arrival at this node to the image leaving it."""
+    """Time from the arrival at this node to the departure of the image."""
 
 
 class ArchiveStatus(msgspec.Struct, kw_only=True):
-    """What stores measurements."""
+    """Status of the storage."""
 
     folder: str
     recording: str = ""
-    """That is being written."""
+    """Name of the recording in progress."""
     journal_bytes: int = 0
     free_bytes: int = 0
     room_bytes: int = 0
-    """That can still be stored, about."""
+    """Approximate remaining capacity."""
     sealed: int = 0
     sealing: int = 0
     sealing_failed: int = 0
     set_aside: int = 0
-    """Journals kept under another name, because they are damaged or no recording can hold some of their sensors."""
+    """Journals kept under another name, because they are damaged or a recording cannot hold some of their sensors."""
     commit: Percentiles = Percentiles()
     ack: Percentiles = Percentiles()
-    """From the arrival of a measurement to its ack being sent."""
+    """Time from the arrival of a measurement to its ack."""
 
 
 class WorkerStatus(msgspec.Struct, kw_only=True):
-    """One worker."""
+    """Status of one worker."""
 
     pid: int
     state: Literal["starting", "idle", "busy"]
@@ -116,7 +116,7 @@ class WorkerStatus(msgspec.Struct, kw_only=True):
 
 
 class SubscriberStatus(msgspec.Struct, kw_only=True):
-    """One application node."""
+    """Status of one application node."""
 
     name: str
     products: tuple[str, ...]
@@ -126,27 +126,27 @@ class SubscriberStatus(msgspec.Struct, kw_only=True):
 
 
 class ProcessingStatus(msgspec.Struct, kw_only=True):
-    """What makes images."""
+    """Status of image processing."""
 
     address: str = ""
-    """Where applications subscribe."""
+    """Address for applications."""
     choice: str = ""
-    """How measurements share the cores, and why, in a line."""
+    """Description of the distribution of measurements over cores, with its reason."""
     workers: list[WorkerStatus] = []
     respawned: int = 0
     retried: int = 0
     quarantined: int = 0
     publisher_respawned: int = 0
     publisher_pid: int = 0
-    """Of the process that serves applications; 0 while there is none."""
+    """Identifier of the process that serves applications; 0 while there is none."""
     process_time: Percentiles = Percentiles()
     subscribers: list[SubscriberStatus] = []
     groups: dict[str, int] = {}
-    """Closed groups: ``complete``, and by flag."""
+    """Closed groups: ``complete``, and counts by flag."""
 
 
 class Status(msgspec.Struct, kw_only=True):
-    """A central node."""
+    """Status of a central node."""
 
     version: str
     pid: int
@@ -159,9 +159,9 @@ class Status(msgspec.Struct, kw_only=True):
     memory_bytes: int = 0
     peers: int = 0
     keys: bool = False
-    """Whether nodes have to have keys."""
+    """True if nodes need keys."""
     keys_note: str = ""
-    """Why the list of keys cannot be used, so that nobody is let in."""
+    """Error of the allow list, which keeps all nodes out; empty if there is none."""
     refused: Annotated[dict[str, int], "by reason"] = {}
     sensors: dict[str, SensorStatus] = {}
     archive: ArchiveStatus | None = None
@@ -176,19 +176,19 @@ class Status(msgspec.Struct, kw_only=True):
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """Return what was encoded.
+        """Return the status from MessagePack.
 
         Raises
         ------
         DataError
-            It is no status.
+            The content is not a status.
         """
         try:
             return msgspec.msgpack.decode(data, type=cls)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             reported = " ".join(str(error).split())
             raise DataError(
-                f"a status cannot be read ({reported}); use the same release of ertis-numba on both"
+                f"a status cannot be decoded ({reported}); use the same release of ertis-numba on both"
             ) from error
 
 

@@ -1,4 +1,4 @@
-"""Asks a central node how it is."""
+"""Client that requests the status of a central node."""
 
 import time
 from types import TracebackType
@@ -19,19 +19,19 @@ _AGAIN_S: Final = 0.5
 
 
 class Asking:
-    """Asks a central node how it is, as often as wanted; use it in a ``with`` statement.
+    """Client for the status of a central node; use it in a ``with`` statement.
 
     Parameters
     ----------
     address : str
-        Where it takes measurements in, or where it publishes.
+        Address for sensor nodes or for applications.
     keys : ClientKeys, optional
-        Of an application or an admin.
+        Keys of an application or an admin.
 
     Raises
     ------
     ArgumentError
-        The address cannot be used, or not without keys.
+        The address cannot be used, or requires keys.
     """
 
     def __init__(self, address: str, *, keys: ClientKeys | None = None) -> None:
@@ -54,18 +54,19 @@ class Asking:
         self._context = None
 
     def ask(self, patience_s: float = 3.0) -> Status:
-        """Return how it is.
+        """Return the status.
 
         Parameters
         ----------
         patience_s : float
+            Timeout.
 
         Raises
         ------
         NetworkError
-            Nothing has answered in this time.
+            There was no answer within the timeout.
         RefusedError
-            It does not let this node in, or does not tell it.
+            The central node refuses this node, or its request.
         DataError
             The answer is not of this protocol.
         """
@@ -78,7 +79,7 @@ class Asking:
             poller = zmq.Poller()
             poller.register(socket, zmq.POLLIN)
             poller.register(monitor.socket, zmq.POLLIN)
-            ready = dict(poller.poll(20))  # a connection that is made wakes nobody
+            ready = dict(poller.poll(20))  # A new connection does not wake the poller.
             if socket in ready:
                 answer = _read(socket.recv_multipart())
                 if answer is not None:
@@ -90,13 +91,13 @@ class Asking:
         if why:
             raise RefusedError(f"{self._address}: {why}")
         raise NetworkError(
-            f"{self._address} has not answered for {patience_s:g} s; start a central node there by 'ertis record' or "
-            "'ertis serve', or give its address"
+            f"no answer from {self._address} within {patience_s:g} s; start a central node there with 'ertis "
+            "record' or 'ertis serve', or correct the address"
         )
 
     def _connection(self) -> tuple["zmq.Socket[bytes]", sockets.Monitor]:
         if self._context is None:
-            raise NetworkError("nothing can be asked now; use it in a with statement")
+            raise NetworkError("this client is not open; use it in a with statement")
         if self._socket is None or self._monitor is None:
             self._socket = sockets.client(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)
             self._monitor = sockets.Monitor(self._socket)
@@ -111,7 +112,7 @@ class Asking:
 
 
 def _read(frames: list[bytes]) -> Status | None:
-    """Return a status; None if a message is another."""
+    """Return a status; None for other messages."""
     message = messages.decode(frames[0])
     if isinstance(message, Refused):
         raise RefusedError(message.reason)

@@ -1,4 +1,4 @@
-"""An application node: images, points, measurements and groups as they come."""
+"""Application node that receives images, points, measurements and groups."""
 
 import queue
 import threading
@@ -39,43 +39,42 @@ class _Options(TypedDict, total=False):
 
 
 class Subscriber(Generic[Kind_co]):
-    """Receives what a central node publishes; use it in a ``with`` statement and a loop.
+    """Receiver of a central node's products; use it in a ``with`` statement and a loop.
 
-    ::
-
-        with Subscriber("tcp://127.0.0.1:5602", sensors=["front"], products=["points"]) as subscriber:
-            for cloud in subscriber:
-                print(cloud.stamp.sequence, cloud.position_m.min(axis=0))
-
-    The loop ends when `close` is called, by another thread or a signal's handler. A central node that goes away is
-    connected to again when it is back. What this is too slow for is dropped there, the latest is kept, and how many
-    were dropped is counted.
+    The loop ends when another thread or a signal handler calls `close`. The subscriber reconnects to a central node
+    that was away. The central node drops and counts products for a slow application, and always keeps the latest.
 
     Parameters
     ----------
     address : str
-        Where the central node publishes, ``tcp://HOST:PORT``.
+        Address at which the central node publishes, ``tcp://HOST:PORT``.
     sensors : sequence of str, optional
         All by default.
     products : sequence of {"energyscape", "points", "raw", "group", "status"}
     keys : ClientKeys, optional
         None on loopback only.
     on_note : callable, optional
-        Is called by a thread with lines on what happens to the connection.
+        Called by a thread with a line for each change of the connection.
     credit : int
-        How many products may be under way or wait here; more give a higher rate over a slow connection, and older
-        products to who is slow.
+        Limit on products under way or waiting here. A higher limit gives a higher rate over a slow connection, and
+        older products to a slow application.
 
     Attributes
     ----------
     latest : Arrival or None
-        What came with the product that was received last: its number and times, and where its sensor is.
+        Details of the last received product: its number and times, and the mounting of its sensor.
     counts : SubscriberCounts
 
     Raises
     ------
     ArgumentError
-        The address, a sensor or a product cannot be used, or the address not without keys.
+        The address, a sensor or a product cannot be used, or the address requires keys.
+
+    Examples
+    --------
+    >>> with Subscriber("tcp://127.0.0.1:5602", sensors=["front"], products=["points"]) as subscriber:  # doctest: +SKIP
+    ...     for cloud in subscriber:
+    ...         print(cloud.stamp.sequence, cloud.position_m.min(axis=0))
     """
 
     @overload
@@ -144,16 +143,16 @@ class Subscriber(Generic[Kind_co]):
         for product in given:
             checks.choice("product", product, PRODUCTS)
         if not given:
-            raise ArgumentError(f"products are none; give some of {', '.join(PRODUCTS)}")
+            raise ArgumentError(f"products is empty; give some of {', '.join(PRODUCTS)}")
         named = None if sensors is None else tuple([sensors] if isinstance(sensors, str) else dict.fromkeys(sensors))
         if named is not None and not 0 < len(named) <= _MAX_SENSORS:
-            raise ArgumentError(f"sensors are {len(named)}; give 1 to {_MAX_SENSORS}, or None for all")
+            raise ArgumentError(f"sensors lists {len(named)} names; give 1 to {_MAX_SENSORS}, or None for all")
         for sensor in named or ():
             checks.sensor_name(sensor)
         checks.integer("credit", credit, 1, 64)
         self.latest: Arrival | None = None
         self.counts = SubscriberCounts()
-        # A queue of this kind may be put to by a signal's handler that has come over a thread which is taking.
+        # A signal handler may put to this kind of queue even if it has interrupted a thread that is taking from it.
         self._waiting: queue.SimpleQueue[Arrival | Exception | None] = queue.SimpleQueue()
         self._closed = False
         self._wakeup_socket = WakeupSocket()
@@ -182,33 +181,34 @@ class Subscriber(Generic[Kind_co]):
 
     @property
     def connected(self) -> bool:
-        """Whether a publisher answers."""
+        """Return True if a publisher answers."""
         return self._subscription.connected
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called, after which nothing comes."""
+        """Return True after `close`."""
         return self._closed
 
     def receive(self, timeout_s: float | None = None) -> Kind_co | None:
-        """Return the next product; None after ``timeout_s``, or when this was closed.
+        """Return the next product; None after ``timeout_s``, or once the subscriber is closed.
 
         Parameters
         ----------
         timeout_s : float, optional
-            How long to wait; for ever by default.
+            Time to wait; unlimited by default.
 
         Raises
         ------
         RefusedError
-            The central node has refused this application from the start. Once it was let in, it goes on trying.
+            The central node has refused this application from the start. After a first acceptance, the subscriber keeps
+            trying.
         """
         try:
             arrival = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return None
         if not isinstance(arrival, Arrival):
-            self._waiting.put(arrival)  # for whoever asks next
+            self._waiting.put(arrival)  # The next caller gets it as well.
         if arrival is None or self._closed:
             return None
         if isinstance(arrival, Exception):
@@ -220,7 +220,7 @@ class Subscriber(Generic[Kind_co]):
         return cast("Kind_co", arrival.item)
 
     def close(self) -> None:
-        """End the loop; what was not taken is lost."""
+        """End the loop; waiting products are lost."""
         self._closed = True
         with suppress(queue.Empty):
             while True:
@@ -231,7 +231,7 @@ class Subscriber(Generic[Kind_co]):
             self._thread.join(_STOP_S)
 
     def _run(self) -> None:
-        """Serve the connection until this is closed."""
+        """Serve the connection until `close`."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
         try:
             with self._subscription.within(context):

@@ -1,4 +1,4 @@
-"""What ends the wait of a loop, from another thread."""
+"""Wake-up socket that ends the wait of an event loop from another thread."""
 
 import socket
 from contextlib import suppress
@@ -7,7 +7,7 @@ __all__ = ["WakeupSocket"]
 
 
 class WakeupSocket:
-    """Can be polled for reading, as it has a `fileno`; that ends once somebody calls `wake`."""
+    """Socket pair with a `fileno` to poll; it becomes readable after `wake`."""
 
     def __init__(self) -> None:
         self._wakes, self._woken = socket.socketpair()
@@ -15,21 +15,21 @@ class WakeupSocket:
             end.setblocking(False)  # noqa: FBT003  as the library has it
 
     def fileno(self) -> int:
-        """Return what is polled."""
+        """Return the descriptor to poll."""
         return self._woken.fileno()
 
     def wake(self) -> None:
-        """End the wait of the loop, or the next one."""
-        with suppress(OSError):  # it is full, so that the loop wakes anyhow, or closed
+        """End the current or the next wait of the loop."""
+        with suppress(OSError):  # The socket is full, so that the loop wakes anyhow, or closed.
             self._wakes.send(b"\0")
 
     def clear(self) -> None:
-        """Let the next wait be one again; called by the loop, before it looks for what there is to do."""
+        """Discard pending wake-ups; the loop calls it before it looks for work."""
         with suppress(OSError):
             while self._woken.recv(4096):
                 pass
 
     def close(self) -> None:
-        """Let go of it; nobody is woken any more."""
+        """Close the socket; later calls of `wake` have no effect."""
         self._wakes.close()
         self._woken.close()

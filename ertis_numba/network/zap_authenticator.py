@@ -1,8 +1,8 @@
-"""Who is let in: the keys of connections, and whose message it is.
+"""ZAP authenticator: checks the keys of connections, and attributes messages to keys.
 
-ZeroMQ asks over ZAP (RFC 27) about each key that wants in. CURVE without anybody who answers lets any key in, and a
-handler that has died nobody, or everybody: the one here is served by the loop that serves the sockets, so that it lives
-as long as they do, and whatever goes wrong in it is a no.
+ZeroMQ asks a handler over ZAP (RFC 27) about each new key. Without a handler, CURVE accepts any key; a dead handler
+blocks all keys, or none. This handler runs in the event loop of the sockets, so it lives as long as they do. Any error
+inside it refuses the key.
 """
 
 import secrets
@@ -26,9 +26,9 @@ from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, was_chosen
 __all__ = ["EVERYBODY", "ZapAuthenticator"]
 
 EVERYBODY: Final = Permission(name="loopback", public="0" * 40, role="admin")
-"""Where there are no keys, which is on loopback only."""
+"""Permission of all peers without keys, on loopback only."""
 
-_ADDRESS: Final = "inproc://zeromq.zap.01"  # RFC 27
+_ADDRESS: Final = "inproc://zeromq.zap.01"  # Address of RFC 27.
 _LOOK_S: Final = 0.25
 _AT_ONCE: Final = 64
 _LIST_BYTES: Final = 4_000_000
@@ -41,38 +41,38 @@ _AUTH: Final = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 
 
 class ZapAuthenticator:
-    """Lets in the keys that are listed, and says whose a message is.
+    """Handler that accepts listed keys and identifies the sender of a message.
 
     ::
 
-        gate = Gate(context, keys)                      # before any server
+        gate = ZapAuthenticator(context, keys)          # before any server
         socket = sockets.server(context, address, keys=keys)
-        gate.watch(socket)                              # counts what never came to show a key
+        gate.watch(socket)                              # counts connections without a key
         gate.self_test(sockets.bound(socket))
-        # in the loop: gate.serve() when gate.socket can be read; gate.tick() some times a second;
-        # gate.who(frames) of each message.
+        # in the loop: gate.serve() when gate.socket is readable; gate.tick() several times a second;
+        # gate.who(frames) for each message.
 
     Parameters
     ----------
     context : zmq.Context
     keys : ServerKeys or None
-        None where nodes have no keys; then everybody may do everything.
+        None if nodes have no keys; every peer then has all permissions.
 
     Attributes
     ----------
     socket : zmq.Socket or None
-        To be polled.
+        Socket to poll.
     refused : Counter of str
-        By reason: who was not let in, and messages of those who may not send them, which callers add.
+        Refused connections and messages by reason; callers add refused messages.
     note : str
-        Why the list of keys cannot be used, so that nobody is let in; empty where it can.
+        Error of the allow list, which keeps all nodes out; empty if there is none.
 
     Raises
     ------
     SettingsError
-        The list of keys cannot be read or used.
+        The allow list cannot be read or used.
     ArgumentError
-        There is a gate in this context already.
+        The context has an authenticator already.
     """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: ServerKeys | None) -> None:
@@ -84,7 +84,7 @@ class ZapAuthenticator:
         self._text: bytes | None = None
         self._next_look_s = 0.0
         self._changed = self._doubted = False
-        # A User-Id that did not come from here, whoever may have found a way to send one, is nobody's.
+        # A forged User-Id, however it was sent, has no permissions.
         self._mark = secrets.token_hex(16)
         self.note = ""
         if keys is None:
@@ -99,14 +99,14 @@ class ZapAuthenticator:
             self.socket.bind(_ADDRESS)
         except zmq.ZMQError as error:
             self.close()
-            raise ArgumentError("a context has a gate already; make one for each") from error
+            raise ArgumentError("the context has an authenticator already; create one per context") from error
 
     def watch(self, server: "zmq.Socket[bytes]") -> None:
-        """Count also those whom a server turns away before they have shown a key."""
+        """Also count peers that a server turned away before they presented a key."""
         self._handshakes.append(HandshakeMonitor(server))
 
     def serve(self) -> None:
-        """Answer those who want in; never raises for what they send."""
+        """Answer pending requests; never raises for their content."""
         if self.socket is None:
             return
         for _ in range(_AT_ONCE):
@@ -116,7 +116,7 @@ class ZapAuthenticator:
                 return
             # Routing id, delimiter, version, request, domain, address, identity, mechanism, credentials.
             if len(request) < 4 or request[1] != b"":
-                continue  # nothing that could be answered: whoever it is, waits in vain
+                continue  # It cannot be answered; the peer waits in vain.
             try:
                 user, reason = self._decide(request[2:])
             except Exception as error:  # noqa: BLE001  whatever it is, the answer is no
@@ -124,11 +124,11 @@ class ZapAuthenticator:
             status, text = (b"200", b"OK") if user else (b"400", b"NO ACCESS")
             if not user:
                 self.refused[reason] += 1
-            with suppress(zmq.ZMQError):  # who asked may be gone
+            with suppress(zmq.ZMQError):  # The peer may have disconnected.
                 self.socket.send_multipart([*request[:2], b"1.0", request[3], status, text, user.encode(), b""])
 
     def _decide(self, request: Sequence[bytes]) -> tuple[str, str]:
-        """Return the User-Id of who is let in, or nothing and why."""
+        """Return the User-Id of an accepted key, or nothing and the reason."""
         version, _, domain, _, _, mechanism, *credentials = request
         if version != b"1.0" or domain != DOMAIN or mechanism != b"CURVE":
             return "", _NO_KEY
@@ -138,12 +138,12 @@ class ZapAuthenticator:
         return (self._mark + permission.public, "") if permission else ("", _UNKNOWN_KEY)
 
     def who(self, frames: Sequence[zmq.Frame]) -> Permission | None:
-        """Return what the sender of a message may do by the list as it is now; None, and counted, if nothing.
+        """Return the current permissions of a message's sender; None, and counted, if there are none.
 
         Parameters
         ----------
         frames : sequence of zmq.Frame
-            As received from a ROUTER without copying: the routing id, then the message.
+            Frames from a ROUTER without copying: the routing id, then the message.
         """
         if not frames or was_chosen(frames[0].bytes):
             self.refused["chosen routing id"] += 1
@@ -164,7 +164,7 @@ class ZapAuthenticator:
         return permission
 
     def tick(self) -> bool:
-        """Look at the list again, and count who was turned away; True if the list has changed since it last was."""
+        """Reload the allow list, and count peers that were turned away; return True if the list has changed."""
         for handshakes in self._handshakes:
             if found := handshakes.read():
                 self.refused[_NO_KEY] += found
@@ -173,7 +173,10 @@ class ZapAuthenticator:
         return changed
 
     def _look(self) -> None:
-        """Read the list if it is time; nobody is in one that cannot be read, twice as an editor may be writing it."""
+        """Read the list if due.
+
+        An unreadable list refuses all keys after a second failure, as an editor may be writing it.
+        """
         now_s = time.monotonic()
         if self._keys is None or now_s < self._next_look_s:
             return
@@ -191,21 +194,21 @@ class ZapAuthenticator:
                 self._doubted = True
                 return
             self._allowed, self._text, self._doubted = {}, None, False
-            self.note = str(error) if isinstance(error, SettingsError) else f"{path}: {error}; correct the list of keys"
+            self.note = str(error) if isinstance(error, SettingsError) else f"{path}: {error}; correct the allow list"
         self._changed = self._changed or self._allowed != before
 
     def self_test(self, endpoint: str) -> None:
-        """Try to get in with a key that nobody knows and without any, and see that it fails.
+        """Verify that connections with an unknown key, and without a key, are refused.
 
         Parameters
         ----------
         endpoint : str
-            Where a server of this context listens.
+            Address of a server in this context.
 
         Raises
         ------
         NetworkError
-            It does not fail, or nothing answers.
+            A connection was accepted, or nothing answered.
         """
         if self._keys is None:
             return
@@ -213,7 +216,7 @@ class ZapAuthenticator:
         self._try(endpoint, _UNKNOWN_KEY)
 
     def _try(self, endpoint: str, reason: str) -> None:
-        """See that an attempt to get in fails as it should; it is not counted."""
+        """Verify that one attempt to connect is refused; it is not counted."""
         unknown = reason == _UNKNOWN_KEY
         before, reported, end_s = self.refused.copy(), False, time.monotonic() + _SELF_TEST_S
         if not unknown:
@@ -221,7 +224,8 @@ class ZapAuthenticator:
                 handshakes.discount()
         with zmq.Context(io_threads=1) as context, context.socket(zmq.DEALER) as stranger:
             stranger.setsockopt(zmq.LINGER, 0)
-            stranger.setsockopt(zmq.RECONNECT_IVL, -1)  # once: what the server counts of it is to be taken back
+            # It connects once, so that the server's count can be corrected by one.
+            stranger.setsockopt(zmq.RECONNECT_IVL, -1)
             stranger.setsockopt(zmq.IPV6, int("[" in endpoint))
             if unknown and self._keys is not None:
                 stranger.curve_publickey, stranger.curve_secretkey = zmq.curve_keypair()
@@ -235,22 +239,22 @@ class ZapAuthenticator:
                     while monitor.poll(0):
                         event = int(parse_monitor_message(monitor.recv_multipart())["event"])
                         if event == _SUCCEEDED:
-                            raise NetworkError(f"{endpoint} lets in a node with {reason}; do not use this installation")
-                        # Who finds first that only one has keys hangs up on the other.
+                            raise NetworkError(f"{endpoint} accepts a node with {reason}; do not use this installation")
+                        # Either side may detect first that only one has keys, and close the connection.
                         reported = reported or event in ((_AUTH,) if unknown else (_PROTOCOL, _NO_DETAIL))
                     if reported and not unknown:
                         return
                     if reported and self.refused[reason] > before[reason]:
                         self.refused.subtract([reason])
-                        self.refused += Counter()  # without zeros
+                        self.refused += Counter()  # Removes zeros.
                         return
         raise NetworkError(
-            f"{endpoint} did not refuse a node with {reason} within {_SELF_TEST_S:g} s; start it when the machine is "
-            "less busy"
+            f"{endpoint} did not refuse a node with {reason} within {_SELF_TEST_S:g} s; start it when the "
+            "machine is less busy"
         )
 
     def close(self) -> None:
-        """Let nobody in any more; close it before the sockets that it watches."""
+        """Refuse all keys from now on; close it before its sockets."""
         for handshakes in self._handshakes:
             handshakes.close()
         self._handshakes.clear()
@@ -264,5 +268,5 @@ def _read(path: Path) -> bytes:
     with path.open("rb") as file:
         text = file.read(_LIST_BYTES + 1)
     if len(text) > _LIST_BYTES:
-        raise SettingsError(f"{path} has more than {_LIST_BYTES // 1_000_000} MB; give the list of keys")
+        raise SettingsError(f"{path} exceeds {_LIST_BYTES // 1_000_000} MB; give an allow list")
     return text

@@ -1,4 +1,4 @@
-"""The central node: takes what sensor nodes send, stores it, and hands it on to processing."""
+"""Central node: receives measurements from sensor nodes, stores them and passes them to processing."""
 
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._node import CentralNode

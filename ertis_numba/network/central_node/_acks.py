@@ -1,4 +1,4 @@
-"""Tells nodes what is settled."""
+"""Acknowledgements to sensor nodes."""
 
 import time
 from collections.abc import Callable
@@ -10,46 +10,46 @@ from ertis_numba.network.status import Latencies
 
 __all__ = ["Acks"]
 
-_DROPS: Final = 32  # told in an ack
+_DROPS: Final = 32  # Limit on the drops in one ack.
 
 
 class Acks:
-    """Acks that are due, one of each run, however much of it has settled.
+    """Pending acks, one per session for any number of measurements.
 
     Parameters
     ----------
     send : callable
         Called with a peer and a message to it.
     status : {"stored", "accepted"}
-        What is settled is on the disk, or in memory.
+        Place of acknowledged measurements: on disk, or in memory.
 
     Attributes
     ----------
     latencies : Latencies
-        From the arrival of a measurement to its ack.
+        Time from the arrival of a measurement to its ack.
     """
 
     def __init__(self, send: Callable[[bytes, Message], None], status: Literal["stored", "accepted"]) -> None:
         self._send: Final = send
         self._status: Final = status
-        self._due: dict[tuple[str, int], Stream] = {}  # by sensor and epoch
+        self._due: dict[tuple[str, int], Stream] = {}  # By sensor and session.
         self._arrived_s: list[float] = []
         self.latencies = Latencies()
 
     def owe(self, stream: Stream) -> None:
-        """Have a run acked the next time."""
+        """Schedule an ack of a session."""
         self._due[stream.run] = stream
 
     def acked_through(self, arrived_s: float) -> None:
-        """Count a measurement that the next ack is the first to tell of."""
+        """Count a measurement that the next ack acknowledges."""
         self._arrived_s.append(arrived_s)
 
     def forget(self, stream: Stream) -> None:
-        """Ack a run no more."""
+        """Send no more acks for a session."""
         self._due.pop(stream.run, None)
 
     def send(self) -> None:
-        """Send those that are due."""
+        """Send pending acks."""
         for (sensor, session_id), stream in self._due.items():
             if not stream.owner:
                 continue

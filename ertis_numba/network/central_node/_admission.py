@@ -1,4 +1,4 @@
-"""Who is let greet for what, and which measurements are taken then."""
+"""Admission of sensors and measurements: validation of Hello and Data messages."""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -18,14 +18,14 @@ from ertis_numba.settings import Settings
 
 __all__ = ["entry_in", "require_room", "require_same", "source_in"]
 
-_STREAMS: Final = 64  # of a peer
+_STREAMS: Final = 64  # Limit per peer.
 _SENSORS: Final = 1024
 _PEERS: Final = 1024
 _PEERS_OF_KEY: Final = 64
 
 
 def source_in(hello: Hello, payload: list[bytes], *, max_bytes: int) -> JournalSensor:
-    """Return the sensor of a greeting, or refuse what is none."""
+    """Return the sensor of a hello, or refuse the hello."""
     if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
         raise Unwanted(
             "settings",
@@ -33,7 +33,7 @@ def source_in(hello: Hello, payload: list[bytes], *, max_bytes: int) -> JournalS
             "size",
         )
     if zlib.crc32(payload[0]) != hello.settings_crc32:
-        raise Unwanted("settings", "settings have another CRC-32 than their hello says; send them again", "crc")
+        raise Unwanted("settings", "settings do not match the CRC-32 in their hello; send them again", "crc")
     try:
         return source_of(hello, payload[0], max_bytes=max_bytes)
     except (ArgumentError, OSError) as error:
@@ -47,15 +47,18 @@ def require_room(
     run: SensorSession,
     key: str,
 ) -> None:
-    """Refuse what is one too many; ``peer`` is None where it has not greeted, ``key`` empty where there are none."""
+    """Refuse a peer, session or sensor beyond the limits.
+
+    ``peer`` is None before its hello, ``key`` empty without keys.
+    """
     if peer is None and len(peers) >= _PEERS:
-        raise Unwanted("size", f"this central node has {_PEERS} sensor nodes; use another", "too many")
+        raise Unwanted("size", f"this central node already has {_PEERS} sensor nodes; use another", "too many")
     if peer is None and key and sum(each.key == key for each in peers.values()) >= _PEERS_OF_KEY:
-        raise Unwanted("size", f"{_PEERS_OF_KEY} sensor nodes have this key; give each its own", "too many")
+        raise Unwanted("size", f"{_PEERS_OF_KEY} sensor nodes already use this key; give each its own", "too many")
     if peer is not None and run not in peer.streams and len(peer.streams) >= _STREAMS:
-        raise Unwanted("size", f"a sensor node has {_STREAMS} runs; say bye to those that are over", "too many")
+        raise Unwanted("size", f"a sensor node already has {_STREAMS} sessions; send bye for finished ones", "too many")
     if run.sensor not in tracks and len(tracks) >= _SENSORS:
-        raise Unwanted("size", f"this central node has {_SENSORS} sensors; use another", "too many")
+        raise Unwanted("size", f"this central node already has {_SENSORS} sensors; use another", "too many")
 
 
 def require_same(
@@ -68,20 +71,24 @@ def require_same(
             if stream.run.sensor == source.name and not same(stream.source, source):
                 raise Unwanted(
                     "settings",
-                    f"another sensor node sends sensor {source.name}, with other settings; give each sensor a name of "
-                    "its own, or end the other",
+                    f"another sensor node sends sensor {source.name}, with other settings; give each sensor its "
+                    "own name, or end the other node",
                     "settings",
                 )
 
 
 def entry_in(stream: Stream, data: Data, payload: Sequence[memoryview]) -> Entry:
-    """Return the measurement of a message, or refuse what is none."""
+    """Return the measurement of a message, or refuse the message."""
     source = stream.source
     if len(payload) != 1 or len(payload[0]) != source.n_bytes:
         sizes = ", ".join(str(len(part)) for part in payload[:4]) or "no"
-        raise Unwanted("message", f"a measurement has {sizes} bytes, its settings say {source.n_bytes}", "size")
+        raise Unwanted(
+            "message",
+            f"a measurement has {sizes} bytes, but its settings give {source.n_bytes}; send matching data",
+            "size",
+        )
     if zlib.crc32(payload[0]) != data.crc32:
-        raise Unwanted("message", f"measurement {data.sequence} has another CRC-32 than it says; send again", "crc")
+        raise Unwanted("message", f"measurement {data.sequence} does not match its CRC-32; send it again", "crc")
     try:
         settings = stream.settings(data)
     except ArgumentError as error:

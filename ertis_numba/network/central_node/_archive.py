@@ -1,4 +1,4 @@
-"""Stores measurements: a thread that waits for the disk, so that nobody else does."""
+"""Archive that stores measurements in a thread of its own, so that only this thread waits for the disk."""
 
 import collections
 import queue
@@ -40,25 +40,25 @@ _STUCK_S: Final = 5.0
 
 
 class Archive:
-    """Puts measurements into journals, and lets those become recordings.
+    """Storage of measurements in journals, which become recordings.
 
     Parameters
     ----------
     folder : str or Path
-        It is made where it is missing; no other archive can use it meanwhile.
+        Folder, created if it is missing. Only one archive can use it at a time.
     name : str
-        Of recordings, before the time.
+        Prefix of recording names, before the time.
     rotate_bytes : float
-        Words after which a recording is full.
+        Number of data bytes after which a recording is full.
     rotate_s : float
-        Time after which it is.
+        Duration after which a recording is full.
     seal : bool
-        Make recordings; where False, journals are left to ``ertis recover``.
+        Make recordings; False leaves the journals to ``ertis recover``.
 
     Raises
     ------
     ArgumentError
-        A name that cannot be that of a file, or numbers that are none.
+        The name cannot be a file name, or a number is invalid.
     """
 
     def __init__(
@@ -91,19 +91,21 @@ class Archive:
         self.fault = ""
 
     def open(self) -> int:
-        """Take the folder, take up what a crash has left, and return what to poll: `read` when it can be read.
+        """Open the folder, recover journals left by a crash, and return a descriptor to poll.
+
+        Call `read` when it is readable.
 
         Raises
         ------
-        InUseError
-            Another process has the folder, or a journal of it that this one has to know.
+        JournalInUseError
+            Another process uses the folder, or a journal in it that this archive needs.
         DataError
-            It cannot be written, or what is in it not be read.
+            The folder is not writable, or its content cannot be read.
         """
         try:
             make_folder(self.folder)
         except OSError as error:
-            raise DataError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
+            raise DataError(f"{self.folder}: {error.strerror}; give a writable folder") from error
         self._lock = Lock(self.folder)
         try:
             self._journal_store = JournalStore(self.folder, self._name, Ledger(self.folder), self._emit_event)
@@ -119,15 +121,15 @@ class Archive:
         return self._wakeup_socket.fileno()
 
     def acked_through(self, run: SensorSession) -> int:
-        """Return the number up to which all of a run is stored or known to be missing; -1 if there is none."""
+        """Return the number up to which a session is stored or known to be missing; -1 if there is none."""
         return -1 if self._journal_store is None else self._journal_store.acked_through.get(run, -1)
 
     def offer(self, item: ReceivedItem) -> None:
-        """Have something stored; returns at once."""
+        """Queue an item to be stored; never blocks."""
         self._queue.put(item)
 
     def read(self) -> list[Event]:
-        """Return what has happened since; returns at once."""
+        """Return new events; never blocks."""
         if self._wakeup_socket is not None:
             self._wakeup_socket.clear()
         found = []
@@ -137,16 +139,16 @@ class Archive:
 
     @property
     def stuck(self) -> str:
-        """Why it will not say that anything fails, or works; empty where it would."""
+        """Reason why the archive reports nothing any more; empty while it works."""
         since_s = self._busy_since_s
         if self._thread is not None and not self._thread.is_alive() and not self._ends:
-            return "what stores measurements has ended by a mistake in it; start the central node again"
+            return "the storage thread has ended because of an internal error; start the central node again"
         if since_s is not None and time.monotonic() - since_s > _STUCK_S:
             return "the disk does not answer"
         return ""
 
     def status(self) -> ArchiveStatus:
-        """Return how it is; returns at once, with numbers that are half a second old."""
+        """Return the status without blocking, with numbers up to half a second old."""
         sealing = self._sealing
         if sealing is None:
             return replace(self._snapshot)
@@ -159,7 +161,7 @@ class Archive:
         )
 
     def finish(self, timeout_s: float) -> bool:
-        """Store what was offered, end the thread, and return whether that was done in time."""
+        """Store queued items, end the thread, and return True if that took no longer than the timeout."""
         if self._thread is None:
             return True
         self._ends = True
@@ -170,7 +172,7 @@ class Archive:
         return not self._thread.is_alive()
 
     def close(self) -> None:
-        """Finish, make recordings of all that is stored, and let others have the folder."""
+        """Finish, make recordings of all stored measurements, and release the folder."""
         if self._sealing is not None:
             self._sealing.hurry()
         finished = self.finish(30.0)
@@ -197,7 +199,7 @@ class Archive:
         while True:
             items, ends = self._next()
             if items and not self._store(journal_store, items):
-                ends = True  # without them: nobody was told that they are stored
+                ends = True  # No ack was sent for the remaining items.
             self._tend(journal_store, ends=ends)
             if ends:
                 break
@@ -205,7 +207,7 @@ class Archive:
         self._attempt(journal_store.close)
 
     def _next(self) -> tuple[list[ReceivedItem], bool]:
-        """Return what to store together, and whether that was the last."""
+        """Return the items to store together, and True if they are the last."""
         items: list[ReceivedItem] = []
         n_bytes = 0
         try:
@@ -221,7 +223,7 @@ class Archive:
         return items, True
 
     def _store(self, journal_store: JournalStore, items: list[ReceivedItem]) -> bool:
-        """Store items, as often as it takes; False where it was ended before."""
+        """Store items, repeating after errors; return False if the archive was closed before."""
         while not self._attempt(lambda: journal_store.store(items)):
             if self._stop.wait(_AGAIN_S):
                 return False
@@ -229,7 +231,7 @@ class Archive:
         return True
 
     def _tend(self, journal_store: JournalStore, *, ends: bool) -> None:
-        """Let journals that are full become recordings."""
+        """Seal full journals."""
         volume = journal_store.volume
         full = volume is not None and (
             volume.n_bytes >= self._rotate_bytes or time.monotonic() - volume.begun_s >= self._rotate_s
@@ -240,14 +242,14 @@ class Archive:
     def _hand_on(self, journal_store: JournalStore, *, rotate: bool, ends: bool) -> None:
         if rotate:
             journal_store.rotate()
-            if not ends:  # what comes next begins a journal, for which the ledger is written anyway
+            if not ends:  # The next item begins a journal, and the ledger is written then.
                 return
         for path in journal_store.hand_on():
             if self._sealing is not None:
                 self._sealing.give(path)
 
     def _attempt(self, act: Callable[[], None]) -> bool:
-        """Do something with the disk; whatever comes of it, this thread goes on."""
+        """Run a disk operation; this thread survives any error of it."""
         begun_s = self._busy_since_s = time.monotonic()
         try:
             act()
@@ -266,7 +268,7 @@ class Archive:
         return True
 
     def _look(self) -> None:
-        """Note how much room there is, where that was not just done."""
+        """Update the free space, unless it was updated recently."""
         now_s = time.monotonic()
         if now_s < self._next_look_s or self._journal_store is None:
             return
@@ -280,6 +282,6 @@ class Archive:
                 made.recording = volume.path.name.removesuffix(SUFFIX)
                 made.journal_bytes = volume.path.stat().st_size
                 made.room_bytes = volume.journal.room()
-        except (OSError, DataError, ArgumentError):  # storing tells what is wrong
+        except (OSError, DataError, ArgumentError):  # Storing raises the specific error.
             pass
         self._snapshot = made

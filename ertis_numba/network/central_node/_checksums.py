@@ -9,18 +9,15 @@ from ertis_numba.network.central_node._received_items import SensorSession
 
 __all__ = ["Checksums"]
 
-_KEPT: Final = 65_536  # about 15 MB
-_LEARNED: Final = 1024  # of a journal that a crash has left
-_TAIL: Final = 16  # of each run: what a sensor node may have under way
+_KEPT: Final = 65_536  # Takes about 15 MB.
+_LEARNED: Final = 1024  # Number of newest measurements of a journal left by a crash.
+_TAIL: Final = 16  # Per session: the largest window of a sensor node.
 
 
 class Checksums:
-    """CRC-32 of the newest measurements by run and number.
+    """CRC-32 of the newest measurements by session and number.
 
     Parameters
-    ----------
-    tails : mapping of Run to dict of int to int
-        CRC-32 by run and number, from earlier processes.
     """
 
     def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:
@@ -45,7 +42,7 @@ class Checksums:
             self.add(SensorSession(sensor, session_id), number, crc32)
 
     def tails(self, runs: Iterable[SensorSession]) -> dict[SensorSession, dict[int, int]]:
-        """Return the CRC-32 of the newest measurements of some runs, for the next process."""
+        """Return the CRC-32 of the newest measurements of given sessions, for the next process."""
         found: dict[SensorSession, dict[int, int]] = {run: {} for run in runs}
         for (run, number), crc32 in reversed(self._kept.items()):
             if run in found and len(found[run]) < _TAIL:

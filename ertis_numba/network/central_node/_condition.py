@@ -1,4 +1,4 @@
-"""How a central node is: what it does, why it cannot store anything, and its status."""
+"""State and status of a central node."""
 
 import os
 import socket as names
@@ -17,30 +17,30 @@ from ertis_numba.network.status import Status
 
 __all__ = ["Condition"]
 
-_REPORT_S: Final = 0.2  # that a status may be old which somebody asks for
+_REPORT_S: Final = 0.2  # Maximum age of a requested status.
 _VERSION: Final = version("ertis-numba")
 
 
 class Condition:
-    """How a central node is.
+    """State and status of a central node.
 
     Parameters
     ----------
     listen : str
-        As it was given.
-    server_socket : Door
+        Requested address.
+    server_socket : ServerSocket
     intake : Intake
     archive : Archive or None
     images : Guarded or None
     keys : bool
-        Whether it has any.
+        True if the node has keys.
 
     Attributes
     ----------
     begun_s : float
-        When it was opened, by `time.monotonic`.
+        Time of opening, by `time.monotonic`.
     fault : str
-        What the archive has told last; empty where it can store.
+        Latest error of the archive; empty while it can store.
     closing : bool
     """
 
@@ -63,12 +63,12 @@ class Condition:
 
     @property
     def address(self) -> str:
-        """What it listens at, with its port; empty where it does not listen yet."""
+        """Actual address, with its port; empty before the node listens."""
         return self._server.address and addresses.at_port(self._listen, self._server.address)
 
     @property
     def state(self) -> State:
-        """What it does at present."""
+        """Current state."""
         if self.closing:
             return "closing"
         if self.trouble:
@@ -77,11 +77,11 @@ class Condition:
 
     @property
     def trouble(self) -> str:
-        """Why nothing can be stored at present; empty where it can."""
+        """Current reason why nothing can be stored; empty while storing works."""
         return self.fault or ("" if self._archive is None else self._archive.stuck)
 
     def status(self) -> Status:
-        """Return how it is."""
+        """Return the status."""
         status = Status(
             version=_VERSION,
             pid=os.getpid(),
@@ -106,7 +106,7 @@ class Condition:
         return status
 
     def report(self) -> bytes:
-        """Return a status as it is sent, made once for all who ask at about the same time."""
+        """Return the encoded status; requests within a short time share it."""
         now_s = time.monotonic()
         if now_s - self._report[0] > _REPORT_S:
             self._report = now_s, self.status().encode()

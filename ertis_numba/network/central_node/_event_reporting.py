@@ -1,4 +1,4 @@
-"""What a central node tells of itself while it runs, each thing once."""
+"""Events of a running central node, each reported once."""
 
 import time
 from collections import Counter
@@ -11,18 +11,18 @@ from ertis_numba.network.central_node._received_items import ReceivedItem
 
 __all__ = ["Telling", "text_of"]
 
-_LOG_INTERVAL_S: Final = 1.0  # between two events about mistakes
+_LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 
 
 class Telling:
-    """Makes events of what has changed.
+    """Reporter of changes as events.
 
     Parameters
     ----------
     on_event : callable
         Called with each event.
     on_stored : callable, optional
-        Called with sensor, epoch, sequence and CRC-32 of measurements that are durable.
+        Called with sensor, session_id, sequence and CRC-32 of stored measurements.
     """
 
     def __init__(
@@ -34,19 +34,19 @@ class Telling:
         self._next_internal_s = 0.0
 
     def notify(self, event: str, **reported: Any) -> None:
-        """Tell of an event."""
-        with suppress(OSError):  # who listened may be gone: measurements are taken all the same
+        """Report an event."""
+        with suppress(OSError):  # The listener may be gone; measurements are received all the same.
             self._on_event({"event": event} | reported)
 
     def stored(self, items: list[ReceivedItem]) -> None:
-        """Tell of measurements that are durable."""
+        """Report measurements that are on disk."""
         if self._on_stored is not None:
-            with suppress(OSError):  # the same
+            with suppress(OSError):  # The listener may be gone.
                 for item in items:
                     self._on_stored(item.run.sensor, item.run.session_id, item.first, getattr(item.what, "crc32", 0))
 
     def sealed(self, sealed: Sealed) -> None:
-        """Tell of a journal that has become a recording."""
+        """Report a journal that has become a recording."""
         self.notify(
             "sealed",
             recording=None if sealed.recording is None else str(sealed.recording),
@@ -56,14 +56,14 @@ class Telling:
         )
 
     def internal(self, error: Exception) -> None:
-        """Tell of a mistake in this package, but not all the time."""
+        """Report an internal error, at most once per interval."""
         now_s = time.monotonic()
         if now_s >= self._next_internal_s:
             self._next_internal_s = now_s + _LOG_INTERVAL_S
             self.notify("internal", text=text_of(error))
 
     def fault(self, text: str) -> None:
-        """Tell why nothing can be stored, if that is new; ``text`` is empty where it can."""
+        """Report a new reason why nothing can be stored; ``text`` is empty once storing works again."""
         before, self._fault = self._fault, text
         if text and text != before:
             self.notify("fault", text=text)
@@ -71,13 +71,13 @@ class Telling:
             self.notify("resumed")
 
     def keys(self, note: str) -> None:
-        """Tell why the list of keys cannot be used, if that is new; ``note`` is empty where it can."""
+        """Report a new error of the allow list; ``note`` is empty once the list can be used again."""
         if note != self._note:
             self._note = note
-            self.notify("keys", text=note or "the list of keys can be used again")
+            self.notify("keys", text=note or "the allow list can be used again")
 
     def refused(self, counts: Counter[str]) -> None:
-        """Tell what was refused since."""
+        """Report new refusals."""
         now = counts.copy()
         for reason, count in (now - self._refused).items():
             self.notify("refused", reason=reason, count=count)
@@ -85,5 +85,5 @@ class Telling:
 
 
 def text_of(error: Exception) -> str:
-    """Return what an error is, in a line."""
+    """Return an error as one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,4 +1,4 @@
-"""What makes images, as the central node sees it; whatever goes wrong in it, measurements are taken all the same."""
+"""Interface of image processing to the central node, whose errors never stop the intake."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -17,7 +17,7 @@ _Result = TypeVar("_Result")
 
 
 class ImageCounts(Protocol):
-    """What became of one sensor's measurements."""
+    """Counts of one sensor's measurements."""
 
     published: int
     dropped: Counter[str]
@@ -27,54 +27,54 @@ class ImageCounts(Protocol):
 
 
 class ImageProducer(Protocol):
-    """What makes images, as `ertis_numba.network.processing.Processing` does."""
+    """Interface of image processing, implemented by `ertis_numba.network.processing.ImageProcessing`."""
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Applications that were refused, by reason."""
+        """Refused applications, by reason."""
 
     def start(self, stopping: Callable[[], bool]) -> None:
         """Start; return early once ``stopping`` returns True."""
 
     def register(self, hello: Hello, settings: Settings) -> None:
-        """Take note of a sensor."""
+        """Register a sensor."""
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Take a measurement, whose words nobody changes any more; returns at once."""
+        """Accept a measurement, whose data must not change any more; never blocks."""
 
     def fds(self) -> Iterable[int]:
-        """Return what to poll."""
+        """Return the descriptors to poll."""
 
     def ready(self, fd: int) -> None:
-        """Read from one of them."""
+        """Read from a descriptor."""
 
     def tick(self, now_s: float) -> None:
-        """Do what is due."""
+        """Do periodic work."""
 
     def counts(self, sensor: str) -> Any:
-        """Return what became of a sensor's measurements."""
+        """Return the counts of a sensor's measurements."""
 
     def drain_dropped(self) -> list[tuple[str, int, int, str]]:
-        """Return what was dropped since: sensor, epoch, sequence and why of each."""
+        """Return new drops: sensor, session_id, sequence and reason of each."""
 
     def status(self) -> ProcessingStatus:
-        """Return how it is."""
+        """Return the status."""
 
     def publish_status(self, status: Status) -> None:
-        """Let applications know."""
+        """Publish the status to applications."""
 
     def close(self, timeout_s: float) -> None:
-        """End."""
+        """Close."""
 
 
 class Guarded:
-    """Images, whose mistakes are told and cost measurements at most; a `Viewer`.
+    """Image processing whose errors are reported and cost measurements at most; a `Viewer`.
 
     Parameters
     ----------
-    images : Images
+    images : ImageProducer
     on_error : callable
-        Called with what was raised.
+        Called with the exception.
     """
 
     def __init__(self, images: ImageProducer, on_error: Callable[[Exception], None]) -> None:
@@ -92,35 +92,35 @@ class Guarded:
         self._images.start(stopping)
 
     def register(self, hello: Hello, settings: Settings) -> None:
-        """Take note of a sensor."""
+        """Register a sensor."""
         self._try(lambda: self._images.register(hello, settings), None)
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Take a measurement."""
+        """Accept a measurement."""
         self._try(lambda: self._images.offer(data, words, arrived_ns), None)
 
     def fds(self) -> list[int]:
-        """Return what to poll."""
+        """Return the descriptors to poll."""
         return self._try(lambda: list(self._images.fds()), [])
 
     def ready(self, fd: int) -> None:
-        """Read from one of them."""
+        """Read from a descriptor."""
         self._try(lambda: self._images.ready(fd), None)
 
     def tick(self, now_s: float) -> None:
-        """Do what is due."""
+        """Do periodic work."""
         self._try(lambda: self._images.tick(now_s), None)
 
     def drain_dropped(self) -> list[tuple[str, int, int, str]]:
-        """Return what was dropped since."""
+        """Return new drops."""
         return self._try(self._images.drain_dropped, [])
 
     def refused(self) -> Counter[str]:
-        """Return applications that were refused, by reason."""
+        """Return refused applications, by reason."""
         return self._try(lambda: Counter(self._images.refused), Counter())
 
     def fill(self, status: Status) -> None:
-        """Put into a status what it has to say."""
+        """Add the state of processing to a status."""
         self._try(lambda: self._fill(status), None)
 
     def _fill(self, status: Status) -> None:
@@ -132,9 +132,9 @@ class Guarded:
             sensor.image_latency = counts.latency
 
     def publish_status(self, status: Status) -> None:
-        """Let applications know."""
+        """Publish the status to applications."""
         self._try(lambda: self._images.publish_status(status), None)
 
     def close(self, timeout_s: float) -> None:
-        """End."""
+        """Close."""
         self._try(lambda: self._images.close(timeout_s), None)

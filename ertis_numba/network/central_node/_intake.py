@@ -1,4 +1,4 @@
-"""Takes measurements in: what comes next of each run, what is settled, and who has to hear of it."""
+"""Intake of measurements: order within each session, acknowledgements, and notifications."""
 
 import time
 from collections import OrderedDict
@@ -19,34 +19,34 @@ from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
 
 __all__ = ["Intake"]
 
-_LEFT_KEPT: Final = 4096  # runs that nobody sends any more
-_WAITING_BYTES: Final = 64_000_000  # of a peer
+_LEFT_KEPT: Final = 4096  # Limit on inactive sessions.
+_WAITING_BYTES: Final = 64_000_000  # Limit per peer.
 _ALL_WAITING_BYTES: Final = 512_000_000
 _SILENT_S: Final = 4.0
 _NEVER: Final = "never reached the central node"
 
 
 class Intake:
-    """Takes what greeted nodes send, each number once and in order.
+    """Receiver of measurements from greeted nodes, each number once and in order.
 
     Parameters
     ----------
     store : Store or None
-        None where nothing is stored: what is taken is settled then.
+        None if nothing is stored; accepted measurements are then acknowledged at once.
     viewer : Viewer or None
     send : callable
         Called with a peer and a message to it.
     notify : callable
-        Called with the name of an event and what there is to say about it.
+        Called with the name of an event and its fields.
     on_stored : callable
-        Called with items that are durable.
+        Called with stored items.
     max_bytes : int
-        Longest measurement.
+        Size of the largest accepted measurement.
 
     Attributes
     ----------
-    tracks : dict of str to Track
-    peers : dict of bytes to Peer
+    tracks : dict of str to SensorTrack
+    peers : dict of bytes to PeerConnection
     acks : Acks
     """
 
@@ -66,17 +66,17 @@ class Intake:
         self._streams: dict[SensorSession, Stream] = {}
         self._left: OrderedDict[SensorSession, int] = (
             OrderedDict()
-        )  # what was settled, or shown, where the store does not know
+        )  # Numbers that were acknowledged or shown, unknown to the store.
         self._waiting_bytes = 0
         self._sharing = Sharing(notify)
         self.tracks: dict[str, SensorTrack] = {}
         self.peers: dict[bytes, PeerConnection] = {}
         self.acks = Acks(send, "accepted" if store is None else "stored")
 
-    # What comes from nodes
+    # Messages from nodes
 
     def read(self, hello: Hello, payload: list[bytes]) -> JournalSensor:
-        """Return the sensor of a greeting; any thread may call this.
+        """Return the sensor of a hello; any thread may call this.
 
         Raises
         ------
@@ -86,21 +86,21 @@ class Intake:
         return source_in(hello, payload, max_bytes=self._max_bytes)
 
     def greet(self, peer_id: bytes, hello: Hello, source: JournalSensor, key: str = "") -> Stream:
-        """Take a greeting, and return the run.
+        """Accept a hello, and return the session.
 
         Parameters
         ----------
         peer_id : bytes
         hello : Hello
-        source : Sensor
-            As `read` returns it.
+        source : JournalSensor
+            Sensor from `read`.
         key : str
-            Of the peer; there are fewer peers of each key than of all.
+            Key of the peer; the number of peers per key is limited more strictly than the number of peers.
 
         Raises
         ------
         Unwanted
-            It cannot be taken.
+            The hello cannot be accepted.
         """
         run = SensorSession(hello.sensor, hello.session_id)
         peer = self.peers.get(peer_id)
@@ -112,7 +112,7 @@ class Intake:
         if stream is None:
             stream = self._streams[run] = self._begin(run, source, hello)
         before, stream.owner = stream.owner, peer_id
-        if before != peer_id and before in self.peers:  # a node that has come back, before it was missed
+        if before != peer_id and before in self.peers:  # The node has reconnected before it was missed.
             self._leave(before, self.peers[before], stream)
         stream.use(source)
         stream.begins = max(stream.begins, hello.next_sequence)
@@ -143,7 +143,7 @@ class Intake:
         )
 
     def _reach(self, stream: Stream) -> None:
-        """Note that what the node does not have any more has never come."""
+        """Register numbers as missing that the node does not have any more."""
         if stream.begins > stream.taken + 1:
             first, last = stream.taken + 1, stream.begins - 1
             self._take_gap(stream, NotedGap(stream.run.sensor, first, last, _NEVER, stream.run.session_id))
@@ -152,17 +152,17 @@ class Intake:
         peer = self.peers.get(peer_id)
         stream = None if peer is None else peer.streams.get(SensorSession(message.sensor, message.session_id))
         if peer is None or stream is None:
-            raise Unwanted("hello", f"sensor {message.sensor} is not known here; say hello first", "hello")
+            raise Unwanted("hello", f"sensor {message.sensor} is not registered here; send hello first", "hello")
         peer.heard_s = time.monotonic()
         return stream
 
     def measure(self, peer_id: bytes, data: Data, payload: list[memoryview], arrived_ns: int) -> None:
-        """Take a measurement.
+        """Accept a measurement.
 
         Raises
         ------
         Unwanted
-            It cannot be taken.
+            The measurement cannot be accepted.
         """
         stream = self._stream(peer_id, data)
         entry, source = entry_in(stream, data, payload), stream.source
@@ -177,7 +177,7 @@ class Intake:
         else:
             stream.remember(data.sequence, data.crc32)
             self._take(stream, item)
-            if data.sequence > stream.shown:  # it may have to be sent again, which does not make it another one
+            if data.sequence > stream.shown:  # A repeated transmission is not a new measurement.
                 stream.shown = data.sequence
                 stream.track.took(source.n_bytes, item.arrived_s)
                 if self._viewer is not None:
@@ -190,7 +190,7 @@ class Intake:
         return bytes_ <= max(_WAITING_BYTES, item.n_bytes) and self._waiting_bytes <= _ALL_WAITING_BYTES
 
     def _again(self, stream: Stream, item: ReceivedItem, data: Data) -> None:
-        """Take note of a measurement whose number was taken before."""
+        """Process a measurement whose number was accepted before."""
         known = stream.recent.get(data.sequence)
         if self._store is None or known == data.crc32 or not self._has_room(stream.owner, item):
             stream.track.repeated += 1
@@ -206,12 +206,12 @@ class Intake:
         self._wait(item, stream)
 
     def miss(self, peer_id: bytes, gap: Gap) -> None:
-        """Take note of numbers that no measurement has.
+        """Register missing numbers.
 
         Raises
         ------
         Unwanted
-            It cannot be taken.
+            The gap cannot be accepted.
         """
         stream = self._stream(peer_id, gap)
         self._reach(stream)
@@ -255,7 +255,7 @@ class Intake:
         self._store.offer(item)
 
     def ping(self, peer_id: bytes) -> None:
-        """Note that a node is alive; it is to hear again what it may have missed."""
+        """Register that a node is alive, and schedule acks that it may have missed."""
         peer = self.peers.get(peer_id)
         if peer is not None:
             peer.heard_s = time.monotonic()
@@ -264,17 +264,17 @@ class Intake:
                     self.acks.owe(stream)
 
     def remark(self, peer_id: bytes) -> str:
-        """Return what a node should know, a line; empty where there is nothing."""
+        """Return a remark for a node, one line; empty if there is none."""
         return self._sharing.remark(self.peers.get(peer_id))
 
     def bye(self, peer_id: bytes) -> None:
-        """Forget a node."""
+        """Remove a node."""
         peer = self.peers.pop(peer_id, None)
         for stream in list(peer.streams.values()) if peer is not None else ():
             self._leave(peer_id, peer, stream)
 
     def _leave(self, peer_id: bytes, peer: PeerConnection | None, stream: Stream) -> None:
-        """Forget that a run comes from a peer."""
+        """Detach a session from a peer."""
         if peer is not None:
             peer.streams.pop(stream.run, None)
         if peer is None or not any(run.sensor == stream.run.sensor for run in peer.streams):
@@ -287,7 +287,7 @@ class Intake:
         self._forget(stream)
 
     def _forget(self, stream: Stream) -> None:
-        """Drop what nobody will ask for."""
+        """Discard the state of old sessions."""
         if stream.owner or stream.taken != stream.acked_through:
             return
         self.acks.forget(stream)
@@ -301,15 +301,15 @@ class Intake:
             self.tracks.pop(stream.run.sensor, None)
 
     def tick(self, now_s: float) -> None:
-        """Forget nodes that are silent, and tell of sensors that several send."""
+        """Remove silent nodes, and report sensors that several nodes send."""
         for peer_id in [peer_id for peer_id, peer in self.peers.items() if now_s - peer.heard_s > _SILENT_S]:
             self.bye(peer_id)
         self._sharing.tick(self.tracks, self.peers)
 
-    # What comes from the archive
+    # Results from the archive
 
     def stored(self, event: Stored) -> None:
-        """Take note of what is durable."""
+        """Process stored items."""
         for item in event.items:
             stream = self._done(item)
             track = self.tracks.setdefault(item.run.sensor, SensorTrack())
@@ -328,7 +328,7 @@ class Intake:
             self._on_stored([item for item in event.items if isinstance(item.what, Entry)])
 
     def twin(self, event: Twin) -> None:
-        """Take note of a number that has come again."""
+        """Process a duplicate."""
         stream = self._done(event.item)
         track = self.tracks.setdefault(event.item.run.sensor, SensorTrack())
         track.repeated += 1
@@ -340,11 +340,11 @@ class Intake:
             self.acks.owe(stream)
 
     def forgotten(self, item: ReceivedItem, reason: str) -> None:
-        """Have an item sent again."""
+        """Request an item again."""
         stream = self._done(item)
         if stream is None:
             return
-        if item.turn == stream.turn:  # otherwise it is on its way again
+        if item.turn == stream.turn:  # Otherwise it is under way again.
             stream.go_back()
         self.acks.owe(stream)
         if reason and stream.owner:
@@ -366,12 +366,12 @@ class Intake:
         return stream
 
     def dropped(self, drops: Iterable[tuple[str, int, int, str]]) -> None:
-        """Take note of what processing has thrown away: sensor, epoch, sequence and why of each."""
+        """Register measurements discarded by processing: sensor, session_id, sequence and reason of each."""
         for sensor, session_id, sequence, reason in drops:
             stream = self._streams.get(SensorSession(sensor, session_id))
             if stream is not None:
                 stream.dropped.append((sequence, reason))
 
     def acknowledge(self) -> None:
-        """Tell nodes what is settled, where that is due."""
+        """Send acks that are due."""
         self.acks.send()

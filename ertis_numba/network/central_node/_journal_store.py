@@ -1,4 +1,4 @@
-"""The journals of a folder, and how far each run is settled in them."""
+"""Journal store: the journals of a folder, and the acknowledged numbers of each session."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -29,36 +29,36 @@ _TWINS_KEPT: Final = 4096
 
 
 class JournalStore:
-    """What is stored, and what is still to be: knows of each number whether it is.
+    """Journals that store each item once and in order.
 
-    Nothing in it is done twice, and nothing out of order: an item is stored only if it follows what is settled.
+    An item is stored only if it follows the acknowledged ones.
 
     Parameters
     ----------
     folder : Path
-        It is locked.
+        Locked folder.
     name : str
-        Of recordings.
+        Prefix of recording names.
     ledger : Ledger
-        Of the folder.
+        Ledger of the folder.
     notify : callable
-        Called with what has happened.
+        Called with events.
 
     Attributes
     ----------
-    acked_through : dict of Run to int
-        The number up to which all of a run is stored or known to be missing.
+    acked_through : dict of SensorSession to int
+        Number up to which a session is stored or known to be missing.
     volume : Volume or None
-        That is being written.
+        Journal in use.
     to_hand_on : list of Path
-        Journals that are to be sealed.
+        Journals to seal.
 
     Raises
     ------
-    InUseError
-        Somebody has a journal whose content has to be known.
+    JournalInUseError
+        Another process uses a journal whose content is needed.
     DataError
-        What is in the folder cannot be read.
+        The content of the folder cannot be read.
     """
 
     def __init__(self, folder: Path, name: str, ledger: Ledger, notify: Callable[[Event], None]) -> None:
@@ -71,13 +71,13 @@ class JournalStore:
         self._known_twins: dict[tuple[SensorSession, int, int], None] = {}
         self._unsealed: set[str] = set(ledger.unsealed)
         self._unrecorded = UnrecordedGaps(ledger.gaps)
-        self._failed: list[Volume] = []  # closed, and not yet given up durably
-        self._is_saved = False  # whether the ledger has what journals hold that are to be handed on
+        self._failed: list[Volume] = []  # Closed, but not yet durably abandoned.
+        self._is_saved = False  # True once the ledger contains the content of the journals to hand on.
         self.to_hand_on: list[Path] = []
         self._take_up()
 
     def _take_up(self) -> None:
-        """Learn what journals hold that a crash has left; they are to be sealed."""
+        """Read journals that a crash has left, and queue them for sealing."""
         damage = self._ledger.damage
         if damage:
             self._emit_event(Remark(damage))
@@ -92,17 +92,17 @@ class JournalStore:
             if (self._folder / name).exists():
                 self._retire(self._folder / name)
         if damage:
-            with suppress(OSError, DataError):  # otherwise the same is done at the next start
+            with suppress(OSError, DataError):  # Otherwise the next start repeats it.
                 self._save(open_=[])
 
     def _learn(self, path: Path) -> None:
-        """Learn what a journal holds, or the recording that somebody has made of it meanwhile."""
+        """Read a journal, or the recording that another process has made of it meanwhile."""
         recording = path.with_name(path.name.removesuffix(SUFFIX))
         if path.exists():
             with Journal.open(path) as journal:
                 self._settle(runs_of(journal))
                 self._unrecorded.learn(journal)
-                if "_conflicts" not in path.name:  # whose measurements come second under their numbers
+                if "_conflicts" not in path.name:  # Conflicting measurements are the second ones under their numbers.
                     self._checksums.learn(journal)
                 if journal.damage:
                     self._emit_event(Remark(f"the log of {path.name} was damaged; measurements lost: {journal.damage}"))
@@ -114,23 +114,23 @@ class JournalStore:
             self._grow(run, last)
 
     def _grow(self, run: SensorSession, last: int) -> None:
-        """Raise the mark of a run, which is then the newest."""
-        self.acked_through[run] = max(last, self.acked_through.get(run, -1))  # others read it meanwhile
+        """Raise the acknowledged number of a session, which becomes the newest."""
+        self.acked_through[run] = max(last, self.acked_through.get(run, -1))  # Other threads read it meanwhile.
         self._by_age.pop(run, None)
         self._by_age[run] = None
 
     def store(self, items: list[ReceivedItem]) -> None:
-        """Make items durable and tell of them; after an error, call it again with the same ones.
+        """Store items durably and report them; after an error, call it again with the same ones.
 
         Raises
         ------
         Exception
-            The disk fails. What was told of is durable, and the rest of the items is not lost.
+            The disk fails. Reported items are durable, and the other items are not lost.
         """
         try:
             self._abandon_failed()
             self._store(items)
-        except DiskFullError:  # nothing was written, so the journals are sound
+        except DiskFullError:  # Nothing was written, so the journals are sound.
             self._free_logs()
             raise
         except Exception:
@@ -139,7 +139,7 @@ class JournalStore:
 
     def _store(self, items: list[ReceivedItem]) -> None:
         batch: list[ReceivedItem] = []
-        ahead: dict[SensorSession, int] = {}  # settled, once the batch is
+        ahead: dict[SensorSession, int] = {}  # Acknowledged once the batch is stored.
 
         def flush() -> None:
             self._append(batch)
@@ -154,7 +154,7 @@ class JournalStore:
                 self._store_twin(item)
                 continue
             last = ahead.get(item.run, self.acked_through.get(item.run, -1))
-            if item.last <= last:  # a commit that seemed to fail had not
+            if item.last <= last:  # A commit that seemed to fail had succeeded.
                 self._report_stored([item], 0.0)
             elif item.first != last + 1:
                 self._send_back(item)
@@ -171,18 +171,19 @@ class JournalStore:
         self._emit_event(Forgotten(item, reason))
 
     def _fit(self, item: ReceivedItem, flush: Callable[[], None]) -> None:
-        """Make sure of a journal that an item can go into."""
+        """Ensure that a journal for an item is open."""
         if self.volume is not None and not self.volume.fits(item):
             flush()
             self.rotate()
         if self.volume is None:
             name = journal_name(self._folder, self._name, taken=self._unsealed)
-            self._save(open_=[name])  # before there is such a file: what a crash leaves of it is found
+            # The ledger lists the journal before it exists, so that a crash leaves no unlisted journal.
+            self._save(open_=[name])
             self.volume = Volume.create(self._folder / name)
         self.volume.register(item.source)
 
     def _append(self, batch: list[ReceivedItem]) -> None:
-        """Store measurements, or gaps, in one transaction; by themselves where that cannot be."""
+        """Store measurements, or gaps, in one transaction; one by one if that fails."""
         if not batch or self.volume is None:
             return
         begun_s = time.monotonic()
@@ -192,7 +193,8 @@ class JournalStore:
             if len(batch) == 1:
                 self._send_back(batch[0], " ".join(str(error).split()))
                 return
-            for item in batch:  # the others must not suffer for one that nothing can hold, but those that follow it
+            # One item that no journal can hold must not affect the others, except those that follow it.
+            for item in batch:
                 if item.first == self.acked_through.get(item.run, -1) + 1:
                     self._append([item])
                 else:
@@ -214,7 +216,7 @@ class JournalStore:
         self._emit_event(Stored(items, took_ms))
 
     def _store_twin(self, item: ReceivedItem) -> None:
-        """Store a measurement with a settled number as a conflict, unless it equals the stored one."""
+        """Store a duplicate with other content as a conflict; discard equal ones."""
         if not isinstance(item.what, Entry):
             return
         key = (item.run, item.first, item.what.crc32 or 0)
@@ -245,7 +247,7 @@ class JournalStore:
 
     @property
     def _open(self) -> list[str]:
-        """Names of journals that hold more than the ledger says."""
+        """Names of journals that contain more than the ledger."""
         volumes = [*self._failed, *([] if self.volume is None else [self.volume])]
         return [volume.path.name for volume in volumes]
 
@@ -259,12 +261,12 @@ class JournalStore:
         self._is_saved = True
 
     def rotate(self) -> None:
-        """Begin new recordings with what comes next.
+        """Begin new recordings with the next item.
 
         Raises
         ------
         Exception
-            A journal that has failed still does; it is taken up at the next start.
+            A failed journal still fails; the next start recovers it.
         """
         self._abandon_failed()
         volumes, self.volume, self._twins = (self.volume, self._twins), None, None
@@ -274,7 +276,7 @@ class JournalStore:
 
     def _retire_volume(self, volume: Volume) -> None:
         self._retire(volume.path)
-        with suppress(DataError):  # what was committed is there, whatever happens now
+        with suppress(DataError):  # Committed items are safe, regardless of errors here.
             self._unrecorded.learn(volume.journal)
         with suppress(DataError):
             volume.close()
@@ -285,12 +287,12 @@ class JournalStore:
         self._is_saved = False
 
     def hand_on(self) -> list[Path]:
-        """Return journals that can be sealed: the ledger has durably what they hold.
+        """Return journals that can be sealed, once the ledger durably contains their content.
 
         Raises
         ------
         DataError, OSError
-            It cannot be written; call this again.
+            The ledger cannot be written; call this again.
         """
         if not self._is_saved:
             self._save(open_=self._open)
@@ -298,7 +300,7 @@ class JournalStore:
         return found
 
     def _free_logs(self) -> None:
-        """Give the room of logs back: on a small disk it is what the next measurements need."""
+        """Free the space of logs, which the next measurements need on a small disk."""
         try:
             for volume in (self.volume, self._twins):
                 if volume is not None:
@@ -307,7 +309,7 @@ class JournalStore:
             self._fail()
 
     def _fail(self) -> None:
-        """Close the journals that are written: after a failed sync, what they show may never reach the disk."""
+        """Close the open journals: after a failed sync, their visible content may never reach the disk."""
         volumes, self.volume, self._twins = (self.volume, self._twins), None, None
         for volume in volumes:
             if volume is not None:
@@ -330,7 +332,7 @@ class JournalStore:
                 Journal.abandon(volume.path, acked)
                 if volume.acked:
                     self._retire(volume.path)
-            else:  # somebody took it away, or has sealed it
+            else:  # It was removed, or sealed by another process.
                 self._learn(volume.path)
             del self._failed[0]
 

@@ -1,4 +1,4 @@
-"""What a folder holds of each run, in a small file: journals and recordings need not be there to know it."""
+"""Ledger of a folder: a small file with its sessions, readable without the journals and recordings."""
 
 import contextlib
 import os
@@ -26,8 +26,8 @@ __all__ = ["Ledger", "Lock", "read_acked_through"]
 
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
-_VERSION: Final = 3  # 1 had no gaps, 2 had no checksums
-_RUNS_KEPT: Final = 64  # of each sensor
+_VERSION: Final = 3  # Version 1 had no gaps, version 2 no checksums.
+_RUNS_KEPT: Final = 64  # Limit per sensor.
 _ALL_RUNS_KEPT: Final = 16_384
 
 
@@ -71,7 +71,7 @@ _Line: TypeAlias = _Begin | _AckedSession | _Open | _Unsealed | _Gap | _Tail | _
 
 
 class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """Content of versions 1 and 2: one JSON object; numbers by sensor and epoch, which is text."""
+    """Content of versions 1 and 2: one JSON object; numbers by sensor and session, which is text."""
 
     version: Annotated[int, msgspec.Meta(ge=1, le=2)] = 2
     acked_through: dict[str, dict[str, int]] = msgspec.field(name="settled", default_factory=dict)
@@ -81,10 +81,10 @@ class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class Ledger:
-    """The highest settled number of each run of a folder, durable.
+    """Durable record of the highest acknowledged number of each session of a folder.
 
-    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader leaves out
-    entries with a wrong CRC-32. The file keeps only the newest 64 runs of each sensor.
+    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader omits
+    entries with a wrong CRC-32. The file keeps only the newest 64 sessions of each sensor.
 
     Parameters
     ----------
@@ -93,22 +93,22 @@ class Ledger:
     Attributes
     ----------
     is_new : bool
-        There was none.
+        The file did not exist.
     damage : str
-        Entries that were left out, and the consequence; empty if the file is sound.
-    acked_through : dict of Run to int
-        The run that grew last comes last.
+        Omitted entries, and the consequence; empty if the file is sound.
+    acked_through : dict of SensorSession to int
+        The session that grew last comes last.
     open, unsealed : list of str
-        Names of journals that may hold more than is in ``acked_through``, and of those that are to be sealed.
-    gaps : list of Gap
-        What is missing, and no recording tells yet.
-    tails : dict of Run to dict of int to int
-        CRC-32 of the newest measurements of runs, by number.
+        Names of journals that may contain more than ``acked_through``, and of those to seal.
+    gaps : list of JournalGap
+        Missing numbers that no recording contains yet.
+    tails : dict of SensorSession to dict of int to int
+        CRC-32 of the newest measurements of sessions, by number.
 
     Raises
     ------
     DataError
-        It cannot be read.
+        The file cannot be read.
     FormatVersionError
         A newer version wrote it.
     """
@@ -129,11 +129,11 @@ class Ledger:
         try:
             content = self._path.read_bytes()
         except OSError as error:
-            raise DataError(f"{self._path}: {error.strerror}; allow reading it") from error
+            raise DataError(f"{self._path}: {error.strerror}; make it readable") from error
         if content.startswith(b"{"):
             try:
                 self._read_old(msgspec.json.decode(content, type=_Old))
-            except (msgspec.MsgspecError, ValueError):  # also texts that are no UTF-8
+            except (msgspec.MsgspecError, ValueError):  # This includes text that is not UTF-8.
                 self._note_damage("it cannot be read")
             return
         lines = content.split(b"\n")[:-1]
@@ -169,7 +169,7 @@ class Ledger:
         match entry:
             case _Begin(version) if version > _VERSION:
                 raise FormatVersionError(
-                    f"{self._path} has version {version}, this package reads {_VERSION}; update ertis-numba"
+                    f"{self._path} has version {version}, but this package reads {_VERSION}; update ertis-numba"
                 )
             case _AckedSession(sensor, session_id, last):
                 self.acked_through[SensorSession(sensor, session_id)] = last
@@ -197,21 +197,21 @@ class Ledger:
         gaps: Sequence[JournalGap] = (),
         tails: Mapping[SensorSession, Mapping[int, int]] | None = None,
     ) -> None:
-        """Replace what is in the file; when this returns, it is durable.
+        """Replace the content of the file durably.
 
         Parameters
         ----------
-        acked_through : mapping of Run to int
-            The run that grew last comes last. Of those that grew first, only the newest of each sensor are kept.
+        acked_through : mapping of SensorSession to int
+            The session that grew last comes last. Only the newest sessions of each sensor are kept.
         open_, unsealed : iterable of str
-        gaps : sequence of Gap
-        tails : mapping of Run to dict of int to int, optional
-            CRC-32 of the newest measurements of each run.
+        gaps : sequence of JournalGap
+        tails : mapping of SensorSession to dict of int to int, optional
+            CRC-32 of the newest measurements of each session.
 
         Raises
         ------
         OSError, DataError
-            It cannot be written; the old content stays.
+            The file cannot be written; the old content stays.
         """
         kept = _newest(acked_through)
         opened, left = list(open_), list(unsealed)
@@ -234,10 +234,10 @@ class Ledger:
 
 
 def _newest(acked_through: Mapping[SensorSession, int]) -> dict[SensorSession, int]:
-    """Return the newest runs of each sensor, in their order.
+    """Return the newest sessions of each sensor, in their order.
 
-    A run that is forgotten does harm only if its sensor comes back with it after so many others: numbers whose ack it
-    has missed are then stored a second time.
+    A discarded session matters only if its sensor resumes it after that many others: numbers whose ack the node has
+    missed are then stored a second time.
     """
     counts: Counter[str] = Counter()
     kept: list[SensorSession] = []
@@ -254,7 +254,7 @@ def _encoded(line: _Line) -> bytes:
 
 
 def _decoded(line: bytes) -> _Line:
-    """Return an entry; a `ValueError` if it is not what was written."""
+    """Return an entry; raise a `ValueError` if it is damaged."""
     check, _, text = line.partition(b" ")
     if check != b"%08x" % zlib.crc32(text):
         raise ValueError("wrong CRC-32")
@@ -265,14 +265,14 @@ _LINES: Final[msgspec.json.Decoder[_Line]] = msgspec.json.Decoder(_Line)
 
 
 class Lock:
-    """Keeps a folder for one process; it ends with the process, however that ends.
+    """Lock of a folder for one process; it ends with the process.
 
     Raises
     ------
-    InUseError
-        Another process has it.
+    JournalInUseError
+        Another process has locked the folder.
     DataError
-        The folder cannot be written.
+        The folder is not writable.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -280,7 +280,7 @@ class Lock:
         try:
             self._descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         except OSError as error:
-            raise DataError(f"{path}: {error.strerror}; give a folder that can be written") from error
+            raise DataError(f"{path}: {error.strerror}; give a writable folder") from error
         try:
             if sys.platform == "win32":
                 msvcrt.locking(self._descriptor, msvcrt.LK_NBLCK, 1)
@@ -289,11 +289,11 @@ class Lock:
         except OSError as error:
             os.close(self._descriptor)
             raise JournalInUseError(
-                f"{folder} is in use by another central node; give a folder of its own to each, or end the other"
+                f"{folder} is in use by another central node; give each its own folder, or end the other"
             ) from error
 
     def release(self) -> None:
-        """Let others have the folder; to release it twice does no harm."""
+        """Release the folder; releasing twice is harmless."""
         if self._descriptor >= 0:
             with contextlib.suppress(OSError):
                 os.close(self._descriptor)
@@ -301,12 +301,12 @@ class Lock:
 
 
 def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
-    """Return the highest settled number of each run in recordings, read by a process of its own.
+    """Return the highest acknowledged number of each session in recordings, read by a separate process.
 
     Raises
     ------
     DataError
-        One cannot be read.
+        A recording cannot be read.
     """
     paths = [str(path) for path in recordings]
     if not paths:
@@ -315,7 +315,7 @@ def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)  # noqa: S603  our own
     if done.returncode:
         stated = done.stderr.decode(errors="backslashreplace").strip().splitlines() or ["nothing"]
-        raise DataError(f"recordings cannot be looked at ({stated[-1]}); move those that are damaged elsewhere")
+        raise DataError(f"recordings cannot be read ({stated[-1]}); move damaged ones elsewhere")
     acked_through: dict[SensorSession, int] = {}
     for sensor, session_id, last in msgspec.json.decode(done.stdout, type=list[tuple[str, int, int]]):
         run = SensorSession(sensor, session_id)

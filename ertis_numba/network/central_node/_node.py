@@ -1,4 +1,4 @@
-"""The loop of the central node: it waits for nobody but for whoever sends something."""
+"""Event loop of the central node; never blocks on a peer."""
 
 import os
 import threading
@@ -53,43 +53,43 @@ from ertis_numba.network.status import Status
 __all__ = ["CentralNode"]
 
 MAX_BYTES: Final = 4 * 2**20
-_TURN: Final = 32  # messages, before something else has its turn
+_TURN: Final = 32  # Limit on messages before other work has its turn.
 _TICK_S: Final = 0.1
-_LOG_INTERVAL_S: Final = 1.0  # between two events about what was refused
+_LOG_INTERVAL_S: Final = 1.0  # Interval between events about refusals.
 _STATUS_S: Final = 1.0
 _FINISH_S: Final = 5.0
 
 
 class CentralNode:
-    """Takes what sensor nodes send; use it in a ``with`` statement, and `run` it.
+    """Receiver of sensor nodes' measurements; use it in a ``with`` statement, and call `run`.
 
     Parameters
     ----------
     listen : str
-        Where sensor nodes find it, as ``tcp://HOST:PORT``.
+        Address for sensor nodes, ``tcp://HOST:PORT``.
     keys : ServerKeys, optional
-        Needed on addresses that other machines can reach.
+        Required for addresses that other machines can reach.
     archive : Archive, optional
-        What stores measurements; then an ack says that they are.
-    processing : Images, optional
-        What makes images of them.
+        Storage of measurements; acks then confirm storage.
+    processing : ImageProducer, optional
+        Processing of measurements into images.
     max_bytes : int
-        Longest measurement that is taken.
+        Size of the largest accepted measurement.
     window : int
-        Measurements of a run that may be under way.
+        Limit on unacknowledged measurements of a session.
     on_event : callable, optional
-        Called with each event, a dict whose ``event`` says which: listening, joined, left, fault, resumed, sealed,
-        unsealed, conflict, refused, shared (two nodes send one sensor), keys (how the list of keys is), internal (a
-        mistake in this package).
+        Called with each event, a dict with the key ``event``: listening, joined, left, fault, resumed, sealed,
+        unsealed, conflict, refused, shared (two nodes send one sensor), keys (state of the allow list), internal (an
+        internal error).
     on_stored : callable, optional
-        Called with measurements that are durable: sensor, epoch, sequence and CRC-32 of each.
+        Called with stored measurements: sensor, session_id, sequence and CRC-32 of each.
 
     Attributes
     ----------
     address : str
-        Where it listens, as nodes of this machine connect to it.
+        Actual address, in the form that nodes on this machine use.
     latest : Status
-        How it was a moment ago; for other threads than that of `run`.
+        Recent status, for threads other than that of `run`.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class CentralNode:
         self._next_tick_s = self._next_log_s = self._next_status_s = 0.0
         self.latest = self.status()
 
-    # Its life
+    # Life cycle
 
     def __enter__(self) -> Self:
         self._condition.begun_s = time.monotonic()
@@ -160,8 +160,8 @@ class CentralNode:
         self.latest = self.status()
 
     def close(self) -> None:
-        """Take nothing more in, and make recordings of what is stored; closing twice does no harm."""
-        with ExitStack() as stack:  # whatever fails, the rest is closed
+        """Stop receiving, and make recordings of all stored measurements; closing twice is harmless."""
+        with ExitStack() as stack:  # Any error leaves no part open.
             stack.callback(self._note_status)
             if self._archive is not None:
                 stack.callback(self._hear)
@@ -173,11 +173,11 @@ class CentralNode:
             self._telling.refused(self._server.refused)
 
     def stop(self) -> None:
-        """End `run` within a tenth of a second, or the wait for processes at the start of ``with``; from any thread."""
+        """End `run` within a tenth of a second, or the start of processes in ``with``; any thread may call this."""
         self._stopping.set()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Receive measurements until `stop` is called, and then wait until they are durable.
+        """Receive measurements until `stop` is called, and then wait until they are on disk.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class CentralNode:
             The central node is not open, or the time is not above zero.
         """
         if not self._server.is_open and not self._stopping.is_set():
-            raise ArgumentError("a central node is not open; use it in a with statement")
+            raise ArgumentError("the central node is not open; use it in a with statement")
         end_s = None if duration_s is None else time.monotonic() + checks.positive("duration", duration_s)
         while not self._stopping.is_set() and (end_s is None or time.monotonic() < end_s):
             self._turn()
@@ -202,10 +202,10 @@ class CentralNode:
             self._hear()
             self._intake.acknowledge()
 
-    # The loop
+    # Event loop
 
     def _turn(self) -> None:
-        """Wait for something, and do what it asks."""
+        """Wait for an event, and process it."""
         poller = zmq.Poller()
         self._server.register(poller)
         others = set() if self._images is None else set(self._images.fds())
@@ -239,12 +239,12 @@ class CentralNode:
             self._handle(frames)
 
     def _internal(self, error: Exception) -> None:
-        """Count a mistake in this package, and tell of it."""
+        """Count and report an internal error."""
         self._server.refused["internal"] += 1
         self._telling.internal(error)
 
     def _handle(self, frames: list[zmq.Frame]) -> None:
-        """Do what a message asks, or answer why not; never raises for a message."""
+        """Process a message or refuse it; never raises for a message."""
         arrived_ns = time.monotonic_ns()
         sender = frames[0].bytes
         message: Message | None = None
@@ -254,7 +254,7 @@ class CentralNode:
                 # The server socket counts messages of keys that are not listed.
                 self._greetings.forget(sender)
                 self._intake.bye(sender)
-                reason = "this key is not listed (any more); have it listed"
+                reason = "this key is not in the allow list; add it"
                 self._server.send(sender, Refused(code="role", reason=reason))
                 return
             message = read(frames)
@@ -266,12 +266,14 @@ class CentralNode:
             self._note_peer(frames)
 
     def _fail(self, sender: bytes, error: Exception, message: Message | None) -> None:
-        """Answer a message that failed, so that its sender does not wait in vain."""
+        """Answer a failed message, so that its sender does not wait in vain."""
         if isinstance(error, Unwanted):
             self._refuse(sender, error, message)
             return
         self._internal(error)
-        text = f"the central node has made a mistake ({text_of(error)}); send it again, and report it"
+        text = (
+            f"the central node has an internal error ({text_of(error)}); send the message again, and report the error"
+        )
         self._server.send(sender, Unwanted("message", text, "internal").answer(message or Bye()))
 
     def _note_peer(self, frames: list[zmq.Frame]) -> None:
@@ -283,7 +285,7 @@ class CentralNode:
         self._server.send(sender, error.answer(message or Bye()))
 
     def _answer_greeting(self, greeting: Greeting) -> None:
-        """Accept or refuse a greeting; never raises for a greeting."""
+        """Accept or refuse a hello; never raises for a hello."""
         try:
             self._greet(greeting)
         except Exception as error:  # noqa: BLE001  as in _handle
@@ -292,10 +294,10 @@ class CentralNode:
             self._note_peer(greeting.frames)
 
     def _greet(self, greeting: Greeting) -> None:
-        """Accept or refuse a greeting whose settings were read."""
+        """Accept or refuse a hello whose settings were read."""
         if isinstance(greeting.result, Exception):
             raise greeting.result
-        if greeting.result is None or self._server.who(greeting.frames) is None:  # its key was removed meanwhile
+        if greeting.result is None or self._server.who(greeting.frames) is None:  # Its key was removed meanwhile.
             return
         sender, hello = greeting.peer_id, greeting.hello
         stream = self._intake.greet(sender, hello, greeting.result, greeting.key)
@@ -332,7 +334,7 @@ class CentralNode:
                 self._server.send(sender, Report(), self._condition.report())
 
     def _hear(self) -> None:
-        """Take note of what the archive has done."""
+        """Process the results of the archive."""
         for event in () if self._archive is None else self._archive.read():
             match event:
                 case Stored():
@@ -373,18 +375,18 @@ class CentralNode:
             self._next_log_s = now_s + _LOG_INTERVAL_S
             self._telling.refused(self._server.refused)
 
-    # What is told of it
+    # Properties
 
     @property
     def address(self) -> str:
-        """Where it listens, as nodes of this machine connect to it."""
+        """Actual address, in the form that nodes on this machine use."""
         return self._server.address
 
     @property
     def state(self) -> State:
-        """What it does at present."""
+        """Current state."""
         return self._condition.state
 
     def status(self) -> Status:
-        """Return how it is."""
+        """Return the status."""
         return self._condition.status()

@@ -1,4 +1,4 @@
-"""Reads what comes: messages of this protocol, of who may send them."""
+"""Decoding of messages, with checks of their senders' roles."""
 
 from typing import Final
 
@@ -16,7 +16,7 @@ _TAKEN: Final = (Hello, Data, Gap, Ping, Bye, AskStatus)
 
 
 def read(frames: list[zmq.Frame]) -> Message:
-    """Return the message in frames, or refuse what is none."""
+    """Return the message in frames, or refuse invalid ones."""
     if len(frames) < 2:
         raise Unwanted("message", "a message is empty; send a header", "message")
     try:
@@ -28,18 +28,22 @@ def read(frames: list[zmq.Frame]) -> Message:
     if isinstance(message, Subscribe):
         raise Unwanted(
             "message",
-            "sensors send to this address; give the one that 'ertis serve' prints as publish, where images are",
+            "this address is for sensor nodes; applications use the address that 'ertis serve' prints as publish",
             "message",
         )
     return message
 
 
 def require_role(who: Permission, message: Message) -> None:
-    """Refuse what its sender may not say."""
+    """Refuse a message that its sender's role does not allow."""
     if isinstance(message, AskStatus):
         if not who.may_receive:
-            raise Unwanted("role", f"key {who.name} is a sensor's, which may not ask for the status", "role")
+            raise Unwanted("role", f"key {who.name} has the role sensor, which may not request the status", "role")
     elif who.may_receive and who.role != "admin":
-        raise Unwanted("role", f"key {who.name} is an application's, which may not send measurements", "role")
+        raise Unwanted("role", f"key {who.name} has the role application, which may not send measurements", "role")
     if isinstance(message, Hello | Data | Gap) and not who.may_send(message.sensor):
-        raise Unwanted("serial", f"key {who.name} may not speak for sensor {message.sensor}; allow it", "serial")
+        raise Unwanted(
+            "serial",
+            f"key {who.name} may not send for sensor {message.sensor}; allow it with 'ertis keys allow'",
+            "serial",
+        )

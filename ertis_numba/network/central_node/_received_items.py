@@ -1,4 +1,4 @@
-"""What goes from the loop to the archive, and what comes back."""
+"""Items that the event loop sends to the archive, and the archive's results."""
 
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
@@ -19,11 +19,11 @@ __all__ = [
     "Twin",
 ]
 
-_OVERHEAD: Final = 2048  # of an item and what belongs to it, beside the words
+_OVERHEAD: Final = 2048  # Memory of an item in addition to its data.
 
 
 class SensorSession(NamedTuple):
-    """A sensor's run, whose numbers settle in order."""
+    """Session of a sensor, whose numbers are acknowledged in order."""
 
     sensor: str
     session_id: int
@@ -31,26 +31,26 @@ class SensorSession(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class ReceivedItem:
-    """Something to be stored.
+    """Item to store.
 
     Attributes
     ----------
-    run : Run
+    run : SensorSession
     first, last : int
-        Numbers that are settled once it is stored.
-    what : Entry or Gap
-    source : Sensor
-        As the journal is to know it.
+        Numbers acknowledged once it is stored.
+    what : Entry or JournalGap
+    source : JournalSensor
+        Sensor for the journal.
     arrived_s : float
-        By `time.monotonic`.
+        Time of arrival, by `time.monotonic`.
     owner : bytes
         Peer that sent it.
     turn : int
-        Rises where a run has to be sent again; what was taken before is none of it any more.
+        Number of the transmission: rises if a session has to be sent again, which invalidates earlier items.
     again : bool
-        The number was settled before: stored only if it is another measurement than that.
+        The number was acknowledged before: stored only if the measurement differs.
     done : bool
-        It was told what has become of it.
+        Its result was reported.
     """
 
     run: SensorSession
@@ -66,13 +66,13 @@ class ReceivedItem:
 
     @property
     def n_bytes(self) -> int:
-        """Memory that it takes, about."""
+        """Approximate memory of the item."""
         return _OVERHEAD + (self.what.measurement.data.nbytes if isinstance(self.what, Entry) else 0)
 
 
 @dataclass(slots=True)
 class Stored:
-    """Items that are durable."""
+    """Items stored durably."""
 
     items: list[ReceivedItem]
     took_ms: float
@@ -80,7 +80,7 @@ class Stored:
 
 @dataclass(slots=True)
 class Forgotten:
-    """An item that was not stored; its sender has to send it again."""
+    """Item that was not stored; its sender has to send it again."""
 
     item: ReceivedItem
     reason: str = ""
@@ -88,7 +88,7 @@ class Forgotten:
 
 @dataclass(slots=True)
 class Twin:
-    """An item whose number was settled before; whether it was another measurement, which is kept, too."""
+    """Duplicate of an acknowledged number; ``True`` if its content differs and is kept, too."""
 
     item: ReceivedItem
     differs: bool
@@ -115,7 +115,7 @@ class SealedOne:
 
 @dataclass(slots=True)
 class SealingFailed:
-    """A journal has not become a recording yet."""
+    """A journal could not be sealed yet."""
 
     text: str
 

@@ -1,4 +1,4 @@
-"""Who the intake has to do with, and how it says no."""
+"""Interfaces that the intake uses, and its refusals."""
 
 from typing import Any, Protocol
 
@@ -14,16 +14,16 @@ __all__ = ["Store", "Unwanted", "Viewer"]
 
 
 class Unwanted(Exception):  # noqa: N818  it is an answer
-    """A message that is not taken.
+    """Refused message.
 
     Parameters
     ----------
     code : str
         As in `ertis_numba.network.messages.Refused`.
     reason : str
-        The line to be told.
+        Reason for the sender, in one line.
     kind : str
-        By which it is counted.
+        Category in the counts.
     """
 
     def __init__(self, code: Any, reason: str, kind: str) -> None:
@@ -31,26 +31,26 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
         self.code, self.kind = code, kind
 
     def answer(self, about: Message) -> Refused:
-        """Return what to tell the sender."""
+        """Return the answer to the sender."""
         sensor, session_id = getattr(about, "sensor", ""), getattr(about, "session_id", 0)
         return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, session_id=session_id)
 
 
 class Store(Protocol):
-    """What makes measurements durable."""
+    """Interface to durable storage."""
 
     def acked_through(self, run: SensorSession) -> int:
-        """Return how far a run is settled."""
+        """Return the number up to which a session is acknowledged."""
 
     def offer(self, item: ReceivedItem) -> None:
-        """Have something stored; returns at once."""
+        """Queue an item to be stored; never blocks."""
 
 
 class Viewer(Protocol):
-    """What is shown measurements that are new."""
+    """Interface to consumers of new measurements."""
 
     def register(self, hello: Hello, settings: Settings) -> None:
-        """Take note of a sensor."""
+        """Register a sensor."""
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Take a measurement, whose words nobody changes any more; returns at once."""
+        """Accept a measurement, whose data must not change any more; never blocks."""

@@ -1,4 +1,4 @@
-"""Journals that are full become recordings, beside what goes on."""
+"""Sealing of full journals, in parallel to the intake."""
 
 import queue
 import shutil
@@ -14,41 +14,44 @@ from ertis_numba.journal import SUFFIX, Sealed, seal_apart
 __all__ = ["Sealing"]
 
 _AGAIN_S: Final = 5.0
-"""Until a journal that could not be sealed is tried again; twice as long after each time, …"""
+"""Delay before a failed journal is sealed again; doubled after each failure, …"""
 
 _LATEST_S: Final = 300.0
-"""… but not longer than this."""
+"""… up to this limit."""
 
 _RESTS: Final = 4.0
-"""Times as long as a step: sealing beside ingest takes a fifth of the disk's time, and what is left grows, …"""
+"""Rest after each step of sealing, relative to its duration.
+
+Sealing then takes a fifth of the disk's time, and the backlog grows, …
+"""
 
 _FEW_RESTS: Final = 0.5
-"""… until it takes up more than …"""
+"""… until the backlog exceeds …"""
 
 _SHARE: Final = 0.25
-"""… this share of the room that is free."""
+"""… this share of the free space."""
 
 
 class Sealing:
-    """A thread that seals one journal after the other, each in a process of its own.
+    """Thread that seals one journal after the other, each in a separate process.
 
     Parameters
     ----------
     on_sealed : callable
         Called in the thread.
     on_failed : callable
-        Called in the thread with a line about why.
+        Called in the thread with a line on the reason.
 
     Attributes
     ----------
     sealed, failed, set_aside : int
-        So far.
+        Counts so far.
     """
 
     def __init__(self, on_sealed: Callable[[Sealed], None], on_failed: Callable[[str], None]) -> None:
         self._on_sealed, self._on_failed = on_sealed, on_failed
         self._given: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
-        self._waiting: list[tuple[float, float, Path]] = []  # when it is due, how long it waited, which
+        self._waiting: list[tuple[float, float, Path]] = []  # Due time, previous delay, journal.
         self._left: set[Path] = set()
         self._ends = False
         self.sealed = self.failed = self.set_aside = 0
@@ -57,20 +60,20 @@ class Sealing:
 
     @property
     def left(self) -> int:
-        """Journals that are not recordings yet."""
+        """Number of journals that are not recordings yet."""
         return len(self._left)
 
     def give(self, path: Path) -> None:
-        """Seal a journal, when those before are done."""
+        """Queue a journal for sealing."""
         self._left.add(path)
         self._given.put(path)
 
     def hurry(self) -> None:
-        """Let nobody have processors and disk first, from the next journal on."""
+        """Stop yielding processors and disk, from the next journal on."""
         self._ends = True
 
     def close(self) -> None:
-        """Seal what is left, each tried once more, and return when that is done."""
+        """Seal the queued journals, each tried once more, and return afterwards."""
         self.hurry()
         self._given.put(None)
         self._thread.join()
@@ -96,10 +99,10 @@ class Sealing:
             sealed = seal_apart(path, rests=None if self._ends else self._rests(path.parent))
         except Exception as error:  # noqa: BLE001  whatever it is, the journal is still there and ingest goes on
             if not path.exists() and path.with_name(path.name.removesuffix(SUFFIX)).exists():
-                self._left.discard(path)  # somebody else has made the recording
+                self._left.discard(path)  # Another process has made the recording.
                 return
             if isinstance(error, JournalInUseError) and not self._ends:
-                waits_s = _AGAIN_S  # who seals it now will be done soon
+                waits_s = _AGAIN_S  # The process that seals it now will end soon.
             else:
                 self.failed += 1
                 waits_s = min(max(_AGAIN_S, 2 * waited_s), _LATEST_S)
@@ -112,6 +115,6 @@ class Sealing:
         self._on_sealed(sealed)
 
     def _rests(self, folder: Path) -> float:
-        """Return how long sealing may rest: long, so that ingest has the disk, until the room gets scarce."""
+        """Return the relative rest of sealing: long for the sake of the intake, until free space gets scarce."""
         n_bytes = sum(path.stat().st_size for path in tuple(self._left) if path.exists())
         return _RESTS if n_bytes < _SHARE * shutil.disk_usage(folder).free else _FEW_RESTS

@@ -1,4 +1,4 @@
-"""Where a central node hears others and answers them: its socket, and the gate that knows who they are."""
+"""Server socket of the central node with its authenticator."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -16,12 +16,12 @@ from ertis_numba.network.zap_authenticator import ZapAuthenticator
 
 __all__ = ["ServerSocket"]
 
-_FRAMES: Final = 4  # of a message, that are looked at
+_FRAMES: Final = 4  # Limit on frames per message.
 _LINGER_MS: Final = 500
 
 
 class ServerSocket:
-    """Hears whoever is listed, and waits for nobody.
+    """Socket that receives messages of listed keys; never blocks.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class ServerSocket:
     Attributes
     ----------
     address : str
-        Where it listens, as nodes of this machine connect to it.
+        Actual address, in the form that nodes on this machine use.
     """
 
     def __init__(self, keys: ServerKeys | None) -> None:
@@ -38,27 +38,27 @@ class ServerSocket:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._authenticator: ZapAuthenticator | None = None
-        self._last_refused: Counter[str] = Counter()  # once the gate is closed
-        self._badges: dict[bytes, list[zmq.Frame]] = {}  # by which peers are looked up again
+        self._last_refused: Counter[str] = Counter()  # Kept after the authenticator is closed.
+        self._badges: dict[bytes, list[zmq.Frame]] = {}  # Frames by which the authenticator identifies peers later.
         self.address = ""
 
     @property
     def is_open(self) -> bool:
-        """Whether anybody can be heard."""
+        """True if messages can be received."""
         return self._socket is not None
 
     @property
     def refused(self) -> Counter[str]:
-        """What was refused, by reason; whoever refuses something adds it."""
+        """Refusals by reason; every part that refuses something adds to it."""
         return self._last_refused if self._authenticator is None else self._authenticator.refused
 
     @property
     def note(self) -> str:
-        """Why the list of keys cannot be used; empty where it can."""
+        """Error of the allow list; empty if the list can be used."""
         return "" if self._authenticator is None else self._authenticator.note
 
     def open(self, listen: str, *, max_bytes: int) -> None:
-        """Listen at an address; raises what `sockets.server` and `ZapAuthenticator.self_test` do."""
+        """Listen at an address; raises the errors of `sockets.server` and `ZapAuthenticator.self_test`."""
         self._context = zmq.Context()
         self._authenticator = ZapAuthenticator(self._context, self._keys)
         self._socket = sockets.server(self._context, listen, keys=self._keys, max_bytes=max_bytes)
@@ -67,27 +67,27 @@ class ServerSocket:
         self._authenticator.self_test(self.address)
 
     def close(self) -> None:
-        """Hear nobody any more; closing twice does no harm."""
+        """Stop receiving; closing twice is harmless."""
         gate, socket, context = self._authenticator, self._socket, self._context
-        with ExitStack() as stack:  # whatever fails, the rest is closed
+        with ExitStack() as stack:  # Any error leaves no part open.
             if context is not None:
                 stack.callback(context.destroy, linger=0)
             if socket is not None:
-                stack.callback(socket.close, linger=_LINGER_MS)  # the last acks
+                stack.callback(socket.close, linger=_LINGER_MS)  # Time for the last acks.
             if gate is not None:
                 self._last_refused = gate.refused
                 stack.callback(gate.close)
             self._authenticator = self._socket = self._context = None
 
     def register(self, poller: zmq.Poller) -> None:
-        """Have it polled."""
+        """Add the sockets to a poller."""
         if self._socket is not None:
             poller.register(self._socket, zmq.POLLIN)
         if self._authenticator is not None and self._authenticator.socket is not None:
             poller.register(self._authenticator.socket, zmq.POLLIN)
 
     def serve(self, ready: Mapping[Any, int]) -> bool:
-        """Let in who asks for it, and return whether there are messages."""
+        """Answer key requests, and return True if there are messages."""
         if self._authenticator is not None and self._authenticator.socket in ready:
             self._authenticator.serve()
         return self._socket in ready
@@ -109,15 +109,15 @@ class ServerSocket:
         return frames
 
     def who(self, frames: list[zmq.Frame]) -> Permission | None:
-        """Return what the sender of a message may do; None if it is not listed, which is counted."""
+        """Return the permissions of a message's sender; None, and counted, if its key is not listed."""
         return None if self._authenticator is None else self._authenticator.who(frames)
 
     def keep_badge(self, frames: list[zmq.Frame]) -> None:
-        """Remember by what a peer was known, to look whether it still is."""
+        """Keep a frame of a peer, to check its key again later."""
         self._badges[frames[0].bytes] = frames[:2]
 
     def tick(self, peers: AbstractSet[bytes]) -> list[bytes]:
-        """Look at the list of keys, and return those of the peers who are not on it any more."""
+        """Reload the allow list, and return the peers whose keys were removed."""
         for peer_id in self._badges.keys() - peers:
             del self._badges[peer_id]
         gate = self._authenticator
@@ -126,13 +126,14 @@ class ServerSocket:
         return [peer_id for peer_id, frames in self._badges.items() if gate.who(frames) is None]
 
     def send(self, peer_id: bytes, message: Message, *payload: bytes) -> None:
-        """Send something if that is possible at once: whatever matters is said again."""
+        """Send a message if possible without blocking; important messages are repeated."""
         if self._socket is None:
             return
         parts = [peer_id, messages.encode(message), *payload]
-        with suppress(zmq.ZMQError):  # the peer is gone, or does not read
+        with suppress(zmq.ZMQError):  # The peer is gone, or does not read.
             try:
                 self._socket.send_multipart(parts, zmq.NOBLOCK)
             except zmq.Again:
-                self._socket.getsockopt(zmq.EVENTS)  # sees now what the peer has read, or only some milliseconds later
+                # Otherwise the socket notices only milliseconds later which messages the peer has read.
+                self._socket.getsockopt(zmq.EVENTS)
                 self._socket.send_multipart(parts, zmq.NOBLOCK)

@@ -1,4 +1,4 @@
-"""Which sensors several nodes send, by a mistake of whoever has named them."""
+"""Detection of sensors that several nodes send because of a wrong name."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,12 +8,12 @@ __all__ = ["Sharing"]
 
 
 class Sharing:
-    """Finds sensors that several nodes send, and tells of each once.
+    """Detector of sensors that several nodes send; reports each once.
 
     Parameters
     ----------
     notify : callable
-        Called with the name of an event and what there is to say about it.
+        Called with the name of an event and its fields.
     """
 
     def __init__(self, notify: Callable[..., None]) -> None:
@@ -22,21 +22,21 @@ class Sharing:
 
     @staticmethod
     def joins(track: SensorTrack, peer_id: bytes, now_s: float) -> None:
-        """Note that a node sends a sensor."""
+        """Register that a node sends a sensor."""
         if track.peers - {peer_id} and peer_id not in track.peers:
             track.shared_s = now_s
         track.peers.add(peer_id)
 
     def leaves(self, track: SensorTrack, sensor: str, peer_id: bytes) -> None:
-        """Note that a node sends a sensor no more."""
+        """Register that a node no longer sends a sensor."""
         track.peers.discard(peer_id)
         if len(track.peers) < 2:
             self._sensors.discard(sensor)
 
     def tick(self, tracks: Mapping[str, SensorTrack], peers: Mapping[bytes, PeerConnection]) -> None:
-        """Tell of what is new."""
+        """Report new ones."""
         for sensor, track in tracks.items():
-            # One that has come back may be missed only some seconds later.
+            # A reconnected node may be noticed as gone only seconds later.
             if track.shared_s and all(peers[each].heard_s > track.shared_s for each in track.peers):
                 track.shared_s = 0.0
                 if len(track.peers) > 1:
@@ -46,8 +46,8 @@ class Sharing:
                     )
 
     def remark(self, peer: PeerConnection | None) -> str:
-        """Return what a node should know, a line; empty where there is nothing."""
+        """Return a remark for a node, one line; empty if there is none."""
         shared = () if peer is None else sorted(self._sensors & {run.sensor for run in peer.streams})
         if not shared:
             return ""
-        return f"another sensor node sends sensor {shared[0]}, too; give each a name of its own (--name), or end one"
+        return f"another sensor node sends sensor {shared[0]}, too; give each its own name (--name), or end one"

@@ -1,4 +1,4 @@
-"""Runs that are greeted: which number comes next, and what is counted of each sensor."""
+"""Greeted sessions with their next numbers, and the counts of each sensor."""
 
 import time
 from collections import Counter, OrderedDict, deque
@@ -19,26 +19,26 @@ __all__ = ["PeerConnection", "SensorTrack", "Stream", "source_of"]
 
 _turns = count()
 _RECENT_S: Final = 3.0
-_DROPS_KEPT: Final = 256  # of each run
-_REASONS: Final = 32  # that numbers are missing for, of each sensor
-_NUMBERS_KEPT: Final = 512  # whose CRC-32 is remembered, of each run
+_DROPS_KEPT: Final = 256  # Limit per session.
+_REASONS: Final = 32  # Limit on reasons for missing numbers, per sensor.
+_NUMBERS_KEPT: Final = 512  # Limit on kept CRC-32 values, per session.
 
 
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
-    """Return the sensor that a node greets for.
+    """Return the sensor of a hello.
 
     Parameters
     ----------
     hello : Hello
     text : bytes
-        Its settings as TOML.
+        Settings as TOML.
     max_bytes : int
-        Longest measurement that is taken.
+        Size of the largest accepted measurement.
 
     Raises
     ------
     ArgumentError
-        They cannot be used.
+        The settings cannot be used.
     """
     return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, max_bytes)
 
@@ -60,15 +60,15 @@ def _source(
     )
     if source.n_bytes > max_bytes:
         raise SettingsError(
-            f"a measurement of sensor {name} has {source.n_bytes} bytes, this node takes {max_bytes}; record fewer "
-            "samples, or raise its limit (--max-bytes)"
+            f"a measurement of sensor {name} has {source.n_bytes} bytes, but the limit is {max_bytes}; record "
+            "fewer samples, or raise the limit (--max-bytes)"
         )
     return source
 
 
 @dataclass(slots=True)
 class SensorTrack:
-    """What became of one sensor's measurements."""
+    """Counts of one sensor's measurements."""
 
     session_id: int = 0
     acked_through: int = -1
@@ -81,21 +81,21 @@ class SensorTrack:
     missing: Counter[str] = field(default_factory=Counter)
     peers: set[bytes] = field(default_factory=set)
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=128))
-    shared_s: float = 0.0  # since when several peers send it; 0 where none do, or that was told
+    shared_s: float = 0.0  # Time since several peers send it; 0 if none do, or once it was reported.
 
     def miss(self, reason: str, n_missing: int) -> None:
-        """Count numbers that no measurement has."""
+        """Count missing numbers."""
         known = reason in self.missing or len(self.missing) < _REASONS
         self.missing[reason if known else "another reason"] += n_missing
 
     def took(self, n_bytes: int, arrived_s: float) -> None:
-        """Count a measurement that has not come before."""
+        """Count a new measurement."""
         self.received += 1
         self.received_bytes += n_bytes
         self.times_s.append(arrived_s)
 
     def status(self) -> SensorStatus:
-        """Return what is counted."""
+        """Return the counts."""
         now_s = time.monotonic()
         recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
         span_s = recent_s[-1] - recent_s[0] if len(recent_s) > 1 else 0.0
@@ -116,25 +116,25 @@ class SensorTrack:
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """A run that is greeted.
+    """A greeted session.
 
     Attributes
     ----------
-    run : Run
-    source : Sensor
-    track : Track
+    run : SensorSession
+    source : JournalSensor
+    track : SensorTrack
     acked_through, taken : int
-        The number up to which all is settled, and will be once what waits is stored.
+        Number up to which everything is acknowledged, and will be once the waiting items are stored.
     begins : int
-        The oldest number that the node has.
+        Oldest number that the node has.
     owner : bytes
-        The peer that has greeted last.
+        Peer that sent the latest hello.
     shown : int
-        The number up to which measurements were counted and shown; what has to be sent again is not once more.
+        Number up to which measurements were counted and shown; repeated ones are not shown again.
     turn : int
-        Of what is taken now; see `Item`.
+        Number of the current transmission; see `ReceivedItem`.
     dropped : deque of (sequence, reason)
-        Thrown away by processing, which the node has not heard of; the latest.
+        Latest measurements discarded by processing and not yet reported to the node.
     """
 
     run: SensorSession
@@ -162,7 +162,7 @@ class Stream:
         Raises
         ------
         ArgumentError
-            There is no such air.
+            The air is impossible.
         """
         air = (data.temperature_c, data.humidity_percent, data.pressure_pa)
         if self._air is None or self._air[0] != air:
@@ -173,28 +173,28 @@ class Stream:
         return self._air[1]
 
     def go_back(self) -> None:
-        """Take what is not settled again."""
+        """Accept unacknowledged numbers again."""
         self.taken, self.turn = self.acked_through, next(_turns)
 
     def use(self, source: JournalSensor) -> None:
-        """Take other settings from now on."""
+        """Use other settings from now on."""
         if source is not self.source:
             self.source, self._air = source, None
 
 
 @dataclass(slots=True, eq=False)
 class PeerConnection:
-    """A connection that has greeted for some sensors.
+    """Connection of a sensor node.
 
     Attributes
     ----------
-    streams : dict of Run to Stream
+    streams : dict of SensorSession to Stream
     heard_s : float
-        When it sent something, by `time.monotonic`.
+        Time of its last message, by `time.monotonic`.
     waiting_bytes : int
-        Of it, that wait for the disk.
+        Bytes from it that wait for the disk.
     key : str
-        That it has shown; empty where there are none.
+        Its key; empty without keys.
     """
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)

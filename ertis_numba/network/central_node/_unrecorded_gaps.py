@@ -1,4 +1,4 @@
-"""What is missing, and no recording says so yet."""
+"""Gaps not yet written to a recording."""
 
 from collections.abc import Iterable
 
@@ -8,14 +8,14 @@ __all__ = ["UnrecordedGaps"]
 
 
 class UnrecordedGaps:
-    """Gaps of sensors of which a journal holds no measurement: the recording that is made of it cannot tell of them.
+    """Gaps of sensors without a measurement in their journal, so that its recording cannot contain them.
 
-    The next one with a measurement of the sensor does. Until then the ledger has them, so that the reason why
-    acknowledged numbers are missing is never lost; one that is told twice, after a crash, does no harm.
+    The next recording with a measurement of the sensor contains them. Until then the ledger keeps them, so that the
+    reasons for missing numbers are never lost. A gap that is recorded twice, after a crash, is harmless.
 
     Parameters
     ----------
-    gaps : iterable of Gap
+    gaps : iterable of JournalGap
     """
 
     def __init__(self, gaps: Iterable[JournalGap]) -> None:
@@ -23,11 +23,11 @@ class UnrecordedGaps:
 
     @property
     def gaps(self) -> list[JournalGap]:
-        """All of them, in the order in which they came."""
+        """All gaps, in order of arrival."""
         return list(self._gaps)
 
     def learn(self, journal: Journal) -> None:
-        """Take those of a journal that is to be sealed."""
+        """Add the gaps of a journal to seal."""
         gaps = journal.gaps
         if gaps:
             measured = {key.sensor for key in journal.index()}
@@ -35,11 +35,11 @@ class UnrecordedGaps:
             self._gaps |= dict.fromkeys(gap for gap in gaps if gap.sensor not in measured)
 
     def of(self, sensors: Iterable[str]) -> list[JournalGap]:
-        """Return those of some sensors."""
+        """Return the gaps of given sensors."""
         wanted = set(sensors) if self._gaps else set()
         return [gap for gap in self._gaps if gap.sensor in wanted]
 
     def reported(self, gaps: Iterable[JournalGap]) -> None:
-        """Forget those that a journal with measurements of their sensor has durably now."""
+        """Remove gaps that a journal with measurements of their sensor now contains durably."""
         for gap in gaps:
             self._gaps.pop(gap, None)

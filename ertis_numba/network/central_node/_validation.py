@@ -1,4 +1,4 @@
-"""Reader of the settings in Hello messages, in a thread of its own: TOML of 256 kB takes a tenth of a second."""
+"""Reader of the settings in Hello messages, in a separate thread: TOML of 256 kB takes a tenth of a second."""
 
 import threading
 from collections import deque
@@ -21,18 +21,18 @@ MAX_WAITING_BYTES: Final = 64_000_000
 
 @dataclass(slots=True, eq=False)
 class Greeting:
-    """A Hello message, and the sensor or error that it led to.
+    """Hello message, with its result.
 
     Attributes
     ----------
     frames : list of zmq.Frame
-        The frames of the message, by which the gate looks up its sender again.
+        Frames of the message, by which the authenticator identifies its sender again.
     hello : Hello
     payload : list of bytes
     key : str
-        Public key of the peer; empty where keys are not used.
-    result : Sensor or Exception
-        The sensor once the settings are read, or the error.
+        Public key of the peer; empty without keys.
+    result : JournalSensor or Exception
+        Sensor of the settings, or the error.
     """
 
     frames: list[zmq.Frame]
@@ -43,7 +43,7 @@ class Greeting:
 
     @property
     def peer_id(self) -> bytes:
-        """The sender."""
+        """Identifier of the sender."""
         return self.frames[0].bytes
 
     @property
@@ -64,9 +64,9 @@ class Greetings:
     def __init__(self, read: Callable[[Hello, list[bytes]], JournalSensor]) -> None:
         self._read = read
         self._change = threading.Condition()
-        self._waiting: dict[bytes, deque[Greeting]] = {}  # by peer, the next one's turn first
+        self._waiting: dict[bytes, deque[Greeting]] = {}  # By peer, in the order of their turns.
         self._done: deque[Greeting] = deque()
-        self._current: Greeting | None = None  # that the thread reads
+        self._current: Greeting | None = None  # Hello that the thread reads.
         self._bytes = 0
         self._ends = False
         self._thread: threading.Thread | None = None
@@ -104,9 +104,7 @@ class Greetings:
             if len(waiting) >= MAX_WAITING_OF_PEER or self._bytes + greeting.n_bytes > MAX_WAITING_BYTES:
                 if not waiting:
                     del self._waiting[greeting.peer_id]
-                raise Unwanted(
-                    "message", "too many hellos wait to be read; send hello again in a few seconds", "too many"
-                )
+                raise Unwanted("message", "too many hellos are waiting; send hello again in a few seconds", "too many")
             self._bytes += greeting.n_bytes
             waiting.append(greeting)
             self._change.notify()
@@ -140,13 +138,13 @@ class Greetings:
                 greeting = self._current = waiting.popleft()
                 self._bytes -= greeting.n_bytes
                 if waiting:
-                    self._waiting[peer_id] = waiting  # behind all others
+                    self._waiting[peer_id] = waiting  # The peer goes to the end of the queue.
             try:
                 greeting.result = self._read(greeting.hello, greeting.payload)
             except Exception as error:  # noqa: BLE001  the loop answers whatever it is
                 greeting.result = error
             with self._change:
-                if self._current is not greeting:  # the peer has left meanwhile
+                if self._current is not greeting:  # The peer has left meanwhile.
                     continue
                 self._current = None
                 self._done.append(greeting)

@@ -1,4 +1,4 @@
-"""Journals of an archive: their names, and which measurements still fit into one."""
+"""Journals of an archive: names, and the measurements that fit into each."""
 
 import re
 import time
@@ -17,9 +17,9 @@ _SOURCE = "central node"
 
 
 def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
-    """Return a name for a journal that neither it nor its recording has in a folder.
+    """Return a new journal name, whose journal and recording do not exist in a folder.
 
-    Of those of one second, the later has the higher number, also where earlier ones are gone: names tell the order.
+    Within a second, later journals have higher numbers, even if earlier ones are gone: names tell the order.
     """
     stem = f"{name}_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     numbered = re.compile(rf"{re.escape(stem)}(?:_(\d+))?{end}\.h5")
@@ -29,7 +29,7 @@ def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str]
 
 
 def runs_of(journal: Journal) -> dict[SensorSession, int]:
-    """Return the highest number of each run that a journal holds, or says to be missing."""
+    """Return the highest number of each session in a journal, gaps included."""
     last: dict[SensorSession, int] = {}
     for key in journal.index():
         run = SensorSession(key.sensor, key.session_id)
@@ -41,21 +41,21 @@ def runs_of(journal: Journal) -> dict[SensorSession, int]:
 
 
 class Volume:
-    """A journal that is being written.
+    """Journal in use.
 
     Parameters
     ----------
     journal : Journal
-        It belongs to this from now on.
+        Owned by this object.
 
     Attributes
     ----------
-    acked : dict of Run to int
-        Highest number of each run that `append` or `note_gaps` has stored.
+    acked : dict of SensorSession to int
+        Highest number of each session that `append` or `note_gaps` has stored.
     n_bytes : int
-        Words that it holds.
+        Data bytes in it.
     begun_s : float
-        When it was opened, by `time.monotonic`.
+        Time of opening, by `time.monotonic`.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -68,34 +68,34 @@ class Volume:
 
     @classmethod
     def create(cls, path: Path) -> Self:
-        """Make one whose recording will lie beside it."""
+        """Create a journal whose recording will lie beside it."""
         return cls(Journal.create(path, target=path.name.removesuffix(SUFFIX), source=_SOURCE))
 
     @property
     def path(self) -> Path:
-        """Of the journal."""
+        """Path of the journal."""
         return self.journal.path
 
     def __len__(self) -> int:
         return len(self.journal)
 
     def fits(self, item: ReceivedItem) -> bool:
-        """Whether an item can go into this journal: its sensor is the same as before, and its number rises."""
+        """Return True if an item can go into this journal: its sensor is the same as before, and its number rises."""
         known = self._known.get(item.source.name)
         if known is not None and known is not item.source and not same(known, item.source):
             return False
         return item.first > self._counted.get(item.run, -1)
 
     def register(self, source: JournalSensor) -> None:
-        """Expect measurements of a sensor."""
+        """Register a sensor."""
         self._known[source.name] = source
 
     def append(self, items: list[ReceivedItem]) -> None:
-        """Make measurements durable, or what is missing, all or none; see `Journal.append`.
+        """Store measurements or gaps durably, all or none; see `Journal.append`.
 
         Parameters
         ----------
-        items : list of Item
+        items : list of ReceivedItem
             Either measurements or gaps.
         """
         for item in items:
@@ -110,7 +110,7 @@ class Volume:
             self.n_bytes += item.source.n_bytes
 
     def note_gaps(self, gaps: list[JournalGap]) -> None:
-        """Make durable what is missing; see `Journal.note_gaps`."""
+        """Store gaps durably; see `Journal.note_gaps`."""
         self.journal.note_gaps(gaps)
         for gap in gaps:
             run = SensorSession(gap.sensor, gap.session_id)
@@ -128,13 +128,13 @@ class Volume:
         self.register(source)
 
     def crc32_of(self, entry: Entry) -> int | None:
-        """Return the CRC-32 of the measurement with the number of this one; None where this journal has none."""
+        """Return the CRC-32 of the stored measurement with this number; None if there is none."""
         stamp = entry.measurement.stamp
         if stamp.sensor not in self.journal.sensors:
             return None
         try:
             key = self.journal.find(stamp.sensor, stamp.session_id, stamp.sequence)
-        except DamagedError:  # there is none
+        except DamagedError:  # The journal does not contain it.
             return None
         return self.journal.entry(key).crc32
 
@@ -144,7 +144,7 @@ class Volume:
 
 
 def same(one: JournalSensor, other: JournalSensor) -> bool:
-    """Whether a recording can hold measurements of both under one name."""
+    """Return True if one recording can contain measurements of both sensors under one name."""
     parts: tuple[Callable[[JournalSensor], object], ...] = (
         lambda sensor: sensor.settings,
         lambda sensor: sensor.firmware,

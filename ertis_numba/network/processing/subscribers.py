@@ -184,7 +184,10 @@ class Subscribers:
             del kept[min(kept)]
 
     def description(self, sensor: str, number: int) -> tuple[int, Sequence[bytes]] | None:
-        """Return what products of a sensor are about, as an `QueuedProduct` has it; None if that is not known (any more)."""
+        """Return what products of a sensor are about, as an `QueuedProduct` has it.
+
+        None if that is not known (any more).
+        """
         frames = self._descriptions.get(sensor, {}).get(number)
         return None if frames is None else (number, frames)
 

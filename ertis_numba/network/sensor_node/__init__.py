@@ -1,4 +1,4 @@
-"""The sensor node: keeps measurements until the central node has acknowledged them."""
+"""Sensor node: keeps measurements until the central node has acknowledged them."""
 
 from ertis_numba.network.sensor_node._link import Central
 from ertis_numba.network.sensor_node._node import SensorNode

@@ -1,4 +1,4 @@
-"""A spool on a disk: a journal for each run, of which goes what the central node has."""
+"""Spool on disk: a journal for each session, cleared as the central node acknowledges."""
 
 import tempfile
 import threading
@@ -22,33 +22,33 @@ __all__ = ["DAMAGED", "SPOOL_FULL", "DiskSpool"]
 SPOOL_FULL: Final = "the spool was full"
 DAMAGED: Final = "damaged in the spool"
 
-_SWEEP_S = 0.5  # journals are cleared in one commit per sensor and this time
-_GAP_NUMBERS = 64  # of refused measurements, before the journal is told
+_SWEEP_S = 0.5  # Journals are cleared in one commit per sensor and interval.
+_GAP_NUMBERS = 64  # Refused numbers to collect before the journal is written.
 
 
 class DiskSpool(Spool):
-    """Measurements in journals of a folder, and in memory as well while there is room.
+    """Measurements in journals of a folder, and also in memory while there is room.
 
     Parameters
     ----------
     folder : Path
-        It is made if it is not there.
+        Folder, created if it does not exist.
     ring_bytes : int
-        Of words in memory.
+        Limit on data bytes in memory.
     max_bytes : int or None
-        Of words in the journals.
+        Limit on data bytes in the journals.
     on_note : callable
-        Called with a line, from whatever thread.
+        Called with a line, from any thread.
     """
 
     def __init__(self, folder: Path, ring_bytes: int, max_bytes: int | None, *, on_note: Callable[[str], None]) -> None:
         super().__init__(ring_bytes)
         self._folder, self._on_note = folder, on_note
         self._limit_bytes = None if max_bytes is None else checks.integer("spool_bytes", max_bytes, 1)
-        self._writing = threading.RLock()  # taken before `turn`, and never while that is held
-        self._journals: dict[int, Journal] = {}  # that measurements of this process go to, by epoch
+        self._writing = threading.RLock()  # Acquired before `turn`, and never while `turn` is held.
+        self._journals: dict[int, Journal] = {}  # Journals for measurements of this process, by session.
         self._found: list[Journal] = []
-        self._open_gaps: dict[tuple[str, int], JournalGap] = {}  # that the journal has not been told of
+        self._open_gaps: dict[tuple[str, int], JournalGap] = {}  # Gaps not yet written to the journal.
         self._discards: dict[tuple[str, int], tuple[Journal, int]] = {}
         self._failing = ""
         self._sweep_now, self._stopping = threading.Event(), threading.Event()
@@ -56,19 +56,17 @@ class DiskSpool(Spool):
 
     @property
     def is_durable(self) -> bool:
-        """Whether what is held outlives this process."""
+        """True if measurements outlive this process."""
         return True
 
     def open(self) -> None:
-        """Take up the journals that earlier nodes have left, oldest first."""
+        """Open the journals that earlier nodes have left, oldest first."""
         try:
             make_folder(self._folder, parents=True)
-            with tempfile.TemporaryFile(dir=self._folder):  # root may write whatever its mode says
+            with tempfile.TemporaryFile(dir=self._folder):  # root may write regardless of the mode.
                 pass
         except OSError as error:
-            raise NetworkError(
-                f"{self._folder}: {error.strerror}; give a folder for the spool that can be written (--spool)"
-            ) from error
+            raise NetworkError(f"{self._folder}: {error.strerror}; give a writable spool folder (--spool)") from error
         for path in sorted(self._folder.glob(f"*{SUFFIX}")):
             try:
                 journal = Journal.open(path)
@@ -79,9 +77,9 @@ class DiskSpool(Spool):
                     journal.close()
                     raise
             except JournalInUseError:
-                continue  # another sensor node's, or being sealed
+                continue  # Another sensor node's, or being sealed.
             except DataError as error:
-                self._on_note(f"what is in {path.name} is not sent: {error}")
+                self._on_note(f"measurements in {path.name} are not sent: {error}")
         self._sweeper.start()
 
     def _report_losses(self, journal: Journal) -> None:
@@ -99,7 +97,7 @@ class DiskSpool(Spool):
         for first, last, reason, name, session_id in sorted(found):
             if last > MAX_SEQUENCE:
                 raise DataError(
-                    f"sequence number {last} is above {MAX_SEQUENCE}; seal it by 'ertis recover {journal.path}'"
+                    f"sequence number {last} is above {MAX_SEQUENCE}; recover it with 'ertis recover {journal.path}'"
                 )
             run = runs.setdefault((name, session_id), OutgoingSession(journal.sensors[name], session_id, journal))
             if reason:
@@ -111,7 +109,7 @@ class DiskSpool(Spool):
             return
         with self.turn:
             if runs.keys() & self.runs.keys():
-                raise DataError(f"{journal.path} holds runs that another journal holds, too; move it elsewhere")
+                raise DataError(f"{journal.path} has sessions that another journal has, too; move it elsewhere")
             self.runs.update(runs)
             for run in runs.values():
                 self.counts.setdefault(run.sensor.name, SensorCounts())
@@ -120,7 +118,7 @@ class DiskSpool(Spool):
         self._found.append(journal)
 
     def append(self, entries: Sequence[Entry]) -> list[Entry]:
-        """Keep measurements, durable when this returns, and return those that are kept; the others become gaps."""
+        """Store measurements durably, and return the stored ones; the others become gaps."""
         kept: list[Entry] = []
         with self._writing:
             with self.turn:
@@ -153,7 +151,7 @@ class DiskSpool(Spool):
         return self._limit_bytes - sum(counts.unacked_bytes for counts in self.counts.values())
 
     def _journal(self, session_id: int, sensors: Iterable[str]) -> Journal:
-        """Return the journal of an epoch, made if it is not there, which knows these sensors."""
+        """Return the journal of a session with these sensors, created if it does not exist."""
         if session_id not in self._journals:
             with self.turn:
                 found = next(
@@ -178,7 +176,7 @@ class DiskSpool(Spool):
         return Journal.create(self._folder / f"{name}{SUFFIX}", target=name, source="spool of a sensor node")
 
     def _add(self, journal: Journal, entries: Iterable[Entry]) -> None:
-        """Make measurements that are in the journal items to be sent."""
+        """Add stored measurements to the items to send."""
         for entry in entries:
             stamp, n_bytes = entry.measurement.stamp, entry.measurement.data.nbytes
             self._report_gap((stamp.sensor, stamp.session_id))
@@ -192,7 +190,7 @@ class DiskSpool(Spool):
                     self._count_kept(run, n_bytes)
 
     def _refuse(self, entry: Entry) -> None:
-        """Make a gap of a measurement for which there is no room."""
+        """Replace a measurement without room by a gap."""
         stamp = entry.measurement.stamp
         key = stamp.sensor, stamp.session_id
         gap = self._open_gaps.get(key)
@@ -208,7 +206,7 @@ class DiskSpool(Spool):
             self._report_gap(key)
 
     def _report_gap(self, key: tuple[str, int]) -> None:
-        """Make a gap durable; where the disk is too full even for that, it stays in memory."""
+        """Store a gap durably; if the disk is too full even for that, it stays in memory."""
         gap = self._open_gaps.get(key)
         if gap is None:
             return
@@ -219,7 +217,7 @@ class DiskSpool(Spool):
             del self._open_gaps[key]
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Keep which of a sensor's numbers are missing, and why; durably, if the disk allows."""
+        """Register missing numbers of a sensor with their reason, durably if the disk allows."""
         with self._writing:
             super().note_gap(sensor, first, last, reason, session_id=session_id)
             try:
@@ -256,7 +254,7 @@ class DiskSpool(Spool):
         status: Literal["stored", "accepted"],
         dropped: Sequence[tuple[int, str]] = (),
     ) -> None:
-        """Let go of what the central node has, and count it; it leaves its journal a little later."""
+        """Release and count acknowledged items; the journal is cleared later."""
         with self.turn:
             super().settle(run, done, status, dropped)
             if run.journal is not None:
@@ -272,7 +270,7 @@ class DiskSpool(Spool):
         self._clear()
 
     def _clear(self) -> None:
-        """Discard what is settled, and remove journals of the past in which nothing is left."""
+        """Discard acknowledged items, and remove empty journals of earlier nodes."""
         with self.turn:
             discards, self._discards = self._discards, {}
         for (sensor, session_id), (journal, acked_through) in discards.items():
@@ -280,7 +278,7 @@ class DiskSpool(Spool):
                 journal.discard(sensor, session_id, acked_through)
             except DataError as error:
                 self._report_failure(str(error))
-                with self.turn:  # with the next that is settled, or at the next start
+                with self.turn:  # The next acknowledgement or the next start tries again.
                     self._discards.setdefault((sensor, session_id), (journal, acked_through))
         with self._writing:
             for key in list(self._open_gaps):
@@ -307,13 +305,13 @@ class DiskSpool(Spool):
         journal.close()
 
     def _report_failure(self, text: str) -> None:
-        """Tell of a disk that is full or fails, once until it works again."""
+        """Report a full or failing disk, once until it works again."""
         if not self._failing:
             self._on_note(text)
         self._failing = text
 
     def close(self) -> None:
-        """Close the journals; what they hold is sent at the next start."""
+        """Close the journals; the next start sends their measurements."""
         if self._stopping.is_set():
             return
         self._stopping.set()

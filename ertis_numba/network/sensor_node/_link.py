@@ -1,4 +1,4 @@
-"""The thread that speaks with the central node: greets, sends, takes acks, and begins again where it has to."""
+"""Thread that talks to the central node: sends hello, data and gaps, receives acks, and reconnects."""
 
 import threading
 import time
@@ -27,14 +27,14 @@ _REFUSED_S = 5.0
 _FAILED_S = 1.0
 _TURN_MS = 100
 _UNDER_WAY_BYTES = 32_000_000
-_AT_ONCE = 32  # messages sent or received before the others have a turn
+_AT_ONCE = 32  # Limit on messages before other work has its turn.
 _LINE_CHARACTERS = 400
 _MAX_REPORTED = 256
 _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused)
 
 
 class Link(threading.Thread):
-    """Sends what a spool holds until it is stopped, whatever becomes of the connection.
+    """Sender of a spool's items, which reconnects until it is stopped.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ class Link(threading.Thread):
     Attributes
     ----------
     central : {"away", "storage", "processing", "fault", "closing"}
-        How the central node is, as it says.
+        Last reported state of the central node.
     reconnects : int
-        How often it was away and came back.
+        Number of reconnections after the central node was away.
     """
 
     def __init__(
@@ -73,25 +73,25 @@ class Link(threading.Thread):
         self._heard_s = self._ping_s = 0.0
         self._is_blocked = False
         self._was_there = False
-        self._reported: set[tuple[str, str]] = set()  # what it was about, and the sensor
-        self._refusals: dict[str, str] = {}  # by sensor; "" is all of them
+        self._reported: set[tuple[str, str]] = set()  # Subject and sensor.
+        self._refusals: dict[str, str] = {}  # By sensor; "" stands for all.
         self._next_sensor = 0
         self._greeted: set[tuple[str, int]] = set()
         self.central: Central = "away"
         self.reconnects = 0
-        self._connect()  # so that an address that cannot be used is refused where it was given
+        self._connect()  # An address that cannot be used raises its error here.
 
     @property
     def refusal(self) -> str:
-        """Why the central node takes nothing of some sensor, and what to do about it; empty where it takes all."""
+        """Reason and remedy if the central node refuses a sensor; empty if it accepts all."""
         return next(iter(self._refusals.copy().values()), "")
 
     def wake(self) -> None:
-        """Say that there is something to send."""
+        """Wake the thread, because there is something to send."""
         self._wakeup_socket.wake()
 
     def stop(self) -> None:
-        """End, and wait for it."""
+        """Stop the thread and wait for its end."""
         self._stopping.set()
         self.wake()
         if self.ident is not None:
@@ -101,12 +101,12 @@ class Link(threading.Thread):
         self._wakeup_socket.close()
 
     def run(self) -> None:
-        """Speak with the central node until stopped."""
+        """Exchange messages with the central node until stopped."""
         while not self._stopping.is_set():
             try:
                 self._turn()
             except Exception as error:  # noqa: BLE001  measurements are kept whatever happens, and sent later
-                text = f"the link to {self._address} has failed ({_line(error)}); it is made again"
+                text = f"the link to {self._address} has failed ({_line(error)}); reconnecting"
                 self._note(text, "link", type(error).__name__)
                 self._stopping.wait(_FAILED_S)
                 with suppress(Exception):
@@ -115,7 +115,7 @@ class Link(threading.Thread):
             self._send(self._socket, [messages.encode(messages.Bye())])
 
     def _connect(self) -> None:
-        """Make a new socket: what was in the old one was settled, or will be sent again."""
+        """Create a new socket: messages in the old one were acknowledged, or will be sent again."""
         self._disconnect()
         self._socket = sockets.client(self._context, self._address, keys=self._keys)
         self._monitor = sockets.Monitor(self._socket)
@@ -149,7 +149,7 @@ class Link(threading.Thread):
         if monitor.socket in events:
             for text in monitor.read():
                 self._refusals[""] = text
-                self._note(text, text)  # which are a handful
+                self._note(text, text)  # There are only a few of them.
         if events.get(socket, 0) & zmq.POLLOUT:
             self._is_blocked = False
         self._receive(socket)
@@ -165,12 +165,12 @@ class Link(threading.Thread):
         if self.central != "away" or not self._was_there:
             text = f"the central node at {self._address} does not answer; measurements are kept meanwhile"
             self._note(text, "away")
-        if self.central != "away":  # what it has said counts no more
+        if self.central != "away":  # Its last state is no longer valid.
             self._refusals.clear()
         self.central = "away"
         self._connect()
 
-    # What comes.
+    # Received messages
 
     def _receive(self, socket: "zmq.Socket[bytes]") -> None:
         for _ in range(_AT_ONCE):
@@ -186,7 +186,7 @@ class Link(threading.Thread):
                 with self._spool.turn:
                     self._wait(list(self._spool.runs.values()), str(error), "version")
             except DataError as error:
-                self._note(f"the central node says what cannot be understood: {error}", "message")
+                self._note(f"a message from the central node cannot be decoded: {error}", "message")
             else:
                 self._heard_s = time.monotonic()
                 self._take(message)
@@ -221,19 +221,19 @@ class Link(threading.Thread):
                     self._on_acked(Acknowledged(*run.key, run.acked_through, message.status, dropped))
 
     def _see(self, state: Literal["storage", "processing", "fault", "closing"], text: str | None = None) -> None:
-        """Note how the central node is, and why if it says so."""
+        """Update the state of the central node, with its reason if given."""
         before, self.central = self.central, state
         if before == "away":
             self.reconnects += self._was_there
             if self._was_there or self._reported:
-                self._on_note(f"the central node at {self._address} is there")
+                self._on_note(f"connected to the central node at {self._address}")
             self._was_there = True
             self._reported.clear()
         if state == "fault" and text is not None:
-            why = text or "it does not say why"
+            why = text or "no reason given"
             self._note(f"the central node cannot store: {why}; measurements are kept", "fault")
         elif state != "fault" and before == "fault":
-            self._on_note("the central node stores again")
+            self._on_note("the central node can store again")
             self._reported.clear()
             with self._spool.turn:
                 for run in self._spool.runs.values():
@@ -262,7 +262,7 @@ class Link(threading.Thread):
         self._wait(runs, text, f"refused {message.code}", message.sensor)
 
     def _send_bye(self) -> bool:
-        """Have the central node forget runs that are over, which it has room for some of; whether there were any."""
+        """Send bye for some finished sessions, within the available room; return True if there were any."""
         socket = self._socket
         with self._spool.turn:
             going_on = {run.key for run in self._spool.runs.values() if run.items}
@@ -276,21 +276,21 @@ class Link(threading.Thread):
         return True
 
     def _wait(self, runs: list[OutgoingSession], text: str, about: str, sensor: str = "") -> None:
-        """Try again later, and let others pass meanwhile."""
+        """Try a session again later, and let others continue meanwhile."""
         self._note(text, about, sensor)
         for run in runs:
             run.stage, run.since_s = "waiting", time.monotonic() + _REFUSED_S
 
     def _note(self, text: str, about: str, sensor: str = "") -> None:
-        """Tell something once until the central node is there again, even if another number is in it each time."""
+        """Report a line once until the central node is there again, even if its numbers change."""
         if (about, sensor) not in self._reported and len(self._reported) < _MAX_REPORTED:
             self._reported.add((about, sensor))
             self._on_note(text)
 
-    # What goes.
+    # Sent messages
 
     def _active(self, now_s: float) -> list[OutgoingSession]:
-        """Return the runs to send of: of each sensor the oldest one that has something and is not refused."""
+        """Return the sessions to send: for each accepted sensor, the oldest one with items."""
         active: dict[str, OutgoingSession] = {}
         with self._spool.turn:
             for run in self._spool.runs.values():
@@ -306,14 +306,14 @@ class Link(threading.Thread):
             with self._spool.turn:
                 if run.stage == "welcome" and run.is_stuck(now_s):
                     run.go_back(now_s)
-                    run.stage = "new"  # the central node may know less than it did: it hears what there is
+                    run.stage = "new"  # The central node may have less than before: it gets the present items.
             if run.stage == "new" or (run.stage == "asked" and now_s - run.since_s > _GREET_AGAIN_S):
                 self._greet(socket, run, now_s)
         runs = [run for run in runs if run.stage == "welcome"]
         n_sent, before = 0, -1
         while runs and not self._is_blocked and before < n_sent < _AT_ONCE:
             before = n_sent
-            for _ in runs:  # in turn, and another first each time
+            for _ in runs:  # In turn, beginning with another one each time.
                 self._next_sensor += 1
                 n_sent += self._send_next(socket, runs, runs[self._next_sensor % len(runs)])
         if n_sent >= _AT_ONCE:
@@ -329,7 +329,7 @@ class Link(threading.Thread):
             self._greeted.add(run.key)
 
     def _send_next(self, socket: "zmq.Socket[bytes]", runs: list[OutgoingSession], run: OutgoingSession) -> bool:
-        """Send the next item of a run, and return whether there was one that might and could go."""
+        """Send the next item of a session, and return True if one was sent."""
         window = 1 if self.central == "fault" else run.window
         with self._spool.turn:
             item = None if self._is_blocked else run.to_send(window)
@@ -340,10 +340,10 @@ class Link(threading.Thread):
                 return False
         try:
             entry = self._spool.entry(item, run)
-        except DataError as error:  # the disk of the spool
+        except DataError as error:  # The disk of the spool fails.
             self._wait([run], str(error), "spool", run.sensor.name)
             return False
-        if entry is None and not item.reason:  # it has made room for later ones meanwhile
+        if entry is None and not item.reason:  # The item was replaced by a gap meanwhile.
             return False
         frames, last = frames_of(run, item, entry)
         if not self._send(socket, frames):
@@ -355,7 +355,7 @@ class Link(threading.Thread):
     def _send(self, socket: "zmq.Socket[bytes]", frames: Frames) -> bool:
         try:
             socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
-        except zmq.Again:  # not connected, or the other side is slow
+        except zmq.Again:  # Not connected, or the other side is slow.
             self._is_blocked = True
             return False
         return True

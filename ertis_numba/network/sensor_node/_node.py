@@ -24,7 +24,7 @@ CallbackArgument = TypeVar("CallbackArgument")
 
 
 class _UserCallback(Generic[CallbackArgument]):
-    """Calls a function of the user; where that fails, it is logged once until it works again, and nothing ends."""
+    """Caller of a user's function; an error in it is logged once until it works again, and ends nothing."""
 
     def __init__(self, name: str, function: Callable[[CallbackArgument], None]) -> None:
         self._name, self._function, self._fails = name, function, False
@@ -41,35 +41,42 @@ class _UserCallback(Generic[CallbackArgument]):
 
 
 class SensorNode:
-    """Takes measurements, keeps them, and sends them until the central node has them.
+    """Node that keeps measurements and sends them until the central node has acknowledged them.
 
-    Use it in a ``with`` statement. It is a sink of `ertis_numba.capture.Session`. Threads may share it. It never
-    waits for the network: while the central node is away, measurements are kept, in memory or on a disk.
+    Use it in a ``with`` statement. It is a sink of `ertis_numba.capture.Session`. Threads may share it. It never waits
+    for the network: while the central node is away, it keeps measurements in memory or on disk.
 
     Parameters
     ----------
     address : str
-        Of the central node, ``tcp://HOST:PORT``.
+        Address of the central node, ``tcp://HOST:PORT``.
     keys : ClientKeys, optional
-        Wanted by any address but loopback.
+        Required for any address but loopback.
     spool : Path, optional
-        Folder of journals where measurements are durable until the central node has them; what earlier nodes left
-        there is sent first. In memory by default.
+        Folder of journals that keep measurements on disk until the central node has acknowledged them. Measurements
+        left by earlier nodes are sent first. By default, measurements are kept in memory.
     ring_bytes : int
-        Of measurements in memory. Without a spool, the oldest become gaps when it is full; with one, later ones are
-        read from the disk when it is their turn.
+        Limit on the data in memory. Without a spool, the oldest measurements of a full ring become gaps. With a spool,
+        later ones are read from disk when they are sent.
     spool_bytes : int, optional
-        Of measurements in the spool; when it is full, new ones are refused and become gaps. As much as the disk
-        allows by default.
+        Limit on the data in the spool. A full spool refuses new measurements, which become gaps. Limited by the disk by
+        default.
     on_acked : callable, optional
-        Called with a `Acknowledged` when the central node has more, from another thread. An exception is logged.
+        Called with an `Acknowledged` for each acknowledgement, from another thread. An exception is logged.
     on_note : callable, optional
-        Called with a line about what whoever watches should know, from another thread. An exception is logged.
+        Called with a line for each event of interest to users, from another thread. An exception is logged.
 
     Raises
     ------
     ArgumentError
-        The address cannot be used, or not without keys.
+        The address cannot be used, or requires keys.
+
+    Examples
+    --------
+    >>> with SensorNode("tcp://127.0.0.1:5601", spool=Path("spool")) as node:  # doctest: +SKIP
+    ...     node.add_sensor("front", settings)
+    ...     node.append(entries)
+    ...     node.flush(10.0)
     """
 
     def __init__(
@@ -87,7 +94,7 @@ class SensorNode:
         addresses.require_keys(self._address, keys=keys)
         self._on_acked, self._on_note = _UserCallback("on_acked", on_acked), _UserCallback("on_note", on_note)
         if spool_bytes is not None and spool is None:
-            raise ArgumentError("spool_bytes is given without a spool; give its folder, too")
+            raise ArgumentError("spool_bytes is given without a spool; give its folder with spool")
         checks.integer("ring_bytes", ring_bytes, 1)
         self._spool = (
             Spool(ring_bytes)
@@ -110,7 +117,7 @@ class SensorNode:
         self.close()
 
     def close(self) -> None:
-        """Send no more; closing twice does no harm. What is in memory only is lost, so `flush` before."""
+        """Stop sending; closing twice is harmless. Measurements kept only in memory are lost, so call `flush` first."""
         if self._link is not None:
             self._link.stop()
             self._link = None
@@ -125,14 +132,14 @@ class SensorNode:
         translation_m: Sequence[float] | None = None,
         rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
-        """Tell of a sensor before its first measurement; told again, it counts for epochs that follow.
+        """Register a sensor before its first measurement; new settings apply to the following sessions.
 
         Parameters are those of `ertis_numba.journal.Journal.add_sensor`.
 
         Raises
         ------
         ArgumentError
-            No recording could hold this, or a measurement is longer than the memory.
+            A recording cannot contain this sensor, or a measurement exceeds the memory.
         """
         made = JournalSensor.of(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
@@ -140,35 +147,35 @@ class SensorNode:
         self._spool.add_sensor(made)
 
     def append(self, entries: Sequence[Entry]) -> list[Entry]:
-        """Keep measurements until the central node has them; with a spool, they are durable when this returns.
+        """Keep measurements until the central node has acknowledged them; with a spool, they are on disk on return.
 
         Parameters
         ----------
         entries : sequence of Entry
-            Of any sensors in any order, whose words nobody changes from now on. The sequence numbers of a sensor rise
-            within an epoch. Their ``crc32`` is filled in where it is None.
+            Measurements of any sensors in any order, whose data must not change any more. The sequence numbers of a
+            sensor rise within a session. ``crc32`` is filled in if it is None.
 
         Returns
         -------
         list of Entry
-            Those that are kept; the others have become gaps, as the spool had no room.
+            Kept measurements; the others have become gaps, because the spool is full.
 
         Raises
         ------
         ArgumentError
-            A measurement does not fit to its sensor, or its number does not rise.
+            A measurement does not match its sensor, or its number does not rise.
         """
         kept = self._spool.append(entries)
         self._wake()
         return kept
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Say why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
+        """Register missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with their reason.
 
         Raises
         ------
         ArgumentError
-            There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
+            The sensor or session is unknown, ``last`` comes before ``first``, or the reason is not a line of at most 64
             bytes.
         """
         checks.sequence_gap(first, last, reason)
@@ -183,42 +190,42 @@ class SensorNode:
             self._link.wake()
 
     def flush(self, timeout_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Wait until the central node has everything, and return whether it has.
+        """Wait until the central node has acknowledged everything, and return True if it has.
 
         Parameters
         ----------
         timeout_s : float
         stop : callable, optional
-            Asked ten times a second whether to wait no longer.
+            Called ten times a second; the wait ends early once it returns True.
         """
         return self._spool.wait(timeout_s, stop)
 
     @property
     def counts(self) -> dict[str, SensorCounts]:
-        """What became of each sensor's measurements so far; a copy."""
+        """Copy of the counts of each sensor's measurements."""
         return self._spool.counts_now()
 
     @property
     def unacked(self) -> int:
-        """Measurements that the central node does not have yet, as far as it has said."""
+        """Number of unacknowledged measurements."""
         return sum(counts.unacked for counts in self.counts.values())
 
     @property
     def central(self) -> Central:
-        """How the central node is, as it says: "storage", "processing", "fault", "closing", or "away"."""
+        """Last reported state of the central node: "storage", "processing", "fault", "closing", or "away"."""
         return "away" if self._link is None else self._link.central
 
     @property
     def refusal(self) -> str:
-        """Why the central node takes nothing of some sensor, and what to do about it; empty where it takes all."""
+        """Reason and remedy if the central node refuses a sensor; empty if it accepts all."""
         return "" if self._link is None else self._link.refusal
 
     @property
     def reconnects(self) -> int:
-        """How often the central node was away and came back."""
+        """Number of reconnections after the central node was away."""
         return 0 if self._link is None else self._link.reconnects
 
     @property
     def is_durable(self) -> bool:
-        """Whether what is kept outlives this process."""
+        """True if kept measurements outlive this process."""
         return self._spool.is_durable

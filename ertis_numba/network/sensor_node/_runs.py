@@ -1,4 +1,4 @@
-"""Runs of sensors on their way to the central node: what of them is held, and how far it has been sent."""
+"""Outgoing sessions of sensors: their items, and the part that was sent."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -14,23 +14,23 @@ __all__ = ["MEMORY_FULL", "NEVER_GIVEN", "OutgoingSession", "UnackedItem"]
 MEMORY_FULL: Final = "the sensor node's memory was full"
 NEVER_GIVEN: Final = "the sensor node never had it"
 
-_GAPS = 64  # at the front of a run; where there are more, the memory is too full to tell them apart
-_PATIENCE_S = 1.0  # without progress, before all under way is sent again; doubled while there is none
+_GAPS = 64  # Limit at the front of a session. With more, the memory is too full to keep them apart.
+_PATIENCE_S = 1.0  # Time without progress before everything under way is sent again; doubled while there is none.
 _MAX_PATIENCE_S = 8.0
 
 
 @dataclass(slots=True, eq=False)
 class UnackedItem:
-    """A measurement or a gap, to be settled in its turn.
+    """Measurement or gap that waits for its acknowledgement.
 
     Attributes
     ----------
     first, last : int
-        Its numbers; one, for a measurement.
+        Numbers; equal for a measurement.
     reason : str
-        Why they are missing; empty for a measurement.
+        Reason of a gap; empty for a measurement.
     n_bytes : int
-        Of its words.
+        Size of its data.
     entry : Entry or None
         The measurement, if it is in memory.
     """
@@ -44,29 +44,29 @@ class UnackedItem:
 
 @dataclass(slots=True, eq=False)
 class OutgoingSession:
-    """The items of one epoch of a sensor, oldest first, and a window over them that is sent: go-back-N.
+    """Items of one session of a sensor, oldest first, with a send window: go-back-N.
 
-    Where sending is, is kept as numbers, so that items may change places or become others meanwhile. Who uses a run
-    sees to it that two threads do not use it at once.
+    Positions are kept as numbers, so that items may be moved or replaced meanwhile. Callers ensure that only one thread
+    uses a session at a time.
 
     Attributes
     ----------
-    sensor : Sensor
+    sensor : JournalSensor
     session_id : int
     journal : Journal or None
-    items : deque of Item
+    items : deque of UnackedItem
     following : int or None
-        The number after the last item; None before the first.
+        Number after the last item; None before the first.
     acked_through : int
-        Up to which the central node has everything.
+        Number up to which the central node has everything.
     sent : int
-        Up to which everything was sent.
+        Number up to which everything was sent.
     reached : int
-        Up to which anything was ever sent: an ack beyond is none of these items'.
+        Number up to which anything was ever sent: an ack beyond it belongs to other items.
     stage : {"new", "asked", "welcome", "waiting"}
-        Of greeting the central node.
+        Stage of the handshake with the central node.
     since_s : float
-        When the stage was reached; of "waiting", when it ends.
+        Start of the stage; for "waiting", its end.
     window : int
     """
 
@@ -81,18 +81,18 @@ class OutgoingSession:
     stage: Literal["new", "asked", "welcome", "waiting"] = "new"
     since_s: float = 0.0
     window: int = 1
-    _under_way: int = 0  # items at the front of which all was sent
+    _under_way: int = 0  # Number of sent items at the front.
     _patience_s: float = field(default_factory=lambda: _PATIENCE_S)
     _moved_s: float = 0.0
     _dropped: deque[int] = field(default_factory=lambda: deque(maxlen=256))
 
     @property
     def key(self) -> tuple[str, int]:
-        """Sensor and epoch."""
+        """Sensor and session."""
         return self.sensor.name, self.session_id
 
     def add_measurement(self, number: int, n_bytes: int, *, entry: Entry | None) -> UnackedItem:
-        """Add a measurement at the end; what is missing before it is a gap, too."""
+        """Add a measurement at the end; missing numbers before it become a gap."""
         self.require_above(number)
         self._fill(number)
         return self._add(UnackedItem(number, number, "", n_bytes, entry))
@@ -101,19 +101,20 @@ class OutgoingSession:
         """Refuse a number that does not rise."""
         if self.following is not None and number < self.following:
             raise ArgumentError(
-                f"measurement {number} of sensor {self.sensor.name} comes after {self.following - 1}; give them in "
-                "order, or with another epoch"
+                f"measurement {number} of sensor {self.sensor.name} follows {self.following - 1}; give rising "
+                "numbers, or another session_id"
             )
 
     def add_gap(self, first: int, last: int, reason: str) -> None:
-        """Add a gap at the end; what is known of its numbers already stays."""
+        """Add a gap at the end; known numbers stay."""
         if self.following is not None:
             first = max(first, self.following)
         if first > last:
             return
         self._fill(first)
         before = self.items[-1] if self.items else None
-        if before is not None and before.reason == reason:  # sent again, even if its beginning was
+        # The extended gap is sent again, even if its beginning was sent.
+        if before is not None and before.reason == reason:
             before.last = last
             self._under_way = min(self._under_way, len(self.items) - 1)
             self.following = last + 1
@@ -132,7 +133,7 @@ class OutgoingSession:
         return item
 
     def forget_oldest(self) -> UnackedItem | None:
-        """Make a gap of the oldest measurement, and return what it was."""
+        """Replace the oldest measurement by a gap, and return the measurement."""
         gaps = []
         while self.items and self.items[0].reason:
             gaps.append(self.items.popleft())
@@ -144,11 +145,11 @@ class OutgoingSession:
         while len(gaps) > 1 and (gaps[-2].reason == MEMORY_FULL or len(gaps) > _GAPS):
             gaps[-2:] = [UnackedItem(gaps[-2].first, gaps[-1].last, MEMORY_FULL)]
         self.items.extendleft(reversed(gaps))
-        self._under_way = 0  # counted again by `to_send`
+        self._under_way = 0  # `to_send` counts again.
         return oldest
 
     def to_send(self, window: int) -> UnackedItem | None:
-        """Return the first item that was not sent, if the window has room for it."""
+        """Return the first unsent item, if the window has room for it."""
         self._count_under_way()
         if self._under_way >= min(window, len(self.items)):
             return None
@@ -159,12 +160,12 @@ class OutgoingSession:
             self._under_way += 1
 
     def under_way(self) -> Iterator[UnackedItem]:
-        """Yield what was sent and is not settled."""
+        """Yield sent but unacknowledged items."""
         self._count_under_way()
         return islice(self.items, self._under_way)
 
     def mark_sent(self, last: int, now_s: float) -> None:
-        """Note that an item was sent."""
+        """Mark an item as sent."""
         if not self._under_way:
             self._moved_s = now_s
         self.sent = max(self.sent, last)
@@ -172,23 +173,23 @@ class OutgoingSession:
         self._count_under_way()
 
     def go_back(self, now_s: float) -> None:
-        """Send everything that is not settled again."""
+        """Send all unacknowledged items again."""
         self.sent, self._under_way, self._moved_s = self.acked_through, 0, now_s
 
     def welcome(self, acked_through: int, window: int, now_s: float) -> list[UnackedItem]:
-        """Begin to send, and return what was settled before."""
+        """Start to send, and return the items that the central node has already."""
         self.stage, self.since_s, self.window = "welcome", now_s, window
         last = -1 if self.following is None else self.following - 1
         acked_through = min(
             acked_through, last
-        )  # it may have more than is left here, as when the end of a spool was lost
+        )  # The central node may have more than is left here, for example if the end of a spool was lost.
         self.reached = max(self.reached, acked_through)
         done = self.settle(acked_through, now_s)
         self.go_back(now_s)
         return done
 
     def settle(self, number: int, now_s: float) -> list[UnackedItem]:
-        """Return what an ack settles, which is not held any more; none where it is late or no ack of this."""
+        """Remove and return the items that an ack covers; none for a late or foreign ack."""
         if not self.acked_through < number <= self.reached:
             return []
         self.acked_through, self._moved_s, self._patience_s = number, now_s, _PATIENCE_S
@@ -202,14 +203,14 @@ class OutgoingSession:
         return done
 
     def is_stuck(self, now_s: float) -> bool:
-        """Whether acks have not moved for too long; asked again, it is patient for longer."""
+        """Return True if acks have made no progress for too long; each time, it waits longer."""
         if not self._under_way or now_s - self._moved_s < self._patience_s:
             return False
         self._patience_s = min(2 * self._patience_s, _MAX_PATIENCE_S)
         return True
 
     def newly_dropped(self, dropped: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
-        """Return those of what an ack says to be thrown away that no ack said before."""
+        """Return the drops of an ack that no earlier ack contained."""
         new = tuple((number, reason) for number, reason in dropped if number not in self._dropped)
         self._dropped.extend(number for number, _ in new)
         return new

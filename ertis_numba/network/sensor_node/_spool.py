@@ -1,4 +1,4 @@
-"""What a sensor node holds until the central node has it: a ring in memory, and what every spool does."""
+"""Spool in memory: a ring buffer of unacknowledged measurements, and the base of all spools."""
 
 import threading
 import time
@@ -19,37 +19,37 @@ if TYPE_CHECKING:
 
 __all__ = ["SensorCounts", "Spool"]
 
-_NAME_CHARACTERS = 64  # of a sensor, on the wire
-_ACKED_IN_ORDER = 1000  # items
+_NAME_CHARACTERS = 64  # Limit on a sensor's name on the wire.
+_ACKED_IN_ORDER = 1000  # Number of items.
 
 
 @dataclass(slots=True)
 class SensorCounts:
-    """What became of one sensor's measurements at its node so far.
+    """Counts of one sensor's measurements at its node.
 
-    ``accepted = stored + taken + overwritten + damaged + unacked``, of those that this process has accepted or found
-    in its spool.
+    ``accepted = stored + taken + overwritten + damaged + unacked``, for measurements that this process has accepted or
+    found in its spool.
 
     Attributes
     ----------
     accepted : int
         Measurements that were kept.
     refused : int
-        Measurements that were not, as the spool had no room.
+        Measurements refused because the spool was full.
     stored : int
-        Measurements that the central node has on its disk, as it says.
+        Measurements acknowledged as stored on the central node's disk.
     taken : int
-        Measurements that it had in memory, as it says.
+        Measurements acknowledged as accepted in its memory.
     dropped : Counter of str
-        Of all these, those that it has thrown away, by reason.
+        Those of them that it has discarded, by reason.
     overwritten : int
-        Measurements that made room in memory for later ones.
+        Measurements replaced in memory by later ones.
     damaged : int
-        Measurements that the spool holds damaged.
+        Damaged measurements in the spool.
     missing : Counter of str
-        Numbers that were told to be missing, by reason, by whoever gives measurements.
+        Numbers reported as missing by the source of the measurements, by reason.
     unacked : int
-        Measurements that are held.
+        Measurements that are kept at present.
     unacked_bytes : int
     """
 
@@ -66,20 +66,20 @@ class SensorCounts:
 
 
 class Spool:
-    """Measurements in memory; where there is no more room, the oldest become gaps.
+    """Measurements in memory; the oldest become gaps if there is no more room.
 
     Parameters
     ----------
     max_bytes : int
-        Of words in memory.
+        Limit on data bytes in memory.
 
     Attributes
     ----------
     turn : threading.RLock
-        To be held while `runs` or `counts` are looked at.
+        Lock for access to `runs` and `counts`.
     acked_through : threading.Condition
-        Of that lock; told whenever something has been settled.
-    runs : dict of (sensor, epoch) to Run
+        Condition of that lock, notified of each acknowledgement.
+    runs : dict of (sensor, session_id) to OutgoingSession
         Oldest first.
     counts : dict of str to SensorCounts
     """
@@ -93,18 +93,18 @@ class Spool:
         self.counts: dict[str, SensorCounts] = {}
         self._sensors: dict[str, JournalSensor] = {}
         self._accepted: dict[str, Settings] = {}
-        self._order: deque[tuple[OutgoingSession, UnackedItem]] = deque()  # of arrival
+        self._order: deque[tuple[OutgoingSession, UnackedItem]] = deque()  # Order of arrival.
 
     def add_sensor(self, sensor: JournalSensor) -> None:
-        """Tell of a sensor before its first measurement, or of what it is in epochs that will follow."""
+        """Register a sensor before its first measurement, or with settings for the following sessions."""
         if len(sensor.name) > _NAME_CHARACTERS:
             raise ArgumentError(
-                f"sensor name {sensor.name!r} has {len(sensor.name)} characters; give {_NAME_CHARACTERS} at most"
+                f"sensor name {sensor.name!r} has {len(sensor.name)} characters; the limit is {_NAME_CHARACTERS}"
             )
         if sensor.n_bytes > self._max_bytes:
             raise ArgumentError(
-                f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, and the memory has room for "
-                f"{self._max_bytes}; give ring_bytes (--ring) that hold some"
+                f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, but the memory has room for "
+                f"{self._max_bytes}; give a larger ring_bytes (--ring)"
             )
         with self.turn:
             self._sensors[sensor.name] = sensor
@@ -112,7 +112,7 @@ class Spool:
             self.counts.setdefault(sensor.name, SensorCounts())
 
     def append(self, entries: Sequence[Entry]) -> list[Entry]:
-        """Keep measurements, and return those that are kept; their CRC-32 is filled in where it is None."""
+        """Keep measurements, and return the kept ones; their CRC-32 is filled in if it is None."""
         with self.turn:
             self.check(entries)
             for entry in entries:
@@ -123,7 +123,7 @@ class Spool:
         return list(entries)
 
     def check(self, entries: Iterable[Entry]) -> None:
-        """Refuse measurements that do not fit to their sensors, or whose numbers do not rise."""
+        """Refuse measurements that do not match their sensors, or whose numbers do not rise."""
         last: dict[tuple[str, int], int] = {}
         for entry in entries:
             settings = entry.measurement.settings
@@ -131,7 +131,7 @@ class Spool:
             if settings is not self._accepted.get(sensor.name):
                 require_same(sensor, settings)
                 self._accepted[sensor.name] = settings
-            # Checked: words are contiguous and little-endian, and numbers are Python's, as what encodes them wants.
+            # The encoder requires contiguous little-endian data and Python integers.
             _, session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(
                 entry, 0
             )
@@ -149,8 +149,8 @@ class Spool:
             key = stamp.sensor, stamp.session_id
             if stamp.sequence <= last.get(key, -1):
                 raise ArgumentError(
-                    f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in "
-                    "order, or with another epoch"
+                    f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; give rising "
+                    "numbers, or another session_id"
                 )
             if key in self.runs:
                 self.runs[key].require_above(stamp.sequence)
@@ -158,11 +158,11 @@ class Spool:
 
     def _known(self, name: str) -> JournalSensor:
         if name not in self._sensors:
-            raise ArgumentError(f"sensor {name!r} is not known to this sensor node; add it first")
+            raise ArgumentError(f"sensor {name!r} is not registered at this sensor node; add it first")
         return self._sensors[name]
 
     def _run(self, sensor: str, session_id: int) -> OutgoingSession:
-        """Return a run, begun if it is new; then earlier ones of this sensor that are empty are over."""
+        """Return a session, created if it is new; empty earlier sessions of this sensor are then finished."""
         key = sensor, session_id
         if key not in self.runs:
             for run in [run for run in self.runs.values() if run.sensor.name == sensor and not run.items]:
@@ -171,7 +171,7 @@ class Spool:
         return self.runs[key]
 
     def _keep(self, run: OutgoingSession, entry: Entry) -> UnackedItem:
-        """Add a measurement that is in memory to its run, and count it."""
+        """Add a measurement in memory to its session, and count it."""
         n_bytes = entry.measurement.data.nbytes
         item = run.add_measurement(entry.measurement.stamp.sequence, n_bytes, entry=entry)
         self._held_bytes += n_bytes
@@ -186,12 +186,12 @@ class Spool:
         counts.unacked_bytes += n_bytes
 
     def _forget_oldest(self) -> None:
-        """Make gaps of the oldest measurements, until the others have room."""
+        """Replace the oldest measurements by gaps, until the others have room."""
         while self._held_bytes > self._max_bytes:
             run, item = self._order.popleft()
-            if item.entry is None:  # settled already
+            if item.entry is None:  # Acknowledged already.
                 continue
-            run.forget_oldest()  # which is this one: both are in the order of arrival
+            run.forget_oldest()  # The oldest is this one: both are in order of arrival.
             item.entry = None
             self._held_bytes -= item.n_bytes
             counts = self.counts[run.sensor.name]
@@ -200,12 +200,12 @@ class Spool:
             counts.unacked_bytes -= item.n_bytes
 
     def _tidy(self) -> None:
-        """Forget the order of what has been settled, which a sensor that is not let in would keep for ever."""
+        """Discard the order of acknowledged items, which a refused sensor would keep for ever."""
         if len(self._order) > 2 * sum(counts.unacked for counts in self.counts.values()) + _ACKED_IN_ORDER:
             self._order = deque(pair for pair in self._order if pair[1].entry is not None)
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Keep which of a sensor's numbers are missing, and why."""
+        """Register missing numbers of a sensor, with their reason."""
         with self.turn:
             self._run(sensor, session_id).add_gap(first, last, reason)
             self.counts[sensor].missing[reason] += last - first + 1
@@ -221,7 +221,7 @@ class Spool:
         status: Literal["stored", "accepted"],
         dropped: Sequence[tuple[int, str]] = (),
     ) -> None:
-        """Let go of what the central node has, and count it."""
+        """Release and count acknowledged items."""
         with self.turn:
             counts = self.counts[run.sensor.name]
             counts.dropped.update(reason for _, reason in dropped)
@@ -245,7 +245,7 @@ class Spool:
             self._held_bytes -= item.n_bytes
 
     def wait(self, timeout_s: float, stop: Callable[[], bool]) -> bool:
-        """Wait until everything is settled, and return whether it is."""
+        """Wait until everything is acknowledged, and return True if it is."""
         with self.turn:
             end_s = time.monotonic() + timeout_s
             while any(run.items for run in self.runs.values()):
@@ -257,7 +257,7 @@ class Spool:
 
     @property
     def is_durable(self) -> bool:
-        """Whether what is held outlives this process."""
+        """True if measurements outlive this process."""
         return False
 
     def counts_now(self) -> dict[str, SensorCounts]:
@@ -269,7 +269,7 @@ class Spool:
             }
 
     def open(self) -> None:
-        """Take up what was left."""
+        """Open measurements left by earlier nodes."""
 
     def close(self) -> None:
-        """End it; what is in memory is lost."""
+        """Close the spool; measurements kept only in memory are lost."""

@@ -1,4 +1,4 @@
-"""What a sensor node says, as it goes over the wire, and what it hears."""
+"""Conversion between items and wire messages."""
 
 import zlib
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ _FIRMWARE_CHARACTERS = 64
 
 @dataclass(frozen=True, slots=True)
 class Acknowledged:
-    """What an ack has brought.
+    """Acknowledgement by the central node.
 
     Attributes
     ----------
     sensor : str
     session_id : int
     acked_through : int
-        Up to which every number is stored or accepted, or known to be missing.
+        Number up to which everything is stored or accepted, or known to be missing.
     status : {"stored", "accepted"}
-        What is settled is on the disk of the central node, or in its memory.
+        Place of the acknowledged measurements: on the central node's disk, or in its memory.
     dropped : tuple of (sequence, reason)
-        What it has thrown away since it said so before.
+        Measurements discarded since the previous acknowledgement.
     """
 
     sensor: str
@@ -42,7 +42,7 @@ class Acknowledged:
 
 
 def greeting(run: OutgoingSession) -> Frames:
-    """Return what introduces a run that has items."""
+    """Return the hello of a session with items."""
     settings = run.sensor.settings.to_toml().encode()
     hello = messages.Hello(
         sensor=run.sensor.name,
@@ -57,7 +57,7 @@ def greeting(run: OutgoingSession) -> Frames:
 
 
 def frames_of(run: OutgoingSession, item: UnackedItem, entry: Entry | None) -> tuple[Frames, int]:
-    """Return an item as it goes over the wire, and its last number as it was then."""
+    """Return the frames of an item, and its last number at that time."""
     if entry is None:
         first, last = item.first, item.last
         gap = messages.Gap(
