@@ -146,7 +146,7 @@ class Subscription:
             self._close()
 
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
-        """Process what is due, or wait up to a tenth of a second.
+        """Do pending work, or wait up to a tenth of a second.
 
         Raises
         ------

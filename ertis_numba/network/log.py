@@ -30,7 +30,7 @@ class EventLog:
     ::
 
         log = logger("central_node")
-        log.warning("conflict", sensor="front", session_id=7, sequence=41, text="stored with another checksum; both are kept")
+        log.warning("conflict", sensor="front", session_id=7, sequence=41, text="both are kept")
 
     Parameters
     ----------

@@ -18,6 +18,9 @@ class Checksums:
     """CRC-32 of the newest measurements by session and number.
 
     Parameters
+    ----------
+    tails : mapping of SensorSession to dict of int to int
+        CRC-32 by session and number, from earlier processes.
     """
 
     def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:

@@ -88,7 +88,7 @@ class Guarded:
             return instead
 
     def start(self, stopping: Callable[[], bool]) -> None:
-        """Start; raise what `ImageProducer.start` raises."""
+        """Start; raise the errors of `ImageProducer.start`."""
         self._images.start(stopping)
 
     def register(self, hello: Hello, settings: Settings) -> None:

@@ -1,4 +1,4 @@
-"""Processing state: worker processes make images of measurements, a publisher hands them to applications."""
+"""Image processing: worker processes make images of measurements, and a publisher sends them to applications."""
 
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.processing import ImageProcessing

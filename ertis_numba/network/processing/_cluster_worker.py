@@ -1,4 +1,4 @@
-"""What the workers of a cluster run: pipelines stay in their processes from one measurement to the next."""
+"""Functions that run on workers of a cluster; pipelines stay in their processes between measurements."""
 
 import threading
 import time
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ClusterResult", "prepare", "process"]
 
-_KEPT: Final = 8  # pipelines of a worker; the one that was used longest ago goes
+_KEPT: Final = 8  # Limit on the pipelines of a worker; the least recently used one is discarded.
 _WORDS = np.dtype("<f4")
 
 _turn = threading.Lock()
@@ -28,16 +28,16 @@ _chains: "OrderedDict[tuple[str, str], SharedPipeline]" = OrderedDict()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterResult:
-    """What came of a measurement.
+    """Result of processing a measurement.
 
     Attributes
     ----------
     image : (direction, range) float32 or float16
     points : (point, 4) float32
-        None of them unless they were asked for.
+        Empty unless points were requested.
     took_s : float
     worker : str
-        Address of the one that made it.
+        Address of the worker.
     """
 
     image: NDArray[Any]
@@ -47,7 +47,7 @@ class ClusterResult:
 
 
 def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
-    """Make the pipeline of a kind of measurements, unless it is there; return what it is, or why there can be none."""
+    """Create the pipeline of a kind of measurements, unless it exists; return its description, or an error text."""
     try:
         chain = _chain(settings, device)
         threads = _threads(device)
@@ -60,7 +60,7 @@ def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
 def process(
     settings: str, device: str, dtype: str, words: "bytes | memoryview", *, points: bool
 ) -> "ClusterResult | str":
-    """Return what is made of a measurement, or why there is nothing that could be."""
+    """Return the products of a measurement, or an error text."""
     begun_s = time.perf_counter()
     try:
         chain = _chain(settings, device)
@@ -80,13 +80,13 @@ def _chain(settings: str, device: str) -> "SharedPipeline":
         if key not in _chains:
             _chains[key] = SharedPipeline(settings, device)
         _chains.move_to_end(key)
-        while len(_chains) > _KEPT:  # who is processing with it has it until that is done
+        while len(_chains) > _KEPT:  # A call that uses the pipeline keeps it until it ends.
             _chains.popitem(last=False)
         return _chains[key]
 
 
 def _threads(device: str) -> int:
-    """Return how many threads one measurement may have, where a worker is given several at once."""
+    """Return the number of threads per measurement on a worker with several at once."""
     from ertis_numba import kernels  # noqa: PLC0415
 
     at_once = int(current_worker().state.nthreads)

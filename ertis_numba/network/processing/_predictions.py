@@ -13,12 +13,12 @@ __all__ = ["Predictions"]
 
 
 class Predictions:
-    """Predictions for the first images of sensors; one at a time.
+    """Predictions for the first images of sensors, one at a time.
 
     Attributes
     ----------
     busy : bool
-        A prediction is not finished, or not yet drained.
+        True while a prediction is not finished, or not yet drained.
     """
 
     def __init__(self, device: str) -> None:
@@ -29,7 +29,7 @@ class Predictions:
 
     @property
     def busy(self) -> bool:
-        """A prediction is not finished, or not yet drained."""
+        """True while a prediction is not finished, or not yet drained."""
         return bool(self._waiting or self._found or self._thread)
 
     def add(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
@@ -55,7 +55,7 @@ class Predictions:
         try:
             match = call_match(measurement)
         except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
-            text = f"echoes are not compared with the call: {type(error).__name__}: {error}"
+            text = f"echoes were not compared with the call: {type(error).__name__}: {error}"
         else:
             text = match.warning if match else ""
         if text:
@@ -64,17 +64,17 @@ class Predictions:
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
         self._report_call(sensor, measurement)
         if image.settings.processing.method == "paper" or not image.amplitude.any():
-            return  # the paper's method has no plan, and silence no relative error
+            return  # The paper's method has no plan, and silence no relative error.
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
         from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
 
         try:
             needed = memory_bytes(image)
             if needed > MAX_MEMORY_BYTES:
-                text = f"the error of images is not predicted: that takes {needed / 1e6:.0f} MB"
+                text = f"the error of images was not predicted: that would need {needed / 1e6:.0f} MB"
             else:
                 text = predict(planner_of(image, measurement, kernels.load(self._device), threads=1)).warning
         except Exception as error:  # noqa: BLE001  a failed prediction must not end a worker that makes images
-            text = f"the error of images is not predicted: {type(error).__name__}: {error}"
+            text = f"the error of images was not predicted: {type(error).__name__}: {error}"
         if text:
             self._found.append(Predicted(sensor=sensor, event="error_budget", warning=text))

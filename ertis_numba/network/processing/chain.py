@@ -1,4 +1,4 @@
-"""What a worker, of this machine or of a cluster, does with a measurement."""
+"""Pipeline of a worker process, on this machine or in a cluster."""
 
 import statistics
 import time
@@ -21,24 +21,24 @@ __all__ = ["SharedPipeline"]
 MAX_BYTES: Final = 1_000_000_000
 """Limit on the memory of one pipeline; a sensor's settings determine its size."""
 
-_TIMED: Final = 5  # measurements, whose median counts
+_TIMED: Final = 5  # Number of measurements, of which the median counts.
 
 
 class SharedPipeline:
-    """A pipeline for one kind of measurements, from their bytes to images and points; threads may share it.
+    """Pipeline for one kind of measurements, from their bytes to images and points; thread-safe.
 
     Parameters
     ----------
     settings : str
-        As TOML.
+        Settings as TOML.
     device : {"auto", "cpu", "cuda", "numpy"}
 
     Attributes
     ----------
     pipeline : Pipeline
     shape : (direction, range)
-        Of its images.
-    format : WordFormat
+        Shape of its images.
+    format : SampleFormat
         Layout of the samples in a measurement.
     """
 
@@ -57,21 +57,23 @@ class SharedPipeline:
         Raises
         ------
         DataError
-            They are not as many as the settings say.
+            The number of bytes does not match the settings.
         """
         if len(words) != self.format.n_bytes:
-            raise DataError(f"a measurement has {len(words)} bytes, which its settings do not say; say Hello again")
+            raise DataError(
+                f"a measurement has {len(words)} bytes, which does not match its settings; send Hello again"
+            )
         array = self.format.from_bytes(words)
         return self.pipeline.process(Measurement(array, self.pipeline.settings), out, threads=threads)
 
     def points(self, image: Energyscape, largest: int) -> NDArray[np.float32]:
-        """Return the points of an image, ``(point, 4)``: x, y, z in m and the energy; the strongest come first."""
+        """Return the points of an image, ``(point, 4)``: x, y, z in m and the amplitude; the strongest come first."""
         cloud = self._extractor(image)
         rows: NDArray[np.float32] = np.column_stack([cloud.position_m, cloud.amplitude]).astype("<f4")[:largest]
         return rows
 
     def times_s(self, threads: int, at_once: int) -> tuple[float, float]:
-        """Return how long one measurement takes on all threads, and as one of several at once that share them."""
+        """Return the time of one measurement on all threads, and of one among several that share the threads."""
         silence = bytes(self.format.n_bytes)
         out = np.empty(self.shape, np.float32)
         wide_s = _median_s(lambda: self.image(silence, out, threads=threads))
@@ -81,7 +83,7 @@ class SharedPipeline:
         return wide_s, _median_s(lambda: self.image(silence, out, threads=share))
 
     def prepared(self, kind: int, wide_s: float, many_s: float) -> Prepared:
-        """Return what the central node needs to know of it."""
+        """Return the description of the pipeline for the central node."""
         axes = (self.pipeline.grid.azimuth_rad, self.pipeline.grid.elevation_rad, self.pipeline.range_m)
         azimuth_rad, elevation_rad, range_m = (axis.astype("<f8").tobytes() for axis in axes)
         return Prepared(

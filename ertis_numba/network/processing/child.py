@@ -1,4 +1,4 @@
-"""Processes of a central node, each with a pipe; they end when the central node does, however that does."""
+"""Child processes of a central node, each with a pipe; they end with the central node, even if it is killed."""
 
 import os
 import select
@@ -21,21 +21,21 @@ _REAPED_S: Final = 5.0
 
 
 class Child(Generic[Kind]):
-    """A Python process that runs a module of this package.
+    """Python process that runs a module of this package.
 
-    It is a new interpreter rather than a fork, which OpenMP and ZeroMQ would not survive, and it does not load the
-    program that started it again, as `multiprocessing` would.
+    It is a new interpreter rather than a fork, which OpenMP and ZeroMQ would not survive. Unlike a process of
+    `multiprocessing`, it does not import the main program.
 
     Parameters
     ----------
     module : str
-        To run; it begins with `pipe_of_child`.
+        Module to run; it begins with `pipe_of_child`.
     kinds : type
-        Of messages that it sends.
+        Messages that it sends.
     arguments : sequence of str
-        For the module; anybody can read them.
+        Arguments of the module; every user of the machine can read them.
     environment : dict, optional
-        Variables that it has besides those of this process.
+        Variables in addition to those of this process.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Child(Generic[Kind]):
                     stdout=subprocess.DEVNULL,
                     pass_fds=[theirs.fileno()],
                     env={**os.environ, **(environment or {})},
-                    process_group=0,  # Ctrl-C in a terminal is for the central node
+                    process_group=0,  # Ctrl-C in a terminal is meant for the central node.
                 )
             except BaseException:
                 ours.close()
@@ -64,17 +64,17 @@ class Child(Generic[Kind]):
         self.pid = self._process.pid
 
     def kill(self) -> None:
-        """End it at once, whatever it does."""
+        """Kill the process at once."""
         with suppress(OSError):
             self._process.kill()
 
     @property
     def ended(self) -> bool:
-        """Whether the process is gone, and can write to no memory any more."""
+        """True if the process is gone, and can write to no memory any more."""
         return self._process.poll() is not None
 
     def close(self, timeout_s: float = 0.0) -> None:
-        """Let it end by itself, but kill it after a while, and wait until it is gone."""
+        """Let the process end by itself, kill it after a timeout, and wait until it is gone."""
         self.pipe.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
@@ -84,16 +84,16 @@ class Child(Generic[Kind]):
 
 
 def pipe_of_child(arguments: list[str], kinds: Any) -> "Pipe[Any]":
-    """Return the pipe to the process that started this one, which from now on ends with that.
+    """Return the pipe to the parent process; this process ends with the parent from now on.
 
     Parameters
     ----------
     arguments : list of str
         ``sys.argv``.
     kinds : type
-        Of messages that come.
+        Messages that the parent sends.
     """
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # it is the other process that says when to end
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # The parent decides when this process ends.
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     end = socket.socket(fileno=int(arguments[1]))
     threading.Thread(target=_end_with, args=(end.fileno(),), daemon=True).start()

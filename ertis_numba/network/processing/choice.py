@@ -1,4 +1,4 @@
-"""Whether a measurement gets all cores, or several get a share of them at once."""
+"""Choice between one measurement on all cores and several that share them."""
 
 import statistics
 import time
@@ -8,27 +8,27 @@ from typing import Final
 
 __all__ = ["Choice", "Load", "Mode"]
 
-_BUSY: Final = 0.8  # share of the time above which the cores have to be shared better …
-_CALM: Final = 0.7  # … and below which one measurement at a time is served soonest
+_BUSY: Final = 0.8  # Share of busy time above which measurements share the cores, …
+_CALM: Final = 0.7  # … and below which each gets all cores.
 _LOOK_S: Final = 3.0
 _KEPT: Final = 32
-_RATE_S: Final = 3.0  # over which the load is told
-_GAIN: Final = 1.05  # that a change has to bring, as times are never quite the same
+_RATE_S: Final = 3.0  # Interval over which the load is measured.
+_GAIN: Final = 1.05  # Required gain of a change, because times fluctuate.
 
 
 class Load:
-    """How often measurements arrive."""
+    """Rate of arriving measurements."""
 
     def __init__(self) -> None:
         self._arrivals_s: deque[float] = deque()
         self._begun_s = time.monotonic()
 
     def add(self, now_s: float) -> None:
-        """Count a measurement; ``now_s`` is that of `time.monotonic`."""
+        """Count a measurement; ``now_s`` is a time of `time.monotonic`."""
         self._arrivals_s.append(now_s)
 
     def rate_hz(self, now_s: float) -> float:
-        """Return how often they have come lately."""
+        """Return the recent rate."""
         while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_S:
             self._arrivals_s.popleft()
         return len(self._arrivals_s) / min(_RATE_S, max(now_s - self._begun_s, 0.5))
@@ -36,29 +36,29 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """How many measurements are processed at once, on how many threads each."""
+    """Number of measurements processed at once, and threads of each."""
 
     at_once: int
     threads: int
 
 
 class Choice:
-    """Chooses by measured times and the measured load.
+    """Choice by measured times and load.
 
-    One measurement on all cores is done soonest; several at once, with a share of the cores each, wait less for each
-    other and get more done.
+    One measurement on all cores is done soonest. Several at once, with a share of the cores each, wait less for each
+    other and give a higher throughput.
 
     Parameters
     ----------
     workers : int
     threads : int
-        Of all of them.
+        Threads of all workers together.
 
     Attributes
     ----------
     mode : Mode
     why : str
-        In a line.
+        Reason in one line.
     """
 
     def __init__(self, workers: int, threads: int) -> None:
@@ -66,20 +66,20 @@ class Choice:
         self.mode = self.wide
         self._times_s: dict[Mode, deque[float]] = {mode: deque(maxlen=_KEPT) for mode in (self.wide, self.many)}
         self._next_s = 0.0
-        self.why = f"{self._named(self.mode)}: no time is known yet"
+        self.why = f"{self._named(self.mode)}: no time measured yet"
 
     def seed(self, wide_s: float, many_s: float) -> None:
-        """Take what was measured before the first job."""
+        """Add times that were measured before the first job."""
         for mode, time_s in ((self.wide, wide_s), (self.many, many_s)):
             if time_s > 0:
                 self._times_s[mode].append(time_s)
 
     def took(self, mode: Mode, time_s: float) -> None:
-        """Take how long a job has taken."""
+        """Add the time of a job."""
         self._times_s[mode].append(time_s)
 
     def look(self, now_s: float, rate_hz: float) -> bool:
-        """Choose again, if it is time; return whether it is another mode now.
+        """Choose again, if due; return True if the mode has changed.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Choice:
             return False
         self._next_s = now_s + _LOOK_S
         if self.wide == self.many:
-            self.why = f"{self._named(self.wide)}: there is nothing to choose"
+            self.why = f"{self._named(self.wide)}: the only mode"
             return False
         before = self.mode
         wide_s, many_s = (statistics.median(self._times_s[mode]) for mode in (self.wide, self.many))

@@ -1,4 +1,4 @@
-"""Which sensors have to pause: workers fail with their measurements, which costs the others of their time."""
+"""Circuit breaker that suspends sensors whose measurements make workers fail."""
 
 import time
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from typing import Final
 
 __all__ = ["CircuitBreaker"]
 
-_IN_A_ROW: Final = 3  # measurements of a sensor that have failed twice, after which it has to pause …
-_PAUSE_S: Final = 10.0  # … for that long, and twice as long each further time
+_IN_A_ROW: Final = 3  # Number of successive measurements of a sensor that fail twice, after which it is suspended …
+_PAUSE_S: Final = 10.0  # … for this time, doubled at each further suspension.
 _LONGEST_PAUSE_S: Final = 640.0
 
 
@@ -19,18 +19,18 @@ class _Failing:
 
 
 class CircuitBreaker:
-    """Sensors whose measurements have failed, until one has not."""
+    """Sensors with successive failures."""
 
     def __init__(self) -> None:
         self._failing: dict[str, _Failing] = {}
 
     def holds(self, sensor: str, now_s: float) -> bool:
-        """Whether a sensor has to pause; ``now_s`` is that of `time.monotonic`."""
+        """Return True if a sensor is suspended; ``now_s`` is a time of `time.monotonic`."""
         failing = self._failing.get(sensor)
         return failing is not None and now_s < failing.until_s
 
     def failed(self, sensor: str) -> float:
-        """Count a measurement that has failed twice; return how long its sensor has to pause now, in s, if at all."""
+        """Count a measurement that has failed twice; return the suspension of its sensor in s, 0 if there is none."""
         failing = self._failing.setdefault(sensor, _Failing())
         failing.in_a_row += 1
         if failing.in_a_row < _IN_A_ROW:
@@ -40,5 +40,5 @@ class CircuitBreaker:
         return failing.pause_s
 
     def succeeded(self, sensor: str) -> None:
-        """Forget what has failed of a sensor."""
+        """Reset the failures of a sensor."""
         self._failing.pop(sensor, None)

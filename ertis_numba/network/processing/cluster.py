@@ -1,4 +1,4 @@
-"""Jobs on the workers of a dask cluster that is there already, for more than one machine."""
+"""Jobs on the workers of an existing dask cluster, for several machines."""
 
 import asyncio
 import threading
@@ -36,7 +36,7 @@ _LOOK_S: Final = 1.0
 
 @dataclass(slots=True, eq=False)
 class _Member:
-    """A worker of the cluster, and the line to it."""
+    """Worker of the cluster, with the connection to it."""
 
     address: str
     line: Any
@@ -50,7 +50,7 @@ class _Member:
 
 @dataclass(slots=True, eq=False)
 class _Attempt:
-    """A job on its way, and where its image is to go."""
+    """Job under way, with the slot for its image."""
 
     job: Job
     slot: Slot
@@ -58,21 +58,20 @@ class _Attempt:
 
 
 class Cluster:
-    """A `Runner` whose jobs run on the workers of a dask scheduler.
+    """`Runner` whose jobs run on the workers of a dask scheduler.
 
-    The scheduler says which workers there are; measurements and images go over a `Line` to each, of which it knows
-    nothing. Pipelines stay in the processes of these workers, which need this package, of the same version. Each has
-    as many jobs under way as it has threads: more of them, so that one is on its way while another is made, took 30 ms
-    instead of 23 and were no more in a second. A worker that does not answer by the deadline, or whose line breaks, is
-    left alone until it is reached again. Whoever reaches a scheduler can run code on its workers: keep it among
-    machines that trust each other, or use dask's TLS.
+    The scheduler lists the workers; measurements and images go directly to and from each worker. Pipelines stay in the
+    processes of these workers, which need the same version of this package. Each worker has as many jobs under way as
+    threads. With more jobs, which would overlap transfer and processing, each took 30 ms instead of 23 ms at the same
+    throughput. A worker that misses the deadline, or whose connection breaks, gets no jobs until it is reached again.
+    Anyone who reaches a scheduler can run code on its workers: keep it among trusted machines, or use dask's TLS.
 
     Parameters
     ----------
-    options : Options
-        Its deadlines, device and type of images count, and ``cluster``, the scheduler's address.
+    options : ProcessingOptions
+        Deadlines, device, type of images, and the scheduler's address ``cluster``.
     log : callable
-        Called with lines about what happens.
+        Called with a line for each event.
 
     Attributes
     ----------
@@ -107,7 +106,7 @@ class Cluster:
 
     @property
     def choice(self) -> str:
-        """How measurements share the cluster."""
+        """Distribution of measurements over the cluster."""
         workers, threads = len(self._members), sum(member.threads for member in self._members.values())
         return f"up to {threads} at a time on {workers} workers of the cluster at {self._address}"
 
@@ -118,7 +117,7 @@ class Cluster:
         self._ask_to_prepare()
 
     def _ask_to_prepare(self) -> None:
-        """Let each worker that has not been asked get ready for each kind."""
+        """Have each worker prepare each kind that it was not asked for."""
         for member in self._members.values():
             for kind in self._kinds.values():
                 if kind.number not in member.asked:
@@ -139,14 +138,14 @@ class Cluster:
         return kind.number in self._prepared and self._idle(kind) is not None
 
     def _idle(self, kind: JobKind) -> _Member | None:
-        """Return the worker with the least to do of those that can take a job of a kind."""
+        """Return the least busy worker that can run a job of a kind."""
         able = [each for each in self._members.values() if kind.number in each.ready and each.busy < each.threads]
         return min(able, key=lambda member: member.busy / member.threads, default=None)
 
     def submit(self, job: Job) -> None:
         """See `Runner`."""
         if (member := self._idle(job.kind)) is None:
-            raise AssertionError("a job is submitted that no worker takes; ask takes() first")
+            raise AssertionError("a job was submitted that no worker can accept; call takes() first")
         attempt = _Attempt(job, self._slot_for(job), member)
         self._attempts.add(attempt)
         member.busy += 1
@@ -163,8 +162,9 @@ class Cluster:
         words: memoryview | None = None,
         slot: Slot | None = None,
     ) -> None:
-        """Have a worker call something, with words if there are some, and tell of it; an image is put into a slot."""
-        sent = () if words is None else (words,)  # beside the call, as what is within it is copied
+        """Call a function on a worker, with samples if given, and report the result; an image is copied into a slot."""
+        # Samples are passed beside the call, because its own contents are copied.
+        sent = () if words is None else (words,)
 
         async def ask() -> None:
             result, text = None, ""
@@ -173,7 +173,7 @@ class Cluster:
                 if isinstance(result, there.ClusterResult) and slot is not None:
                     result = _kept(result, slot)
             except TimeoutError:
-                text = "it was not done in time"
+                text = "it missed the deadline"
             except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
                 text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
             self._emit_event(*event, result, text)
@@ -181,7 +181,7 @@ class Cluster:
         self._client.loop.add_callback(ask)
 
     def _slot_for(self, job: Job) -> Slot:
-        """Return a slot that is large enough, with the measurement in it, for whoever wants it raw."""
+        """Return a slot that is large enough, with the measurement in it for raw products."""
         shape = self._prepared[job.kind.number].shape
         image_bytes = int(np.prod(shape)) * np.dtype(self._options.dtype).itemsize
         words_bytes = job.words.nbytes
@@ -230,7 +230,7 @@ class Cluster:
         self._wakeup_socket.close()
 
     def _look(self) -> None:
-        """Follow which workers there are; in a thread of its own, as the scheduler may take its time."""
+        """Follow the list of workers, in a separate thread, because the scheduler may be slow."""
         lines = WorkerActors(self._client)
         while not self._closing.is_set():
             try:
@@ -247,7 +247,7 @@ class Cluster:
             self._closing.wait(_LOOK_S)
 
     def _emit_event(self, *event: Any) -> None:
-        """Hand something over to the loop; called in other threads."""
+        """Pass an event to the loop; other threads call this."""
         self._events.append(event)
         self._wakeup_socket.wake()
 
@@ -276,14 +276,14 @@ class Cluster:
         self._ask_to_prepare()
 
     def _leave(self, member: _Member, text: str) -> None:
-        """Give a worker nothing more, unless it is reached again."""
+        """Give a worker no more jobs until it is reached again."""
         if self._members.get(member.address) is member:
             del self._members[member.address]
             self.respawned += 1
-            self._log(f"worker {member.address} is given nothing more: {text}")
+            self._log(f"worker {member.address} gets no more jobs: {text}")
 
     def _became_ready(self, kind: JobKind, member: _Member, result: Any, text: str) -> list[Event]:
-        if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
+        if self._kinds.get(kind.number) is not kind:  # The kind was discarded meanwhile.
             return []
         is_first = kind.number not in self._prepared
         if isinstance(result, Prepared):
@@ -292,13 +292,13 @@ class Cluster:
                 self._prepared[kind.number] = result
                 self._log(f"measurements are processed {self.choice}")
             return [KindReady(result)] if is_first else []
-        if isinstance(result, str) and is_first:  # a pipeline that no worker can make
+        if isinstance(result, str) and is_first:  # No worker can make this pipeline.
             return [KindFailed(kind.number, result)]
         if result is None:
             self._leave(member, text)
         else:
             reported = result.text if isinstance(result, RemoteError) else result
-            self._log(f"worker {member.address} cannot get ready: {reported}")
+            self._log(f"worker {member.address} cannot prepare: {reported}")
         return []
 
     def _finished(self, attempt: _Attempt, result: Any, text: str) -> Event:
@@ -310,16 +310,16 @@ class Cluster:
             member.done += 1
             return FinishedJob(job, result.took_s)
         self._free.append(slot)
-        if isinstance(result, str):  # of which nothing can be made
+        if isinstance(result, str):  # The measurement cannot be processed.
             return Lost(job, result, again=False)
         if isinstance(result, RemoteError):
             return Lost(job, result.text, again=True)
-        self._leave(member, text)  # so that the other try is another's
+        self._leave(member, text)  # Another worker gets the second try.
         return Lost(job, text, again=True)
 
 
 def _kept(made: there.ClusterResult, slot: Slot) -> there.ClusterResult:
-    """Put what was made into a slot; in the thread of the client."""
+    """Copy a result into a slot; runs in the thread of the client."""
     np.copyto(slot.view.image_as(made.image.shape, made.image.dtype), made.image)
     slot.view.points(made.points.nbytes)[:] = made.points.tobytes()
-    return replace(made, image=made.image[:0])  # which is large, and not needed any more
+    return replace(made, image=made.image[:0])  # The image is large, and not needed any more.

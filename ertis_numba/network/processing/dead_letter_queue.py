@@ -1,4 +1,4 @@
-"""Where measurements are kept that workers have died of, so that somebody can find out why."""
+"""Dead-letter queue of measurements that made workers fail, for later analysis."""
 
 import queue
 import threading
@@ -19,20 +19,20 @@ from ertis_numba.settings import Settings
 __all__ = ["DeadLetterQueue", "entry_of"]
 
 _WAITING: Final = 16
-_MAX: Final = 100  # measurements that are kept: what is wrong with one sensor must not fill a disk
+_MAX: Final = 100  # Limit on kept measurements: a fault of one sensor must not fill a disk.
 _CLOSED_S: Final = 2.0
 
 
 class DeadLetterQueue:
-    """Writes measurements into a journal, from a thread: a slow disk delays nobody.
+    """Writer of measurements into a journal, in a separate thread, so that a slow disk delays nothing.
 
-    ``ertis recover`` makes a recording of it.
+    ``ertis recover`` makes a recording of the journal.
 
     Parameters
     ----------
     folder : Path
-    log : Log
-        Told what goes wrong.
+    log : EventLog
+        Log of failures.
     """
 
     def __init__(self, folder: Path, log: EventLog) -> None:
@@ -44,9 +44,9 @@ class DeadLetterQueue:
         self._thread.start()
 
     def put(self, entry: Entry) -> None:
-        """Keep a measurement, unless there are many already or the disk is far behind."""
+        """Queue a measurement, unless too many are kept or the disk is far behind."""
         if self._kept >= _MAX:
-            self._lost(entry, f"{_MAX} are kept already; see what is wrong with them")
+            self._lost(entry, f"{_MAX} measurements are kept already; analyse these first")
             return
         self._kept += 1
         try:
@@ -55,7 +55,7 @@ class DeadLetterQueue:
             self._lost(entry, "the disk is too slow")
 
     def close(self) -> None:
-        """End it, when what waits is written; a disk that does not answer is not waited for."""
+        """Write the waiting measurements and close; a disk that does not answer is not waited for."""
         with suppress(queue.Full):
             self._waiting.put(None, timeout=_CLOSED_S)
         self._thread.join(_CLOSED_S)
@@ -78,7 +78,7 @@ class DeadLetterQueue:
         if self._journal is not None:
             try:
                 self._append(self._journal, measurement, entry)
-            except ArgumentError:  # numbers that do not rise, or other settings: that needs another journal
+            except ArgumentError:  # Numbers that do not rise, or other settings, need another journal.
                 self._journal.close()
                 self._journal = None
             else:
@@ -86,7 +86,7 @@ class DeadLetterQueue:
         target = self._folder / f"quarantine_{datetime.now(UTC):%Y%m%dT%H%M%S_%fZ}.h5"
         self._journal = Journal.create(target.with_name(target.name + SUFFIX), target=target.name, source="quarantine")
         self._append(self._journal, measurement, entry)
-        self._log.warning("quarantine", text=f"see what is kept by 'ertis recover {self._journal.path}'")
+        self._log.warning("quarantine", text=f"recover the kept measurements with 'ertis recover {self._journal.path}'")
 
     @staticmethod
     def _append(journal: Journal, measurement: Measurement, entry: Entry) -> None:
@@ -96,7 +96,7 @@ class DeadLetterQueue:
 
 
 def entry_of(job: Job, settings: Settings) -> Entry | None:
-    """Return the measurement of a job whose sensor has such settings, None if they are not of its words."""
+    """Return the measurement of a job with the settings of its sensor; None if its data does not match them."""
     data, content = job.data, bytes_of(job.words)
     words = sample_format(settings)
     if len(content) != words.n_bytes:

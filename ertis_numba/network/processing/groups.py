@@ -1,4 +1,4 @@
-"""Which measurements were emitted together, as the SYNC chain says."""
+"""Groups of simultaneous measurements, formed by the SYNC chain's counts."""
 
 import time
 from collections import Counter, deque
@@ -10,30 +10,30 @@ from ertis_numba.network.messages import Data, Group
 
 __all__ = ["Groups"]
 
-_RUNS: Final = 32  # that can be compared at a time
+_RUNS: Final = 32  # Limit on the sessions that are compared.
 _OPEN: Final = 32
-_MAX: Final = 32  # that the header of a group can name
-_SHORTEST_S: Final = 0.02  # between pulses, while that is not known
-_MIN_S, _INTERVALS = 1.0, 10.0  # that an incomplete group waits for: that long, or so many intervals
-_RECENT: Final = 256  # closed groups, that are not opened again
+_MAX: Final = 32  # Limit on the members in the header of a group.
+_SHORTEST_S: Final = 0.02  # Assumed interval between pulses, until it is known.
+_MIN_S, _INTERVALS = 1.0, 10.0  # Time that an incomplete group stays open: this long, or this number of intervals.
+_RECENT: Final = 256  # Number of closed groups that are not opened again.
 _FUTURE_S: Final = 0.5
-_PACE_S, _PACE = 2.0, 0.1  # a clock that stays behind for so long, but for that share of it, is wrong
-_FAR: Final = 128  # pulses that a count may be away from where time has got: less than `_RECENT`
+_PACE_S, _PACE = 2.0, 0.1  # A clock is wrong if it lags by this share over this time.
+_FAR: Final = 128  # Allowed difference between a count and the time, in pulses: less than `_RECENT`.
 _MAX_NS: Final = 2**63 - 1
-_AWAY: Final = 3.0  # as many times that: a sensor that has sent nothing for so long is not waited for
+_AWAY: Final = 3.0  # Multiple of that time after which a silent sensor is not waited for.
 
 Flag = Literal["incomplete", "clock", "pulse"]
 
 
 @dataclass(slots=True)
 class _SessionClock:
-    """A run: its measurements share a counter, and a clock."""
+    """Session of a sensor: its measurements share a counter and a clock."""
 
     slot: str
-    ahead_ns: int  # of its clock that nobody sets, to the one of all
-    count: int  # at which it began …
-    began_ns: int  # … by the clock of all
-    paced_ns: tuple[int, int]  # since when it is looked at whether it is behind, by the clock of all and of this node
+    ahead_ns: int  # Offset from its monotonic clock to the common clock.
+    count: int  # Count at the start …
+    began_ns: int  # … and the start by the common clock.
+    paced_ns: tuple[int, int]  # Start of the observation of its lag, by the common clock and by this node's.
     used_ns: int = 0
 
 
@@ -45,20 +45,19 @@ class _Group:
 
 
 class Groups:
-    """Puts together what has the same number of a pulse.
+    """Grouping of measurements with the same pulse number.
 
-    Within a run (epoch) sensors have the same SYNC count. Counts of several runs differ by an offset that is found
-    by time: by the timestamp of the first measurement, and from then on by the sensor node's clock that nobody sets,
-    so that a clock which is set by an hour puts no measurement into another group. Where that time cannot be, as it is
-    yet to come, or is long ago although no older measurements are being caught up with, the time of arrival counts. A
-    count that is not where time has got is compared anew, like that of another run: whatever one sensor says, it moves
-    no groups of others.
+    Within a session, sensors have the same SYNC count. Counts of several sessions differ by an offset that is found
+    from times. The offset comes from the timestamp of the first measurement, and then from the sensor node's monotonic
+    clock. A system clock that is set by an hour therefore moves no measurement into another group. If a timestamp is
+    impossible, the time of arrival counts: it lies in the future, or long ago although no older measurements are being
+    caught up with. A count that contradicts the time is aligned again, like that of a new session. Wrong data of one
+    sensor never moves groups of others.
 
     Attributes
     ----------
     closed : Counter of str
-        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of groups that were
-        closed already.
+        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of closed groups.
     """
 
     def __init__(self) -> None:
@@ -70,8 +69,8 @@ class Groups:
         self._groups: dict[int, _Group] = {}
         self._recent: deque[int] = deque(maxlen=_RECENT)
         self._realigned = 0
-        self._joined_ns: int | None = None  # when the latest sensor that was not known came
-        self._ahead_ns: int | None = None  # of the clock of all, to the one of this node
+        self._joined_ns: int | None = None  # Time at which the latest new sensor joined.
+        self._ahead_ns: int | None = None  # Offset from the common clock to this node's.
         self.closed: Counter[str] = Counter()
 
     def register(self, sensor: str, now_ns: int) -> None:
@@ -81,14 +80,14 @@ class Groups:
         self._seen_ns[sensor] = now_ns
 
     def add(self, data: Data, arrived_ns: int) -> list[Group]:
-        """Take a measurement, and return the groups that are closed now."""
+        """Add a measurement, and return the groups that are now closed."""
         run = self._checked(self._run(data, arrived_ns), data, arrived_ns)
         run.used_ns = self._seen_ns[data.sensor] = arrived_ns
         self._place(self._pulses.add(run.slot, (data, arrived_ns), data.sync_count, data.monotonic_ns + run.ahead_ns))
         return self._close(arrived_ns)
 
     def tick(self, now_ns: int) -> list[Group]:
-        """Return the groups that are closed now, as time has passed."""
+        """Return the groups that are now closed because of elapsed time."""
         if self._ahead_ns is not None:
             self._place(self._pulses.release(now_ns + self._ahead_ns))
         return self._close(now_ns)
@@ -108,18 +107,18 @@ class Groups:
             self._ahead_ns = min(at_ns, time.time_ns()) - arrived_ns
         now_ns = arrived_ns + self._ahead_ns
         if at_ns - now_ns > _FUTURE_S * 1e9:
-            at_ns = now_ns  # nothing comes before it was measured: that clock is wrong
+            at_ns = now_ns  # A measurement cannot arrive before its emission: that clock is wrong.
         made = _SessionClock(slot, at_ns - data.monotonic_ns, data.sync_count, at_ns, (at_ns, arrived_ns))
         self._runs[data.session_id] = made
         return made
 
     def _checked(self, run: _SessionClock, data: Data, arrived_ns: int) -> _SessionClock:
-        """Return the run as it is to be used: begun anew, if its time or its count cannot be right."""
+        """Return the session to use: a new one if its time or its count cannot be right."""
         at_ns = data.monotonic_ns + run.ahead_ns
         if self._ahead_ns is None:
             return run
         if at_ns - arrived_ns > self._ahead_ns and at_ns <= time.time_ns():
-            self._ahead_ns = at_ns - arrived_ns  # what came until now was old, and is caught up with
+            self._ahead_ns = at_ns - arrived_ns  # Measurements until now were old ones that the node catches up with.
         now_ns = arrived_ns + self._ahead_ns
         since_ns, came_ns = run.paced_ns
         behind = now_ns - at_ns > _MIN_S * 1e9
@@ -151,7 +150,7 @@ class Groups:
         """Close groups in order: one closes when it is complete, too old, or followed by too many."""
         patience_ns = max(_MIN_S * 1e9, _INTERVALS * self._pulses.interval_ns)
         sensors = {name for name, seen_ns in self._seen_ns.items() if now_ns - seen_ns < _AWAY * patience_ns}
-        # Sensors come one after the other at first: until then, nobody knows who is to be waited for.
+        # At first, sensors join one after the other; until then, the set of sensors is unknown.
         all_here = self._joined_ns is not None and now_ns - self._joined_ns > _MIN_S * 1e9
         ready = [
             number

@@ -1,4 +1,4 @@
-"""What to make of measurements, and with what."""
+"""Options of image processing."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,40 +15,40 @@ __all__ = ["ProcessingOptions"]
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessingOptions:
-    """What to make of measurements, and with what.
+    """Options of image processing.
 
     Attributes
     ----------
     publish : str
-        Address at which applications subscribe.
+        Address for applications.
     keys : ServerKeys, optional
-        Without them, on loopback only.
+        None on loopback only.
     processing : dict
-        Fields of `ertis_numba.settings.Processing` that are to be other than a sensor says.
+        Fields of `ertis_numba.settings.Processing` that override a sensor's own.
     max_error_db : float, optional
-        Error that images may have, if other than a sensor says.
+        Error budget of images; the sensor's own by default.
     device : {"auto", "cpu", "cuda", "numpy"}
     workers : int, optional
-        Processes; one for each core, or one for a GPU, by default.
+        Number of processes; by default one for each core, or one for a GPU.
     threads : int, optional
-        Of all workers together; all cores by default.
+        Threads of all workers together; all cores by default.
     deadline_s : float
-        After which a worker that is not done with a measurement is killed.
+        Timeout of a measurement, after which its worker is killed.
     prepare_s : float
-        After which it is killed if it is not ready for a sensor, the compilation of kernels included.
+        Timeout of preparing for a sensor, the compilation of kernels included.
     dtype : {"float32", "float16"}
-        Of images that are sent.
+        Type of published images.
     quarantine : Path, optional
-        Folder for measurements that two workers have died of.
+        Folder of the dead-letter queue, for measurements that made two workers fail.
     expected : Settings, optional
-        Of a sensor that is likely to come: workers get ready for it before it does.
+        Settings of a likely sensor: workers prepare for it in advance.
     cluster : str, optional
-        Address of a dask scheduler whose workers are to be used instead of local ones.
+        Address of a dask scheduler whose workers replace local ones.
 
     Raises
     ------
     ArgumentError
-        One of them cannot be used.
+        An option cannot be used.
     """
 
     publish: str = DEFAULT_PUBLISH
@@ -74,16 +74,16 @@ class ProcessingOptions:
             if (value := getattr(self, name)) is not None:
                 checks.integer(name, value, 1, 256)
         if self.quarantine is not None and not self.quarantine.is_dir():
-            raise ArgumentError(f"quarantine {self.quarantine} is no folder; make it first")
+            raise ArgumentError(f"quarantine folder {self.quarantine} does not exist; create it first")
         self.applied(Settings())
 
     def applied(self, settings: Settings) -> Settings:
-        """Return the settings of a sensor as measurements of it are to be processed.
+        """Return a sensor's settings with these options applied.
 
         Raises
         ------
         ArgumentError
-            They cannot be.
+            The result cannot be used.
         """
         if self.processing:
             settings = settings.replace(processing=settings.processing.replace(**self.processing))

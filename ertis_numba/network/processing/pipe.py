@@ -1,4 +1,4 @@
-"""What goes between the processes of a central node: small messages and files, and nobody ever waits to send one."""
+"""Pipes between the processes of a central node, for small messages and descriptors; sending never blocks."""
 
 import os
 import select
@@ -15,29 +15,29 @@ __all__ = ["Pipe"]
 Kind = TypeVar("Kind")
 
 _LENGTH: Final = struct.Struct("<I")
-_MAX_BYTES: Final = 64 * 2**20  # of a message; what is longer has not been sent by a process of ours
+_MAX_BYTES: Final = 64 * 2**20  # Limit on a message; a process of this package sends no longer one.
 _READ_BYTES: Final = 1 << 18
-_FILES: Final = 8  # with one message
+_FILES: Final = 8  # Limit on descriptors per message.
 
 
 class Pipe(Generic[Kind]):
-    """One end of a connection of two processes.
+    """One end of a connection between two processes.
 
-    Messages are MessagePack, never pickle: a worker that has gone wrong cannot make the central node run anything.
+    Messages are MessagePack, never pickle: a corrupted worker cannot make the central node run code.
 
     Parameters
     ----------
     end : socket.socket
-        Of a pair.
+        One socket of a pair.
     kinds : type
-        Of what comes in: a union of tagged `msgspec.Struct`.
+        Received messages: a union of tagged `msgspec.Struct`.
 
     Attributes
     ----------
     files : deque of int
-        Descriptors that have come, in the order of the messages that they belong to.
+        Received descriptors, in the order of their messages.
     closed : bool
-        The other process has ended, or has sent what is no message.
+        The other process has ended, or has sent an invalid message.
     """
 
     def __init__(self, end: socket.socket, kinds: Any) -> None:
@@ -51,29 +51,29 @@ class Pipe(Generic[Kind]):
         self.closed = False
 
     def fileno(self) -> int:
-        """Return what is to be polled."""
+        """Return the descriptor to poll."""
         return self._end.fileno()
 
     def send(self, message: msgspec.Struct, *, files: Sequence[int] = ()) -> None:
-        """Send a message as soon as the other process takes it, and files with it, which may be closed at once."""
+        """Send a message, with descriptors, as soon as the other process reads it; the caller may close them."""
         body = self._encoder.encode(message)
         self._out.append((memoryview(_LENGTH.pack(len(body)) + body), [os.dup(each) for each in files]))
         self.flush()
 
     @property
     def waiting(self) -> bool:
-        """Whether something could not be sent yet."""
+        """True if a message waits to be sent."""
         return bool(self._out)
 
     def flush(self) -> None:
-        """Send what could not be sent before, as far as that is possible now."""
+        """Send waiting messages as far as possible now."""
         while self._out:
             data, files = self._out[0]
             try:
                 sent = socket.send_fds(self._end, [data], files) if files else self._end.send(data)
             except BlockingIOError:
                 return
-            except OSError:  # the other process is gone, which reading tells
+            except OSError:  # The other process is gone; reading reports it.
                 self._drop()
                 return
             _close(files)
@@ -83,7 +83,7 @@ class Pipe(Generic[Kind]):
                 self._out.popleft()
 
     def receive(self) -> list[Kind]:
-        """Return what has come; `closed` is set when no more will."""
+        """Return received messages; `closed` is set when no more will come."""
         self.flush()
         while not self.closed:
             try:
@@ -126,7 +126,7 @@ class Pipe(Generic[Kind]):
         return any(event & ~select.POLLOUT for _, event in ready)
 
     def close(self) -> None:
-        """Close it; the other process notices."""
+        """Close the pipe; the other process notices."""
         self.closed = True
         self._end.close()
         self._drop()

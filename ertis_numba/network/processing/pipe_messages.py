@@ -1,4 +1,4 @@
-"""What the central node, its workers and its publisher tell each other over their pipes."""
+"""Messages between the central node, its workers and its publisher."""
 
 from typing import Literal
 
@@ -39,7 +39,7 @@ class _Note(msgspec.Struct, frozen=True, kw_only=True, tag=True):
 
 
 class SlotMemory(_Note, frozen=True, kw_only=True):
-    """A slot; its file comes with the message."""
+    """A slot; its descriptor comes with the message."""
 
     slot: int
     words_bytes: int
@@ -47,7 +47,7 @@ class SlotMemory(_Note, frozen=True, kw_only=True):
 
 
 class Prepare(_Note, frozen=True, kw_only=True):
-    """A worker is to be ready for measurements of a kind, and to measure how long they take if ``measure`` is set."""
+    """Request to prepare for a kind, and to measure its times if ``measure`` is set."""
 
     kind: int
     settings: str
@@ -55,7 +55,7 @@ class Prepare(_Note, frozen=True, kw_only=True):
 
 
 class ProcessJob(_Note, frozen=True, kw_only=True):
-    """A worker is to make an image of the words in a slot."""
+    """Request to make an image of the samples in a slot."""
 
     job: int
     kind: int
@@ -77,7 +77,7 @@ ToWorker = SlotMemory | Prepare | ProcessJob | Release
 
 
 class Ready(_Note, frozen=True, kw_only=True):
-    """A worker has loaded what it needs, and found a device."""
+    """A worker has loaded its modules, and found a device."""
 
     device: str
     threads: int
@@ -86,7 +86,7 @@ class Ready(_Note, frozen=True, kw_only=True):
 class Prepared(_Note, frozen=True, kw_only=True):
     """A worker is ready for a kind.
 
-    Times are of one measurement: on all threads, and as one of many of which each has its share of them.
+    Times are those of one measurement: on all threads, and with a share of the threads.
     """
 
     kind: int
@@ -107,7 +107,7 @@ class Unusable(_Note, frozen=True, kw_only=True):
 
 
 class JobFinished(_Note, frozen=True, kw_only=True):
-    """The image is in its slot, and its points are, where they were asked for."""
+    """The image is in its slot, with its points if requested."""
 
     job: int
     took_s: float
@@ -115,7 +115,7 @@ class JobFinished(_Note, frozen=True, kw_only=True):
 
 
 class JobFailed(_Note, frozen=True, kw_only=True):
-    """There is no image. With ``again``, another worker may do better."""
+    """There is no image. With ``again``, another worker may succeed."""
 
     job: int
     text: str
@@ -134,7 +134,7 @@ FromWorker = Ready | Prepared | Unusable | JobFinished | JobFailed | Predicted
 
 
 class Begin(_Note, frozen=True, kw_only=True):
-    """What a publisher is to be."""
+    """Configuration of a publisher."""
 
     address: str
     name: str = ""
@@ -144,14 +144,14 @@ class Begin(_Note, frozen=True, kw_only=True):
 
 
 class Describe(_Note, frozen=True, kw_only=True):
-    """What products are about, before the first of them."""
+    """Description of products, sent before the first of them."""
 
     description: Description
     payloads: tuple[bytes, ...]
 
 
 class Publish(_Note, frozen=True, kw_only=True):
-    """A measurement and what was made of it are in a slot, until `ProductsQueued` says otherwise."""
+    """A measurement and its products are in a slot, until `ProductsQueued` releases it."""
 
     job: int
     slot: int
@@ -166,13 +166,13 @@ class Publish(_Note, frozen=True, kw_only=True):
 
 
 class Grouped(_Note, frozen=True, kw_only=True):
-    """A group is closed."""
+    """A closed group."""
 
     group: Group
 
 
 class StatusNote(_Note, frozen=True, kw_only=True):
-    """How the central node is, as MessagePack."""
+    """Status of the central node, as MessagePack."""
 
     status: bytes
 
@@ -181,29 +181,29 @@ ToPublisher = Begin | SlotMemory | Describe | Publish | Grouped | StatusNote
 
 
 class Started(_Note, frozen=True, kw_only=True):
-    """Applications can subscribe, or why they cannot."""
+    """Applications can subscribe, or an error."""
 
     address: str
     error: str = ""
 
 
 class ProductsQueued(_Note, frozen=True, kw_only=True):
-    """Whoever wants it will get a product; its slot is free."""
+    """Subscribers of a product will get it; its slot is free."""
 
     job: int
     published_ns: int
 
 
 class Wanted(_Note, frozen=True, kw_only=True):
-    """Sensors whose points somebody wants; None are all."""
+    """Sensors whose points are subscribed; None stands for all."""
 
     points: tuple[str, ...] | None
 
 
 class Served(_Note, frozen=True, kw_only=True):
-    """How it goes; sent each second.
+    """State of the publisher, sent each second.
 
-    ``reports`` counts those `StatusNote` that were taken, ``keys_note`` says why the list of keys cannot be used.
+    ``reports`` counts the accepted `StatusNote` messages; ``keys_note`` is the error of the allow list.
     """
 
     subscribers: tuple[SubscriberStatus, ...]

@@ -1,4 +1,4 @@
-"""What makes images of measurements and has them published, without ever holding up who takes them in."""
+"""Processing and publication of images, without ever delaying the intake."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -34,27 +34,27 @@ _PUBLISHER_DIED: Final = "the publisher died"
 _REFUSED: Final = "it cannot be processed"
 _CHANGED: Final = "the settings of its sensor changed"
 _UNUSABLE: Final = "its settings cannot be used"
-_UNDESCRIBED: Final = "nothing describes it"
-_PAUSED: Final = "too many of its sensor have failed"
+_UNDESCRIBED: Final = "no description"
+_PAUSED: Final = "sensor suspended after repeated failures"
 
 
 class ImageProcessing:
-    """Makes images of measurements in worker processes and publishes them.
+    """Processing of measurements in worker processes, and publication of the images.
 
-    It is a part of the loop of who takes measurements in: poll `fds`, call `ready` for each that can be read, and
-    `tick` at least ten times a second. These calls wait for no other process and no disk: what they take is the copy
-    of a measurement, and where a worker or the publisher is started, the milliseconds that this takes.
+    It runs in the event loop of the intake: poll `fds`, call `ready` for each readable one, and `tick` at least ten
+    times a second. These calls wait for no other process and no disk. They take the time of copying a measurement, or
+    some milliseconds to start a process.
 
     Parameters
     ----------
-    options : Options
-    log : Log, optional
-        Told what goes wrong; the package's own by default.
+    options : ProcessingOptions
+    log : EventLog, optional
+        Log of failures; the package's own by default.
 
     Attributes
     ----------
     address : str
-        Where applications subscribe.
+        Address for applications.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog | None = None) -> None:
@@ -67,7 +67,7 @@ class ImageProcessing:
         self._quarantine: DeadLetterQueue | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
-        self._predicted: dict[str, int] = {}  # number of the kind whose error was predicted, by sensor
+        self._predicted: dict[str, int] = {}  # Number of the kind whose error was predicted, by sensor.
         self._order = ReorderBuffer()
         self._load = Load()
         self._took = Latencies()
@@ -77,12 +77,12 @@ class ImageProcessing:
 
     @property
     def address(self) -> str:
-        """Where applications subscribe."""
+        """Address for applications."""
         return self._publisher.address
 
     @property
     def refused(self) -> dict[str, int]:
-        """Messages and keys of applications that were refused, by reason."""
+        """Refused messages and keys of applications, by reason."""
         return self._publisher.refused
 
     def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
@@ -110,20 +110,20 @@ class ImageProcessing:
             raise
 
     def register(self, hello: Hello, settings: Settings) -> None:
-        """Take what a sensor is, before its first measurement, and whenever it has changed."""
+        """Register a sensor before its first measurement, and after each change."""
         if self._sensors.register(hello, settings):
             self._groups.register(hello.sensor, time.monotonic_ns())
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Take a measurement, which is counted from now on until it is published or dropped.
+        """Accept a measurement, and count it until it is published or dropped.
 
         Parameters
         ----------
         data : Data
         words : array
-            It is not copied, and must not change.
+            Samples as bytes. They are not copied, and must not change.
         arrived_ns : int
-            By `time.monotonic_ns`.
+            Time of `time.monotonic_ns`.
         """
         now_s = time.monotonic()
         self._load.add(now_s)
@@ -140,12 +140,12 @@ class ImageProcessing:
         self._dispatch()
 
     def fds(self) -> Iterable[int]:
-        """Return what is to be polled for reading now; it changes."""
+        """Return the descriptors to poll for reading at present."""
         runner = () if self._runner is None else self._runner.fds()
         return [*runner, *self._publisher.fds()]
 
     def ready(self, fd: int) -> None:
-        """Do what there is to do, as a descriptor can be read."""
+        """Process the event of a readable descriptor."""
         if self._runner is None:
             return
         if fd in self._publisher.fds():
@@ -155,7 +155,7 @@ class ImageProcessing:
         self._dispatch()
 
     def tick(self, now_s: float) -> None:
-        """Do what time demands; ``now_s`` is that of `time.monotonic`."""
+        """Do periodic work; ``now_s`` is a time of `time.monotonic`."""
         if self._runner is None:
             return
         self._handle(self._runner.tick(now_s, self._load.rate_hz(now_s)))
@@ -168,17 +168,17 @@ class ImageProcessing:
         self._dispatch()
 
     def counts(self, sensor: str) -> SensorCounts:
-        """Return what became of a sensor's measurements."""
+        """Return the counts of a sensor's measurements."""
         return self._queues.counts_of(sensor)
 
     def drain_dropped(self) -> list[tuple[str, int, int, str]]:
-        """Return sensor, epoch, number and reason of what was dropped since, the latest of it if it is a lot."""
+        """Return sensor, session_id, number and reason of new drops; only the latest of very many."""
         found = list(self._queues.dropped)
         self._queues.dropped.clear()
         return found
 
     def status(self) -> ProcessingStatus:
-        """Return how it goes."""
+        """Return the status."""
         runner = self._runner
         if runner is None and self._final is not None:
             return self._final
@@ -197,11 +197,11 @@ class ImageProcessing:
         )
 
     def publish_status(self, status: Status) -> None:
-        """Have applications told how the central node is."""
+        """Send the status of the central node to applications."""
         self._publisher.report(status)
 
     def close(self, timeout_s: float = 0.0) -> None:
-        """End all of it; measurements that are under way have that long."""
+        """Close everything; measurements under way get a limited time."""
         end_s = time.monotonic() + timeout_s
         while any(each.in_flight for each in self._queues.counts.values()) and time.monotonic() < end_s:
             for fd in list(self.fds()):
@@ -227,13 +227,13 @@ class ImageProcessing:
             self._runner.prepare(kind)
 
     def _tidy(self, runner: Runner) -> None:
-        """Let go of kinds that no sensor has any more; of what waits of them, there are no images."""
+        """Release kinds without a sensor, and drop their waiting measurements."""
         for kind in self._sensors.unused(lambda kind: any(job.kind is kind for job in self._order.jobs)):
             self._queues.drop_kind(kind.number, _CHANGED)
             runner.forget(kind)
 
     def _dispatch(self) -> None:
-        """Give workers what waits, as long as they take it."""
+        """Give waiting measurements to workers, as far as they accept them."""
         runner, found = self._runner, True
         while runner is not None and found:
             found = False
@@ -292,14 +292,14 @@ class ImageProcessing:
         self._publish_of(job.data.sensor)
 
     def _failed_twice(self, sensor: str) -> None:
-        """Have a sensor pause after some in a row: each has cost workers two deadlines, and was before all others."""
+        """Suspend a sensor after successive failures: each has cost workers two deadlines, ahead of all other jobs."""
         pause_s = self._pauses.failed(sensor)
         if pause_s:
             self._log.error("paused", sensor=sensor, text=f"{_PAUSED}; it is tried again in {pause_s:g} s")
             self._queues.drop_sensor(sensor, _PAUSED)
 
     def _keep(self, job: Job) -> None:
-        """Put a measurement where somebody can look at it."""
+        """Put a measurement into the dead-letter queue."""
         self._quarantined += 1
         if self._quarantine is None:
             return
@@ -308,7 +308,7 @@ class ImageProcessing:
             self._quarantine.put(entry)
 
     def _publish_of(self, sensor: str) -> None:
-        """Publish what is done of a sensor, in the order in which it came."""
+        """Publish a sensor's finished images in the order of its measurements."""
         while self._publisher.serves and (job := self._order.take(sensor)) is not None:
             self._publish(job)
 
@@ -338,7 +338,7 @@ class ImageProcessing:
             self._queues.drop(job.data, _UNDESCRIBED)
 
     def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job] = ()) -> None:
-        """Count what was published, or has died with the publisher, and take the slots back."""
+        """Count published images and those lost with the publisher, and release their slots."""
         for job, published_ns in taken:
             counts = self._queues.counts_of(job.data.sensor)
             counts.published += 1

@@ -1,4 +1,4 @@
-"""The publisher as the central node sees it: a process that is started, told, watched and started again."""
+"""Supervision of the publisher process."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -21,36 +21,36 @@ if TYPE_CHECKING:
 __all__ = ["Publisher"]
 
 _MODULE: Final = "ertis_numba.network.processing.publisher_process"
-# The GNU C library gives the memory of large blocks back to the system and asks for it again, which is a page fault for
-# each 4 KiB: 3600 for an image of 14 MB, and 5 of the 12 ms that the system took for it. Kept, there are 100.
+# By default, the GNU C library returns the memory of large blocks and requests it again, with a page fault for
+# each 4 KiB: 3600 for an image of 14 MB, or 5 of its 12 ms. Keeping the memory leaves 100 page faults.
 _KEEP_MEMORY: Final = {
     "MALLOC_MMAP_THRESHOLD_": str(32 * 2**20),
     "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
     "MALLOC_ARENA_MAX": "1",
 }
 _STARTED_S: Final = 20.0
-_HUNG_S: Final = 10.0  # without a word, where it tells each second
+_HUNG_S: Final = 10.0  # Limit on silence; it sends a message each second.
 _BACK_OFF_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 _CLOSED_S: Final = 2.0
 
 
 class Publisher:
-    """Hands products to applications, in a process of its own.
+    """Process that sends products to applications.
 
     Parameters
     ----------
-    options : Options
-    log : Log
-        Told what goes wrong.
+    options : ProcessingOptions
+    log : EventLog
+        Log of failures.
 
     Attributes
     ----------
     address : str
-        Where applications subscribe; it stays the same.
+        Address for applications; it stays the same after a restart.
     respawned : int
     subscribers : tuple of SubscriberStatus
     refused : dict of str to int
-        Messages and keys that were refused, by reason.
+        Refused messages and keys, by reason.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
@@ -68,7 +68,7 @@ class Publisher:
         self._points: tuple[str, ...] | None = ()
         self._jobs: dict[int, Job] = {}
         self._slots: dict[int, Slot] = {}
-        self._descriptions: dict[str, dict[int, tuple[Description, tuple[bytes, ...]]]] = {}  # by sensor
+        self._descriptions: dict[str, dict[int, tuple[Description, tuple[bytes, ...]]]] = {}  # By sensor.
         self._reported: set[int] = set()
         self._keys_note = ""
         self._reports_sent = self._reports_taken = 0
@@ -85,7 +85,7 @@ class Publisher:
         end_s = time.monotonic() + _STARTED_S
         while self._child is not None and not self._serves and not stopping():
             if time.monotonic() > end_s or self._child.pipe.closed:
-                raise NetworkError(f"{self.address} is not listened at: its process ended or hangs; try again")
+                raise NetworkError(f"cannot listen at {self.address}: the publisher has ended or hangs; try again")
             self._child.pipe.wait(0.2)
             for note in self._child.pipe.receive():
                 if isinstance(note, pipe_messages.Started) and note.error:
@@ -94,20 +94,20 @@ class Publisher:
 
     @property
     def pid(self) -> int:
-        """Of the process; 0 while there is none."""
+        """Identifier of the process; 0 while there is none."""
         return 0 if self._child is None else self._child.pid
 
     @property
     def serves(self) -> bool:
-        """Whether it takes products now."""
+        """True if it accepts products now."""
         return self._serves
 
     def wants_points(self, sensor: str) -> bool:
-        """Whether anybody wants the points of a sensor."""
+        """Return True if an application subscribes to the points of a sensor."""
         return self._points is None or sensor in self._points
 
     def describe(self, description: Description, payloads: tuple[bytes, ...]) -> None:
-        """Say what products are about, before the first of them."""
+        """Send the description of products before the first of them."""
         kept = self._descriptions.setdefault(description.sensor, {})
         kept[description.number] = description, payloads
         while len(kept) > DESCRIPTIONS:
@@ -115,10 +115,10 @@ class Publisher:
             del kept[stale]
 
     def publish(self, job: Job, publish: pipe_messages.Publish) -> bool:
-        """Hand over a job that is done; `ProductsQueued` tells of it, or its death does. False if nothing describes it."""
+        """Send a finished job, until `ProductsQueued` or the end of the process; return False without a description."""
         child, slot = self._child, job.slot
         if child is None or slot is None:
-            raise AssertionError("nothing can be published now; ask serves first")
+            raise AssertionError("nothing can be published now; check serves first")
         described = self._descriptions.get(job.data.sensor, {})
         if not {publish.description, publish.raw_description} <= described.keys():
             return False
@@ -138,32 +138,32 @@ class Publisher:
         return True
 
     def group(self, group: Group) -> None:
-        """Tell of a group that is closed; it is not told while the process does not listen."""
+        """Send a closed group, unless the process does not listen."""
         if self._child is not None and self._serves and not self._child.pipe.waiting:
             self._child.pipe.send(pipe_messages.Grouped(group=group))
 
     def report(self, status: Status) -> None:
-        """Tell how the central node is, if what was told before has been taken."""
+        """Send the status of the central node, if the previous one was accepted."""
         if self._child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
             self._reports_sent += 1
             self._child.pipe.send(pipe_messages.StatusNote(status=status.encode()))
 
     def fds(self) -> Iterable[int]:
-        """Return what is to be polled now."""
+        """Return the descriptors to poll now."""
         return () if self._child is None or self._child.pipe.closed else (self._child.pipe.fileno(),)
 
     def ready(self) -> Sequence[tuple[Job, int]]:
-        """Return jobs that were published, with the time."""
+        """Return published jobs, with the time."""
         if self._child is None:
             return ()
         taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
-        if self._child.pipe.closed:  # `tick` clears up, when it is gone
+        if self._child.pipe.closed:  # `tick` cleans up once the process is gone.
             self._child.kill()
             self._serves = False
         return taken
 
     def tick(self, now_s: float) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
-        """Do as `ready`, and return jobs that the process has died with; start it again, or end one that hangs."""
+        """Do as `ready`, return jobs lost with the process, and restart it or kill a hanging one."""
         if self._child is None:
             if now_s >= self._next_s:
                 self._begin()
@@ -178,7 +178,7 @@ class Publisher:
         return self.ready(), self._died()
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         if self._child is not None:
             self._child.close(_CLOSED_S if self._serves else 0.0)
             self._child = None
@@ -196,7 +196,7 @@ class Publisher:
                 "secret": keys.pair.secret,
                 "allow": str(keys.allow),
             }
-        # At the port that it has had, and the host that was given: where it can be reached may be one of several.
+        # It listens at the previous port and the given host, which may have several addresses.
         address = f"{self._options.publish.rpartition(':')[0]}:{self.address.rpartition(':')[2]}"
         self._child.pipe.send(pipe_messages.Begin(address=address, **given))
 
@@ -224,7 +224,7 @@ class Publisher:
         return None
 
     def _died(self) -> list[Job]:
-        """Clear up after the process, and return what it had taken with it."""
+        """Clean up after the process, and return the jobs lost with it."""
         if self._child is None:
             return []
         self._child.close()

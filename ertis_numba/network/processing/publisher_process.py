@@ -1,4 +1,4 @@
-"""The process that hands products to applications: ``python -m …processing._publisher DESCRIPTOR``."""
+"""Publisher process: ``python -m ertis_numba.network.processing.publisher_process DESCRIPTOR``."""
 
 import os
 import sys
@@ -39,13 +39,13 @@ from ertis_numba.network.zap_authenticator import ZapAuthenticator
 if TYPE_CHECKING:
     from ertis_numba.network.processing.pipe import Pipe
 
-_PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same bytes in one large frame
+_PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same bytes in one large frame.
 _AT_ONCE: Final = 64
 _TICK_MS: Final = 200
 _REPORT_INTERVAL_S: Final = 1.0
-_HEARD_BYTES: Final = 16_384  # a few applications need; sensor nodes at the wrong address send settings, of 4.4 kB
+_HEARD_BYTES: Final = 16_384  # Enough for applications; sensor nodes at the wrong address send settings of 4.4 kB.
 _SENSORS_ELSEWHERE: Final = (
-    "this address publishes images; give the one that 'ertis serve' prints first, where sensors send"
+    "this address publishes images; sensor nodes use the first address that 'ertis serve' prints"
 )
 
 
@@ -133,7 +133,7 @@ class _Publisher:
                 self._subscribers.offer(QueuedProduct("status", "", Report(), (note.status,)))
 
     def _publish(self, note: pipe_messages.Publish) -> None:
-        """Copy what anybody wants out of a slot, and say that it is free."""
+        """Copy the subscribed parts out of a slot, and release it."""
         view, sensor = self._views[note.slot], note.data.sensor
         common: dict[str, Any] = {
             name: getattr(note.data, name)
@@ -161,7 +161,7 @@ class _Publisher:
             self._subscribers.offer(item)
 
     def _hear(self, frames: list[zmq.Frame]) -> None:
-        """Do what an application asks for, or tell it why not; never raises for what it has sent."""
+        """Process a request of an application, or refuse it; never raises for its content."""
         permission = self._authenticator.who(frames)
         if permission is None:
             if frames:
@@ -169,8 +169,8 @@ class _Publisher:
             return
         if not permission.may_receive:
             reason = (
-                f"this address publishes images, and {permission.name} is listed as {permission.role}; give the "
-                "address that 'ertis serve' prints first, or have it listed as application"
+                f"this address publishes images, but {permission.name} has the role {permission.role}; use the "
+                "address that 'ertis serve' prints first, or allow the key as application"
             )
             self._refuse(frames, Refused(code="role", reason=reason), "role")
             return
@@ -191,7 +191,7 @@ class _Publisher:
         match message:
             case Subscribe():
                 if not self._subscribers.hear(frames, name, message):
-                    reason = "too many applications are connected, of this key or in all; end one"
+                    reason = "too many applications are connected, for this key or in all; end one"
                     self._refuse(frames, Refused(code="size", reason=reason), "too many")
             case AskStatus() if self._status:
                 self._reply(frames, [encode(Report()), self._status])
@@ -207,12 +207,12 @@ class _Publisher:
     def _reply(self, frames: list[zmq.Frame], answer: list[bytes]) -> None:
         try:
             self._socket.send_multipart([frames[0].bytes, *answer], zmq.NOBLOCK)
-        except zmq.ZMQError:  # it is gone, or takes nothing
+        except zmq.ZMQError:  # The peer is gone, or does not read.
             return
 
 
 def _is_greeting(frames: list[zmq.Frame]) -> bool:
-    """Whether this is what a sensor node says first."""
+    """Return True for the first message of a sensor node."""
     try:
         return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello)
     except DataError:

@@ -1,4 +1,4 @@
-"""What waits for a worker, and what became of all that came: the latest wins, and nothing is lost uncounted."""
+"""Queues of measurements for workers: the latest has priority, and each drop is counted."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -11,16 +11,16 @@ from ertis_numba.network.status import Latencies, Percentiles
 
 __all__ = ["SUPERSEDED", "Queues", "SensorCounts"]
 
-_QUEUE: Final = 2  # measurements of a sensor that wait; the oldest gives way to a new one
-_REPORTED: Final = 4096  # of those that were dropped, until somebody asks
+_QUEUE: Final = 2  # Limit on waiting measurements of a sensor; a new one replaces the oldest.
+_REPORTED: Final = 4096  # Limit on kept drops, until they are reported.
 SUPERSEDED: Final = "superseded"
 
 
 @dataclass(slots=True)
 class SensorCounts:
-    """What became of one sensor's measurements.
+    """Counts of one sensor's measurements.
 
-    ``received = published + sum(dropped.values()) + in_flight`` at any moment.
+    ``received = published + sum(dropped.values()) + in_flight`` at any time.
 
     Attributes
     ----------
@@ -28,11 +28,11 @@ class SensorCounts:
     dropped : Counter of str
         By reason.
     in_flight : int
-        Waiting, being processed, or with the publisher.
+        Waiting, in a worker, or with the publisher.
     queue : int
-        Of those, the ones that wait for a worker.
+        Those of them that wait for a worker.
     times : Latencies
-        From the arrival of a measurement to its image being published.
+        From the arrival of a measurement to the publication of its image.
     """
 
     received: int = 0
@@ -44,33 +44,33 @@ class SensorCounts:
 
     @property
     def latency(self) -> Percentiles:
-        """What those times come to."""
+        """Percentiles of these times."""
         return self.times.percentiles()
 
 
 class Queues:
-    """Measurements that wait, two of each sensor at most, served in turn.
+    """Waiting measurements, at most two per sensor, served in turn.
 
     Attributes
     ----------
-    counts : dict of str to Counts
+    counts : dict of str to SensorCounts
         By sensor.
-    dropped : deque of (sensor, epoch, sequence, reason)
-        The latest that were dropped; whoever tells of them takes them out.
+    dropped : deque of (sensor, session_id, sequence, reason)
+        Latest drops, removed when they are reported.
     """
 
     def __init__(self) -> None:
         self.counts: dict[str, SensorCounts] = {}
         self.dropped: deque[tuple[str, int, int, str]] = deque(maxlen=_REPORTED)
         self._waiting: dict[str, deque[Job]] = {}
-        self._again: deque[Job] = deque()  # jobs that get another try, before all others
+        self._again: deque[Job] = deque()  # Jobs for a second try, before all others.
 
     def counts_of(self, sensor: str) -> SensorCounts:
-        """Return the counts of a sensor, which begin with 0."""
+        """Return the counts of a sensor, which begin at 0."""
         return self.counts.setdefault(sensor, SensorCounts())
 
     def take_in(self, data: Data) -> SensorCounts:
-        """Count a measurement that has come; return the counts of its sensor."""
+        """Count a received measurement; return the counts of its sensor."""
         counts = self.counts_of(data.sensor)
         counts.received += 1
         counts.in_flight += 1
@@ -84,7 +84,7 @@ class Queues:
         self.dropped.append((data.sensor, data.session_id, data.sequence, reason))
 
     def add(self, job: Job, reason: str = SUPERSEDED) -> None:
-        """Let a measurement wait; the oldest of its sensor is dropped, for a reason, if there are too many."""
+        """Add a measurement; if there are too many, drop the oldest of its sensor for a reason."""
         sensor = job.data.sensor
         counts = self.take_in(job.data)
         waiting = self._waiting.setdefault(sensor, deque())
@@ -94,33 +94,33 @@ class Queues:
         counts.queue = len(waiting)
 
     def again(self, job: Job) -> None:
-        """Let a measurement that was taken out wait again, for its other try."""
+        """Add a measurement again for its second try."""
         self._again.append(job)
 
     def turns(self) -> Iterator[Job]:
-        """Yield what is next of each sensor, those that have waited longest for their turn first."""
+        """Yield the next measurement of each sensor, beginning with the sensor that has waited longest."""
         yield from list(self._again)
         for waiting in list(self._waiting.values()):
             if waiting:
                 yield waiting[0]
 
     def take(self, job: Job) -> None:
-        """Take out a measurement that `turns` has told."""
+        """Remove a measurement that `turns` has yielded."""
         if job in self._again:
             self._again.remove(job)
             return
         sensor = job.data.sensor
         waiting = self._waiting.pop(sensor)
         waiting.popleft()
-        self._waiting[sensor] = waiting  # it is at the end now
+        self._waiting[sensor] = waiting  # The sensor goes to the end of the queue.
         self.counts[sensor].queue = len(waiting)
 
     def drop_kind(self, kind: int, reason: str) -> None:
-        """Drop all that waits of a kind."""
+        """Drop all waiting measurements of a kind."""
         self._drop(lambda job: job.kind.number == kind, reason)
 
     def drop_sensor(self, sensor: str, reason: str) -> None:
-        """Drop all that waits of a sensor."""
+        """Drop all waiting measurements of a sensor."""
         self._drop(lambda job: job.data.sensor == sensor, reason)
 
     def _drop(self, condition: Callable[[Job], bool], reason: str) -> None:

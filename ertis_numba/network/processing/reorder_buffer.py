@@ -1,4 +1,4 @@
-"""In which order images are published: of each sensor in that in which its measurements came."""
+"""Reorder buffer: publishes the images of each sensor in the order of their measurements."""
 
 import itertools
 from collections import deque
@@ -10,30 +10,30 @@ __all__ = ["ReorderBuffer"]
 
 
 class ReorderBuffer:
-    """Jobs that are under way, by sensor; one that has failed leaves, and is published whenever it is done."""
+    """Jobs under way by sensor; a failed one leaves its place, and is published once it is done."""
 
     def __init__(self) -> None:
         self._jobs: dict[str, deque[Job]] = {}
-        self._done: set[int] = set()  # those that wait for an older one, or for the publisher
+        self._done: set[int] = set()  # Jobs that wait for an older one, or for the publisher.
 
     def add(self, job: Job) -> None:
-        """Take a job whose first try begins."""
+        """Add a job whose first try begins."""
         if not job.tries:
             self._jobs.setdefault(job.data.sensor, deque()).append(job)
 
     def leave(self, job: Job) -> None:
-        """Let a job that has failed hold up no others."""
+        """Release the place of a failed job, so that it delays no others."""
         jobs = self._jobs.get(job.data.sensor, deque())
         if job in jobs:
             jobs.remove(job)
 
     def done(self, job: Job) -> None:
-        """Note that a job has an image."""
+        """Mark a job with an image."""
         if not job.tries:
             self._done.add(job.number)
 
     def take(self, sensor: str) -> Job | None:
-        """Take out what is to be published next of a sensor; None if that is not done."""
+        """Remove and return the next image of a sensor; None if it is not done."""
         jobs = self._jobs.get(sensor)
         if not jobs or jobs[0].number not in self._done:
             return None
@@ -42,10 +42,10 @@ class ReorderBuffer:
 
     @property
     def sensors(self) -> list[str]:
-        """Those of which there was something."""
+        """Sensors with jobs so far."""
         return list(self._jobs)
 
     @property
     def jobs(self) -> Iterable[Job]:
-        """All that are under way."""
+        """All jobs under way."""
         return itertools.chain.from_iterable(self._jobs.values())

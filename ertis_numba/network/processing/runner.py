@@ -1,4 +1,4 @@
-"""What runs jobs, as `Processing` sees it: local workers, or a cluster."""
+"""Interface to the executors of jobs: local workers, or a cluster."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class JobKind:
     ----------
     number : int
     settings : str
-        As TOML.
+        Settings as TOML.
     words_bytes : int
         Size of a measurement.
     """
@@ -35,25 +35,25 @@ class JobKind:
 
 @dataclass(slots=True, eq=False)
 class Job:
-    """A measurement on its way to an image.
+    """A measurement to process.
 
     Attributes
     ----------
     number : int
     data : Data
     words : array
-        Contiguous bytes; kept until the image is made, so that it can be tried again.
-    kind : Kind
+        Contiguous bytes, kept until the image is done for a second try.
+    kind : JobKind
     arrived_ns : int
-        By a clock that nobody sets.
+        Time of arrival by a monotonic clock.
     points : bool
-        Whether somebody wants the points, too.
+        True if an application subscribes to the points.
     tries : int
-        That have failed.
+        Number of failed tries.
     predict : bool
         Predict the error of the image, and log a warning if images may exceed the budget.
     slot : Slot, optional
-        Where words and image are, once it is `FinishedJob`; to be given back.
+        Slot of samples and image, once it is `FinishedJob`; release it afterwards.
     """
 
     number: int
@@ -70,7 +70,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class FinishedJob:
-    """A job's image is in its slot."""
+    """A job whose image is in its slot."""
 
     job: Job
     took_s: float
@@ -78,7 +78,7 @@ class FinishedJob:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A job has no image. With ``again`` it may be given another try: who ran it died, hung or made a mistake."""
+    """A job without an image. With ``again`` it may be tried again: its worker died, hung or failed."""
 
     job: Job
     text: str
@@ -87,14 +87,14 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class KindReady:
-    """Jobs of a kind can be run from now on; its axes and the settings that were chosen."""
+    """Jobs of a kind can run from now on; with their axes and chosen settings."""
 
     prepared: Prepared
 
 
 @dataclass(frozen=True, slots=True)
 class KindFailed:
-    """Jobs of a kind cannot be run, unless another `Runner.prepare` succeeds."""
+    """Jobs of a kind cannot run, unless another `Runner.prepare` succeeds."""
 
     kind: int
     text: str
@@ -109,57 +109,59 @@ Event: TypeAlias = FinishedJob | Lost | KindReady | KindFailed
 
 
 class Runner(Protocol):
-    """Runs jobs, and waits for none: calls take the copy of a measurement, or the start of a process, until `close`.
+    """Executor of jobs.
+
+    No method blocks, except `close`: calls take the copy of a measurement, or the start of a process.
 
     Attributes
     ----------
     respawned : int
-        Workers that were replaced.
+        Number of replaced workers.
     """
 
     respawned: int
 
     @property
     def choice(self) -> str:
-        """How jobs share the machine, and why, in a line."""
+        """Distribution of jobs over the machine, with its reason, in one line."""
         ...
 
     def prepare(self, kind: JobKind) -> None:
-        """Get ready for a kind of which jobs will come; `KindReady` or `KindFailed` follows."""
+        """Prepare for jobs of a kind; `KindReady` or `KindFailed` follows."""
         ...
 
     def forget(self, kind: JobKind) -> None:
-        """Know that no more jobs of a kind will come."""
+        """Release a kind, because no more jobs of it will come."""
         ...
 
     def takes(self, kind: JobKind) -> bool:
-        """Whether a job of a kind can be run now."""
+        """Return True if a job of a kind can run now."""
         ...
 
     def submit(self, job: Job) -> None:
-        """Run a job, when `takes` has said so; `FinishedJob` or `Lost` follows."""
+        """Run a job that `takes` accepts; `FinishedJob` or `Lost` follows."""
         ...
 
     def release(self, slot: Slot) -> None:
-        """Take back the slot of a job that was done."""
+        """Release the slot of a finished job."""
         ...
 
     def fds(self) -> Iterable[int]:
-        """Return what is to be polled now."""
+        """Return the descriptors to poll now."""
         ...
 
     def ready(self, fd: int) -> Sequence[Event]:
-        """Return what has happened, when something that is polled can be read."""
+        """Return new events, after a descriptor became readable."""
         ...
 
     def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
-        """Return what has happened; to be called ten times a second with the rate at which measurements arrive."""
+        """Return new events; call it ten times a second with the rate of arriving measurements."""
         ...
 
     def status(self) -> list[WorkerStatus]:
-        """Return how the workers are."""
+        """Return the status of the workers."""
         ...
 
     def close(self) -> None:
-        """End all of it."""
+        """Close everything."""
         ...

@@ -1,4 +1,4 @@
-"""What sensors are: which pipeline their measurements need, and what products of them are about."""
+"""Registered sensors: the pipeline for their measurements, and the descriptions of their products."""
 
 import time
 from collections.abc import Callable
@@ -19,9 +19,9 @@ from ertis_numba.settings import Air, Settings
 __all__ = ["RegisteredSensor", "Sensors"]
 
 _AIR_STEPS: Final = {"temperature_c": 0.5, "humidity_percent": 5.0, "pressure_pa": 1000.0}
-_MAX_BYTES: Final = 256_000_000  # of an image as float32
-_AGAIN_S: Final = 60.0  # after which a pipeline that could not be made is tried again …
-_GREETED_S: Final = 10.0  # … and where its sensor has said Hello
+_MAX_BYTES: Final = 256_000_000  # Limit on an image as float32.
+_AGAIN_S: Final = 60.0  # Delay before a pipeline that failed is tried again …
+_GREETED_S: Final = 10.0  # … and after a Hello of its sensor.
 
 
 class _Describe(Protocol):
@@ -36,11 +36,11 @@ class RegisteredSensor:
     ----------
     hello : Hello
     stated : Settings
-        As it says them.
+        Settings of its hello.
     settings : Settings
-        The same, but with air that is about that of its latest measurement.
-    kind : Kind or None
-        None where no pipeline can use its settings.
+        The same, with air close to that of its latest measurement.
+    kind : JobKind or None
+        None if no pipeline can use its settings.
     raw, image : int
         Numbers of the descriptions of its products.
     """
@@ -54,14 +54,14 @@ class RegisteredSensor:
 
 
 class Sensors:
-    """All sensors; those whose settings are equal share a kind, and so a pipeline.
+    """All sensors; those with equal settings share a kind, and therefore a pipeline.
 
     Parameters
     ----------
-    options : Options
-    log : Log
+    options : ProcessingOptions
+    log : EventLog
     describe : callable
-        Called with what products are about, before there are any.
+        Called with a description before the first product.
     prepare : callable
         Called with each new kind.
     """
@@ -73,14 +73,14 @@ class Sensors:
         self._known: dict[str, RegisteredSensor] = {}
         self._kinds: dict[str, JobKind] = {}
         self._prepared: dict[int, Prepared] = {}
-        self._unusable: dict[int, float] = {}  # since when
+        self._unusable: dict[int, float] = {}  # Time of the failure.
         self._n_kinds = self._n_descriptions = 0
 
     def __getitem__(self, sensor: str) -> RegisteredSensor:
         return self._known[sensor]
 
     def register(self, hello: Hello, settings: Settings) -> bool:
-        """Take what a sensor is; return whether it is new or has changed."""
+        """Register a sensor; return True if it is new or has changed."""
         before = self._known.get(hello.sensor)
         if before is not None and (before.stated, _place(before.hello)) == (settings, _place(hello)):
             if before.kind is not None:
@@ -90,7 +90,7 @@ class Sensors:
         return True
 
     def expect(self, settings: Settings) -> None:
-        """Get ready for a sensor that has not come yet."""
+        """Prepare for a sensor that has not connected yet."""
         self._kind_of("expected", settings)
 
     def _take(self, hello: Hello, stated: Settings, settings: Settings) -> None:
@@ -100,11 +100,11 @@ class Sensors:
         self._describe_images(known)
 
     def kind_of(self, data: Data) -> JobKind | None:
-        """Return the kind of a measurement, None if there can be no image of it.
+        """Return the kind of a measurement, None if no image can be made of it.
 
-        In other air ranges are others, and so is the kind. It takes 0.5 °C, 5 % or 1 kPa to make another, as a pipeline
-        cannot be made for each measurement of a day that gets warmer. For that, ranges at 20 °C are wrong by up to
-        0.09 % of the temperature, 0.02 % of the humidity and 0.003 % of the pressure: 6 mm at 5 m if all come together.
+        Air determines ranges, and therefore the kind. A new kind needs a difference of 0.5 °C, 5 % or 1 kPa, because a
+        pipeline cannot be made for each measurement of a warming day. The resulting error of ranges at 20 °C is at most
+        0.09 % for temperature, 0.02 % for humidity and 0.003 % for pressure: 6 mm at 5 m for all together.
         """
         known = self._known[data.sensor]
         try:
@@ -118,23 +118,23 @@ class Sensors:
         return None if kind is None or kind.number in self._unusable else kind
 
     def is_ready(self, kind: JobKind) -> bool:
-        """Whether a worker has been ready for a kind."""
+        """Return True if a worker has been ready for a kind."""
         return kind.number in self._prepared
 
     def became_ready(self, prepared: Prepared) -> None:
-        """Take what a pipeline has told of itself."""
+        """Store the description of a pipeline."""
         self._prepared[prepared.kind] = prepared
         for known in self._of(prepared.kind):
             self._describe_images(known)
 
     def failed(self, kind: int, text: str) -> None:
-        """Know that there can be no pipeline for a kind for now, and why."""
+        """Mark a kind as unusable for now, with the reason."""
         self._unusable[kind] = time.monotonic()
         for known in self._of(kind):
             self._log.warning("unusable", sensor=known.hello.sensor, text=text)
 
     def tick(self) -> None:
-        """Try again what has failed a while ago: memory or a device may have been short."""
+        """Try old failures again: memory or a device may have been short."""
         for kind in [kind for kind in self._kinds.values() if kind.number in self._unusable]:
             self._try_again(kind, _AGAIN_S)
 
@@ -144,13 +144,13 @@ class Sensors:
             self._prepare(kind)
 
     def shape_of(self, kind: JobKind) -> tuple[int, int]:
-        """Return directions and ranges of the images of a kind that is ready."""
+        """Return directions and ranges of the images of a ready kind."""
         return self._prepared[kind.number].shape
 
     def unused(self, under_way: Callable[[JobKind], bool]) -> list[JobKind]:
-        """Forget kinds that no sensor has any more, and of which nothing is under way; return them."""
+        """Remove and return kinds without a sensor and without jobs."""
         used = {known.kind.number for known in self._known.values() if known.kind is not None}
-        if not self._known:  # then there is what was expected, if anything
+        if not self._known:  # Only the expected kind is left, if any.
             return []
         found = [kind for kind in self._kinds.values() if kind.number not in used and not under_way(kind)]
         for kind in found:
@@ -195,9 +195,9 @@ class Sensors:
 
 
 def _about(came: Air, used: Air) -> Air:
-    """Return the air that a measurement is processed for: what is in use, as long as it is about the same.
+    """Return the air for processing a measurement: the present one, as long as it is about the same.
 
-    What is not is rounded, so that sensors in the same air share a pipeline.
+    New air is rounded, so that sensors in the same air share a pipeline.
     """
     changes = {}
     for name, step in _AIR_STEPS.items():
@@ -208,18 +208,18 @@ def _about(came: Air, used: Air) -> Air:
 
 
 def _require_size(settings: Settings) -> None:
-    """Refuse images that nobody has the memory for, before anything is made for them."""
+    """Refuse images that exceed the memory, before anything is allocated."""
     processing = settings.processing
     count = grid_count(processing.directions)
-    if count is None:  # a list of directions, which is as long as somebody has written it here
+    if count is None:  # A list of directions is only as long as its text.
         return
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
     grid = processing.directions if isinstance(processing.directions, str) else f"{count} directions"
     n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
     if n_bytes > _MAX_BYTES:
         raise ArgumentError(
-            f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have {n_bytes / 1e6:.0f} "
-            f"MB; give fewer directions or ranges, {_MAX_BYTES // 1_000_000} MB at most"
+            f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have "
+            f"{n_bytes / 1e6:.0f} MB; the limit is {_MAX_BYTES // 1_000_000} MB, give fewer directions or ranges"
         )
 
 

@@ -1,4 +1,4 @@
-"""Memory that processes share, without a name: the system takes it back when the last of them is gone."""
+"""Anonymous memory shared between processes, freed by the system with the last of them."""
 
 import mmap
 import os
@@ -21,14 +21,14 @@ def _paged(n_bytes: int) -> int:
 
 
 class SlotView:
-    """What one process sees of a slot: the words of a measurement, its image, its points.
+    """Access of one process to a slot: the samples of a measurement, its image, its points.
 
     Parameters
     ----------
     descriptor : int
-        Of the memory; it may be closed afterwards.
+        Descriptor of the memory; it may be closed afterwards.
     words_bytes, image_bytes : int
-        Room for them.
+        Sizes.
     """
 
     def __init__(self, descriptor: int, words_bytes: int, image_bytes: int) -> None:
@@ -37,7 +37,7 @@ class SlotView:
         self._map = mmap.mmap(descriptor, self._points + POINTS_BYTES)
 
     def words(self, n_bytes: int) -> memoryview:
-        """Return the first bytes of the words."""
+        """Return the first bytes of the samples."""
         return memoryview(self._map)[:n_bytes]
 
     def image(self, n_bytes: int) -> memoryview:
@@ -55,23 +55,23 @@ class SlotView:
 
 
 class Slot:
-    """Memory for one measurement and what is made of it.
+    """Memory for one measurement and its products.
 
-    A file in memory without a name, rather than one of `multiprocessing.shared_memory`: nothing is left behind even if
+    An anonymous file in memory, rather than one of `multiprocessing.shared_memory`: nothing is left behind even if
     every process is killed at once.
 
     Parameters
     ----------
     number : int
-        By which processes speak of it.
+        Number by which processes refer to it.
     words_bytes, image_bytes : int
-        Room for them.
+        Sizes.
 
     Attributes
     ----------
     descriptor : int
-        To be sent to the processes that are to see it.
-    view : View
+        Descriptor for the processes that use it.
+    view : SlotView
     """
 
     def __init__(self, number: int, words_bytes: int, image_bytes: int) -> None:
@@ -85,16 +85,16 @@ class Slot:
             raise
 
     def holds(self, words_bytes: int, image_bytes: int) -> bool:
-        """Whether there is room for them."""
+        """Return True if a measurement and an image of these sizes fit."""
         return words_bytes <= self.words_bytes and image_bytes <= self.image_bytes
 
     def close(self) -> None:
-        """Let go of it; others keep what they see."""
+        """Release it; other processes keep their access."""
         os.close(self.descriptor)
 
 
 def _nameless() -> int:
     if hasattr(os, "memfd_create"):
         return os.memfd_create("ertis")
-    with tempfile.TemporaryFile() as file:  # where there is no such thing, a file that has lost its name
+    with tempfile.TemporaryFile() as file:  # Systems without anonymous memory get a deleted file.
         return os.dup(file.fileno())

@@ -1,4 +1,4 @@
-"""What each application gets: what it has asked for, as much as it takes, the latest first."""
+"""Products for each application: as requested, as much as it accepts, the latest first."""
 
 import itertools
 import time
@@ -16,33 +16,33 @@ from ertis_numba.network.status import SubscriberStatus
 __all__ = ["DESCRIPTIONS", "ConnectedSubscriber", "QueuedProduct", "Subscribers"]
 
 DESCRIPTIONS: Final = 4
-"""That are kept of each sensor: of its images and of its words, and those of before a change of its settings."""
+"""Limit on the descriptions of each sensor: of its images and its samples, before and after a change of settings."""
 
 _MAX: Final = 256
 _MAX_OF_KEY: Final = 16
-_DESCRIBED: Final = 16  # descriptions of each sensor that an application is taken to have still
+_DESCRIBED: Final = 16  # Number of descriptions of each sensor that an application keeps.
 _SILENT_S: Final = 3.0
-_UNDER_WAY_BYTES: Final = 64_000_000  # that an application may have been sent and not yet have taken
-_AFTER_S: Final = 60.0  # that one is remembered when it says nothing any more
+_UNDER_WAY_BYTES: Final = 64_000_000  # Limit on the bytes under way to an application.
+_AFTER_S: Final = 60.0  # Time after which a silent application is forgotten.
 
 Header: TypeAlias = Image | Points | Raw | Group | Report
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedProduct:
-    """Something to be sent, to whoever wants it.
+    """Product to send to its subscribers.
 
     Attributes
     ----------
     product : str
     sensor : str
-        Empty for what is of no sensor.
+        Empty for products without a sensor.
     header : Message
-        But for its numbers.
+        Header without its numbers.
     payloads : sequence of bytes
-        Shared by all that get it.
+        Shared by all subscribers.
     description : (number, frames), optional
-        That has to be sent before.
+        Description to send before.
     """
 
     product: Product
@@ -59,40 +59,40 @@ class QueuedProduct:
 
 @dataclass(slots=True, eq=False)
 class ConnectedSubscriber:
-    """An application that is connected.
+    """A connected application.
 
     Attributes
     ----------
     frames : sequence of zmq.Frame
-        Its latest message: whose it is, is to be asked again and again.
+        Its latest message, by which its key is checked again.
     wants : Subscribe
     """
 
     frames: Sequence[zmq.Frame]
     name: str
     wants: Subscribe
-    before: int = 0  # what it had consumed when it was first heard of
+    before: int = 0  # Products consumed when it was first heard of.
     heard_s: float = 0.0
     active: bool = True
-    number: int = 0  # of the next product
+    number: int = 0  # Number of the next product.
     sent: int = 0
     dropped: int = 0
-    described: dict[str, deque[int]] = field(default_factory=dict)  # by sensor
-    under_way: deque[int] = field(default_factory=deque)  # bytes of each product that it has not consumed yet
+    described: dict[str, deque[int]] = field(default_factory=dict)  # By sensor.
+    under_way: deque[int] = field(default_factory=deque)  # Bytes of each product that it has not consumed yet.
     waiting: dict[tuple[str, str], tuple[int, QueuedProduct]] = field(default_factory=dict)
 
     def asks_for(self, product: str, sensor: str) -> bool:
-        """Whether it wants this."""
+        """Return True if it subscribes to a product of a sensor."""
         sensors = self.wants.sensors
         return product in self.wants.products and (not sensor or sensors is None or sensor in sensors)
 
     @property
     def has_credit(self) -> bool:
-        """Whether something may be sent to it."""
+        """True if another product may be sent to it."""
         return len(self.under_way) < self.wants.credit and sum(self.under_way) < _UNDER_WAY_BYTES
 
     def consumed(self, wants: Subscribe) -> None:
-        """Take what it says to want and to have consumed."""
+        """Update its subscription and its consumed products."""
         self.wants = wants
         left = max(0, self.sent - max(0, wants.consumed - self.before))
         while len(self.under_way) > left:
@@ -102,7 +102,7 @@ class ConnectedSubscriber:
             self.dropped += 1
 
     def offer(self, item: QueuedProduct) -> None:
-        """Give it something that it gets as soon as it has credit, unless something newer comes first."""
+        """Queue a product until it has credit, unless a newer one replaces it."""
         if not self.asks_for(item.product, item.sensor):
             return
         key = (item.product, item.sensor)
@@ -111,34 +111,34 @@ class ConnectedSubscriber:
         self.number += 1
 
     def next(self) -> tuple[tuple[str, str], int, QueuedProduct] | None:
-        """Return what is to be sent next, if anything."""
+        """Return the next product to send, if any."""
         if not self.waiting or not self.has_credit:
             return None
         key = min(self.waiting, key=lambda each: self.waiting[each][0])
         return key, *self.waiting[key]
 
     def was_sent(self, key: tuple[str, str]) -> None:
-        """Note that something is under way to it."""
+        """Register a product as under way."""
         _, item = self.waiting.pop(key)
         self.under_way.append(item.n_bytes)
         self.sent += 1
 
     def retire(self) -> None:
-        """Forget what it wants until it says so again; its numbers go on."""
+        """Suspend its subscription until it sends it again; its numbers continue."""
         self.active = False
         self.dropped += len(self.waiting)
         self.waiting.clear()
 
 
 class Subscribers:
-    """All applications, and the socket that they are connected to.
+    """All applications, with their common socket.
 
     Parameters
     ----------
     socket : zmq.Socket
         A ROUTER.
     with_keys : bool
-        Whether names are those of keys, each of which may have a share of the places only.
+        True if applications have keys, each of which may use a share of the places only.
     """
 
     def __init__(self, socket: "zmq.Socket[bytes]", *, with_keys: bool = False) -> None:
@@ -151,7 +151,7 @@ class Subscribers:
         return (each for each in self._all.values() if each.active)
 
     def hear(self, frames: Sequence[zmq.Frame], name: str, wants: Subscribe) -> bool:
-        """Take what an application wants; return whether it is a new one that there is room for, or a known one."""
+        """Update the subscription of an application; return True if it is known, or new and there is room for it."""
         routing_id, now_s = frames[0].bytes, time.monotonic()
         known = self._all.get(routing_id)
         if known is None:
@@ -164,7 +164,7 @@ class Subscribers:
         return True
 
     def _has_room(self, name: str) -> bool:
-        """Whether a key may have another application; those of it that are silent make room."""
+        """Return True if a key may have another application; its silent ones make room."""
         of_key = {routing_id: each for routing_id, each in self._all.items() if each.name == name}
         silent = [routing_id for routing_id, each in of_key.items() if not each.active]
         if len(of_key) >= self._max_of_key and silent:
@@ -173,18 +173,18 @@ class Subscribers:
         return len(of_key) < self._max_of_key and sum(1 for _ in self) < _MAX
 
     def forget(self, routing_id: bytes) -> None:
-        """Know of an application no more."""
+        """Remove an application."""
         self._all.pop(routing_id, None)
 
     def describe(self, sensor: str, number: int, frames: Sequence[bytes]) -> None:
-        """Keep what products are about, for those who get one of them."""
+        """Keep the description of products for their subscribers."""
         kept = self._descriptions.setdefault(sensor, {})
         kept[number] = frames
         while len(kept) > DESCRIPTIONS:
             del kept[min(kept)]
 
     def description(self, sensor: str, number: int) -> tuple[int, Sequence[bytes]] | None:
-        """Return what products of a sensor are about, as an `QueuedProduct` has it.
+        """Return the description of a sensor's products for a `QueuedProduct`; None if it is not known (any more).
 
         None if that is not known (any more).
         """
@@ -192,25 +192,25 @@ class Subscribers:
         return None if frames is None else (number, frames)
 
     def wanted(self, product: Product, sensor: str) -> bool:
-        """Whether anybody wants this."""
+        """Return True if an application subscribes to a product of a sensor."""
         return any(each.asks_for(product, sensor) for each in self)
 
     def sensors_for(self, product: Product) -> tuple[str, ...] | None:
-        """Return the sensors of which anybody wants a product; None are all."""
+        """Return the sensors of a subscribed product; None stands for all."""
         asked = [each.wants.sensors for each in self if product in each.wants.products]
         if any(sensors is None for sensors in asked):
             return None
         return tuple(sorted(set(itertools.chain.from_iterable(sensors or () for sensors in asked))))
 
     def offer(self, item: QueuedProduct) -> None:
-        """Send something to whoever wants it and has credit; the others get it, or something newer, later."""
+        """Send a product to subscribers with credit; the others get it, or a newer one, later."""
         for routing_id, each in list(self._all.items()):
             if each.active:
                 each.offer(item)
                 self._send(routing_id, each)
 
     def tick(self, may_receive: Any) -> None:
-        """Retire those who are silent, and forget those who ``may_receive`` no more; send what could not be before."""
+        """Suspend silent applications, remove those that no longer ``may_receive``, and send waiting products."""
         now_s = time.monotonic()
         for routing_id, each in list(self._all.items()):
             if now_s - each.heard_s > _AFTER_S or (each.active and not may_receive(each.frames)):
@@ -221,13 +221,13 @@ class Subscribers:
                 self._send(routing_id, each)
 
     def notify(self, message: Message) -> None:
-        """Send a message that is no product to everybody."""
+        """Send a message that is not a product to all."""
         header = encode(message)
         for routing_id in [routing_id for routing_id, each in self._all.items() if each.active]:
             self._put(routing_id, [header])
 
     def status(self) -> tuple[SubscriberStatus, ...]:
-        """Return how they are served."""
+        """Return the status of the applications."""
         return tuple(
             SubscriberStatus(
                 name=each.name,
@@ -258,7 +258,7 @@ class Subscribers:
             each.was_sent(key)
 
     def _put(self, routing_id: bytes, frames: Iterable[bytes]) -> bool:
-        """Send a message to an application; return whether it could be, and forget one that is gone."""
+        """Send a message to an application; return True on success, and remove an application that is gone."""
         try:
             self._socket.send_multipart([routing_id, *frames], zmq.NOBLOCK, copy=False)
         except zmq.Again:

@@ -1,4 +1,4 @@
-"""A local worker, as who feeds it sees it: its process, its memory, and what it does."""
+"""A local worker as its pool manages it: process, memory and current job."""
 
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -12,12 +12,12 @@ from ertis_numba.network.processing.slots import Slot
 __all__ = ["SLOTS", "Worker"]
 
 SLOTS: Final = 2
-"""Of each worker: one is processed while the publisher reads the other."""
+"""Slots of each worker: one is processed while the publisher reads the other."""
 
 
 @dataclass(slots=True, eq=False)
 class Worker:
-    """A process, started again whenever it has died.
+    """A process that is restarted whenever it has died.
 
     Attributes
     ----------
@@ -25,24 +25,24 @@ class Worker:
     child : Child or None
         None while there is no process.
     ready : bool
-        Whether it has told that it is.
+        True once it has reported that it is ready.
     slots, free : list of Slot
-        All of them, and those that nothing is in.
+        All slots, and the empty ones.
     kinds : set of int
-        That it has a pipeline for.
-    preparing : Kind or None
-        That it gets ready for.
+        Kinds with a pipeline.
+    preparing : JobKind or None
+        Kind that it prepares for.
     job : Job or None
     slot : Slot or None
-        That the job is in.
+        Slot of the job.
     mode : Mode or None
-        In which the job runs.
+        Mode of the job.
     deadline_s, start_s : float
-        When it is killed, and may be started again, by `time.monotonic`.
+        Times at which it is killed, and may be restarted, by `time.monotonic`.
     deaths : int
-        Since it has finished a job.
+        Number of deaths since its last finished job.
     done : int
-        Jobs that it has finished.
+        Number of finished jobs.
     """
 
     number: int
@@ -62,13 +62,13 @@ class Worker:
 
     @property
     def state(self) -> Literal["starting", "idle", "busy"]:
-        """What it does at present."""
+        """Current state."""
         if not self.ready or self.preparing is not None:
             return "starting"
         return "idle" if self.job is None else "busy"
 
     def attach_memory(self, words_bytes: int, image_bytes: int) -> None:
-        """See to it that it has slots that are large enough; those that are read elsewhere are given later."""
+        """Ensure that it has slots of sufficient size; slots in use elsewhere are replaced later."""
         if self.child is None:
             return
         if not self.slots:
@@ -76,7 +76,7 @@ class Worker:
             self.slots = [Slot(number, words_bytes, image_bytes) for number in numbers]
             self.free = list(self.slots)
         elif not all(slot.holds(words_bytes, image_bytes) for slot in self.slots):
-            # What the publisher reads of the old ones, it has as long as it needs it.
+            # The publisher keeps its access to old slots as long as necessary.
             largest = max(words_bytes, self.slots[0].words_bytes), max(image_bytes, self.slots[0].image_bytes)
             for slot in self.slots:
                 slot.close()

@@ -1,4 +1,4 @@
-"""Local worker processes: started, fed, watched, killed and started again."""
+"""Pool of local worker processes: start, jobs, deadlines, restart."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -41,21 +41,21 @@ __all__ = ["LocalWorkerPool"]
 
 _MODULE: Final = "ertis_numba.network.processing.worker_process"
 _LOADING_S: Final = 60.0
-_BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # before a worker that dies again and again is started again
-_TRIES: Final = 3  # workers that may die over getting ready for a kind for which none has ever been
+_BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # Delays before a worker that dies repeatedly is restarted.
+_TRIES: Final = 3  # Limit on workers that die while preparing for a kind that has never been ready.
 
 
 class LocalWorkerPool:
-    """A `Runner` whose jobs run in processes of this machine.
+    """`Runner` whose jobs run in processes of this machine.
 
-    Each worker has a pipe and two slots of its own, so that one that dies at any moment takes nothing with it but the
-    job it had. A worker is killed when it is not done in time.
+    Each worker has its own pipe and two slots, so that its death at any time costs only its job. A worker that misses
+    its deadline is killed.
 
     Parameters
     ----------
-    options : Options
-    log : Log
-        Told what goes wrong.
+    options : ProcessingOptions
+    log : EventLog
+        Log of failures.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class LocalWorkerPool:
         self._prepared: dict[int, Prepared] = {}
         self._tries: dict[int, int] = {}
         self._workers = [Worker(number) for number in range(count)]
-        self._started = 1  # the others wait until the first has compiled what all need, and has found a device
+        self._started = 1  # The others wait until the first has compiled the common kernels and found a device.
         self.respawned = 0
         self._start(self._workers[0])
 
     @property
     def choice(self) -> str:
-        """How measurements share the cores, and why."""
+        """Distribution of measurements over the cores, with its reason."""
         return self._chosen.why
 
     def prepare(self, kind: JobKind) -> None:
@@ -113,7 +113,7 @@ class LocalWorkerPool:
         """See `Runner`."""
         worker = self._idle(job.kind)
         if worker is None or worker.child is None:
-            raise AssertionError("a job is submitted that no worker takes; ask takes() first")
+            raise AssertionError("a job was submitted that no worker can accept; call takes() first")
         worker.job, worker.mode = job, self._chosen.mode
         worker.slot = slot = worker.free.pop(0)
         slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
@@ -158,11 +158,11 @@ class LocalWorkerPool:
                 continue
             worker.child.pipe.flush()
             if now_s > worker.deadline_s:
-                self._log.warning("worker_killed", pid=worker.child.pid, text="it was not done in time")
+                self._log.warning("worker_killed", pid=worker.child.pid, text="it missed its deadline")
                 worker.deadline_s = float("inf")
                 worker.child.kill()
             if worker.child.ended:
-                found += self._heard(worker)  # it may have told something before
+                found += self._heard(worker)  # It may have sent messages before.
             else:
                 self._next_kind(worker)
         if self._chosen.look(now_s, rate_hz):
@@ -181,7 +181,7 @@ class LocalWorkerPool:
         """See `Runner`."""
         for worker in self._workers:
             if worker.child is not None:
-                worker.child.kill()  # left alone, it would end without clearing up as well, but after its imports
+                worker.child.kill()  # Left alone, it would end after its imports, without cleaning up either.
         for worker in self._workers:
             if worker.child is not None:
                 worker.child.close()
@@ -206,7 +206,7 @@ class LocalWorkerPool:
         worker.deadline_s = time.monotonic() + _LOADING_S
 
     def _heard(self, worker: Worker) -> list[Event]:
-        """Return what a worker has to tell."""
+        """Return the events in a worker's messages."""
         found: list[Event] = []
         if worker.child is None:
             return found
@@ -214,7 +214,7 @@ class LocalWorkerPool:
             found += self._events_of(worker, note)
         if worker.child.ended:
             found += self._died(worker)
-        elif worker.child.pipe.closed:  # `tick` clears up, when it is gone and writes no more
+        elif worker.child.pipe.closed:  # `tick` cleans up once the process is gone and writes no more.
             worker.ready = False
             worker.child.kill()
         else:
@@ -241,7 +241,7 @@ class LocalWorkerPool:
         worker.ready, worker.deadline_s = True, float("inf")
         if self._started == 1 and not self._kinds_known:
             if threads == 1 and self._options.workers is None and len(self._workers) > 1:
-                # A GPU, say, that serves one measurement faster than it serves several.
+                # A GPU, for example, serves one measurement faster than several.
                 self._log.info("choice", text=f"device {device} has one worker")
                 del self._workers[1:]
                 self._chosen = Choice(1, 1)
@@ -257,7 +257,7 @@ class LocalWorkerPool:
         worker.preparing, worker.deadline_s = None, float("inf")
         if worker.child is None or kind is None:
             return []
-        if self._kinds.get(kind.number) is not kind:  # it was forgotten meanwhile
+        if self._kinds.get(kind.number) is not kind:  # The kind was discarded meanwhile.
             worker.child.pipe.send(Release(kind=note.kind))
             return []
         worker.kinds.add(kind.number)
@@ -289,11 +289,11 @@ class LocalWorkerPool:
         return [FinishedJob(job, note.took_s)]
 
     def _next_kind(self, worker: Worker) -> None:
-        """Let a worker that has nothing else to do get ready for a kind that it does not know."""
+        """Let an idle worker prepare for a kind that it does not know."""
         if worker.child is None or worker.state != "idle":
             return
         if worker.kinds and any(other.preparing for other in self._workers):
-            return  # one after the other, so that sensors which are served go on to be
+            return  # One after the other, so that present sensors continue to be served.
         for number, kind in self._kinds.items():
             if number not in worker.kinds:
                 worker.preparing = kind
@@ -303,7 +303,7 @@ class LocalWorkerPool:
                 return
 
     def _died(self, worker: Worker) -> list[Event]:
-        """Clear up after a worker, and return what became of its job."""
+        """Clean up after a worker, and return the result for its job."""
         if worker.child is None:
             return []
         pid, found = worker.child.pid, list[Event]()
@@ -321,9 +321,9 @@ class LocalWorkerPool:
             self._tries[kind.number] = self._tries.get(kind.number, 0) + 1
             if self._tries[kind.number] >= _TRIES:
                 del self._kinds[kind.number]
-                found.append(KindFailed(kind.number, "workers die of getting ready for it"))
+                found.append(KindFailed(kind.number, "workers die while preparing for it"))
         if slot is not None:
             worker.free.append(slot)
         if job is not None:
-            found.append(Lost(job, f"worker {pid} has died of it or was killed", again=True))
+            found.append(Lost(job, f"worker {pid} died while processing it, or was killed", again=True))
         return found

@@ -1,4 +1,4 @@
-"""A process that makes images: ``python -m ertis_numba.network.processing.worker_process DESCRIPTOR``."""
+"""Worker process that makes images: ``python -m ertis_numba.network.processing.worker_process DESCRIPTOR``."""
 
 import faulthandler
 import os
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from ertis_numba.network.processing.pipe import Pipe
 
 _DRAIN_S: Final = 0.1
-_NEGLECTED: Final = 3  # deadlines after which a worker that hangs ends by itself, where nobody is left to kill it
+# Number of deadlines after which a hanging worker ends by itself, if no process is left to kill it.
+_NEGLECTED: Final = 3
 
 
 class _ImageWorker:
@@ -49,7 +50,7 @@ class _ImageWorker:
 
         try:
             loaded: kernels.KernelSet | None = kernels.load(self._device)
-        except DeviceError:  # which making the pipeline says again, then it can be told
+        except DeviceError:  # Creating the pipeline raises it again, at a time when it can be reported.
             loaded = None
         largest = 1 if loaded is None else loaded.max_threads
         self._threads = min(self._threads, largest)
@@ -101,7 +102,7 @@ class _ImageWorker:
         return JobFinished(job=order.job, took_s=time.perf_counter() - begun_s, n_points=n_points)
 
     def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> int:
-        """Make the image in its slot, and the points, of which there are that many."""
+        """Make the image in its slot, and the points; return the number of points."""
         place = view.image_as(chain.shape, self._dtype)
         words = view.words(order.words_bytes)
         image = chain.image(words, place if self._dtype == "float32" else None, threads=order.threads)

@@ -77,7 +77,7 @@ class Spool:
     ----------
     turn : threading.RLock
         Lock for access to `runs` and `counts`.
-    acked_through : threading.Condition
+    acked : threading.Condition
         Condition of that lock, notified of each acknowledgement.
     runs : dict of (sensor, session_id) to OutgoingSession
         Oldest first.
@@ -88,7 +88,7 @@ class Spool:
         self._max_bytes = checks.integer("ring_bytes", max_bytes, 1)
         self._held_bytes = 0
         self.turn = threading.RLock()
-        self.acked_through = threading.Condition(self.turn)
+        self.acked = threading.Condition(self.turn)
         self.runs: dict[tuple[str, int], OutgoingSession] = {}
         self.counts: dict[str, SensorCounts] = {}
         self._sensors: dict[str, JournalSensor] = {}
@@ -237,7 +237,7 @@ class Spool:
                 self._discard(item)
             while self._order and self._order[0][1].entry is None:
                 self._order.popleft()
-            self.acked_through.notify_all()
+            self.acked.notify_all()
 
     def _discard(self, item: UnackedItem) -> None:
         if item.entry is not None:
@@ -252,7 +252,7 @@ class Spool:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or stop():
                     return False
-                self.acked_through.wait(min(left_s, 0.1))
+                self.acked.wait(min(left_s, 0.1))
             return True
 
     @property
