@@ -31,7 +31,7 @@ suppress_warnings = ["misc.highlighting_failure"]  # fragments of code in tables
 
 MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # an address of a node is no link
 REFERENCE = re.compile(r"<!-- keys of (\w+) -->")
-OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./((?!docs/)[^)#\s]+)\)")
+OUTSIDE = r"\[([^\]]+)\]\(%s((?!\.\.|docs/)[^)#\s]+)\)"
 
 
 def setup(app: Any) -> None:
@@ -47,20 +47,19 @@ def setup(app: Any) -> None:
 
 
 def _name_what_is_outside(_: Any, page: str, source: list[str]) -> None:
-    """Name folders and pages beside docs/, which are not part of the site; files can be downloaded."""
-    if "/" in page:  # in a folder of docs/, ../ is docs/ itself
-        return
+    """Name folders and pages outside docs/, which are not part of the site; files can be downloaded."""
+    outside = "../" * (page.count("/") + 1)
 
     def named(match: re.Match[str]) -> str:
         path = ROOT / match[2]
         return f"{match[1]} (`{match[2]}` in the source)" if path.is_dir() or path.suffix == ".md" else match[0]
 
-    source[0] = OUTSIDE.sub(named, source[0])
+    source[0] = re.sub(OUTSIDE % re.escape(outside), named, source[0])
 
 
 def _write_reference(_: Any, page: str, source: list[str]) -> None:
     """Put the keys of each kind of TOML file where the page on settings names it."""
-    if page == "settings":
+    if page == "reference/settings":
         source[0] = REFERENCE.sub(lambda match: "\n".join(_tables(match[1])), source[0])
 
 
