@@ -35,6 +35,7 @@ RUN_BY = {
     ("first-hour", "$"): ["test_first_hour::test_first_hour"],
     ("formats", "python"): ["test_guide::test_python_on_formats"],
     ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
+    ("gpu", "$"): ["test_guide::test_commands_on_cuda"],
     ("health", "$"): ["test_health_commands::test_page_shows_what_the_commands_print"],
     ("many", "$"): [
         "test_many_docs::test_commands_in_their_order",
@@ -50,6 +51,7 @@ RUN_BY = {
     ("python", "python"): ["test_guide::test_importing_loads_nothing_but_names"],
     ("quickstart", "$"): ["test_guide::test_start"],
     ("quickstart", "python"): ["test_guide::test_start"],
+    ("ros", "$"): ["test_guide::test_commands_on_ros"],
     ("simulation", "$"): ["test_readme::test_page_on_simulation"],
     ("simulation", "python"): ["test_readme::test_page_on_simulation"],
     ("view", "$"): ["test_view_command::test_the_page_on_the_view"],
@@ -140,7 +142,7 @@ def test_python_on_concepts(place):
 
 def test_commands_on_cuda():
     """What `make test` runs, as it is there."""
-    lines = re.findall(r"^\$ (.*?)\s+#", page("cuda"), re.MULTILINE)
+    lines = re.findall(r"^\$ (.*?)\s+#", page("cuda") + page("gpu"), re.MULTILINE)
     legs = [line for line in lines if not line.startswith("pip install ")]
     assert len(legs) == 2
     recipes = (ROOT / "Makefile").read_text("utf-8")
@@ -149,6 +151,13 @@ def test_commands_on_cuda():
         folder = leg.split()[-1]
         assert list((ROOT / folder).glob("test_*.py"))
         assert f"\t{variables[0]}$(PYTEST) {folder}" in recipes
+
+
+def test_commands_on_ros(place):
+    pytest.importorskip("mcap_ros2", reason="mcap comes with the extra ros")
+    for command in commands_in(page("ros")):
+        run_here(place, command)
+    assert (place / "POINTS.mcap").stat().st_size > 1000
 
 
 def test_python_on_cuda():

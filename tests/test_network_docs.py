@@ -1,4 +1,4 @@
-"""What docs/how-to/network.md says of the wire is what is spoken."""
+"""What docs/reference/network-protocol.md says of the wire is what is spoken."""
 
 import re
 import typing
@@ -8,7 +8,7 @@ import msgspec
 from ertis_numba.network import messages
 from tests.pages import page
 
-PAGE = page("network")
+PAGE = page("network-protocol")
 
 
 def test_the_table_of_messages_is_complete():
