@@ -1,4 +1,4 @@
-"""How Sphinx makes a site of these pages: `make docs`, with warnings as errors and nothing loaded from elsewhere."""
+"""Sphinx configuration of the documentation site: `make docs`, with warnings as errors and no external resources."""
 
 import re
 import sys
@@ -25,20 +25,20 @@ copybutton_prompt_text = r"^(\w*)\$ "
 copybutton_prompt_is_regexp = True
 numpydoc_show_class_members = False
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # the docstrings say them, with shapes and units
+autodoc_typehints = "none"  # docstrings contain the types, with shapes and units
 autodoc_default_options = {"members": True}
-suppress_warnings = ["misc.highlighting_failure"]  # fragments of code in tables of formats
+suppress_warnings = ["misc.highlighting_failure"]  # tables of formats contain fragments of code
 
-MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # an address of a node is no link
+MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # addresses of nodes must not become links
 REFERENCE = re.compile(r"<!-- keys of (\w+) -->")
-OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./((?!docs/)[^)#\s]+)\)")
+OUTSIDE = r"\[([^\]]+)\]\(%s((?!\.\.|docs/)[^)#\s]+)\)"
 
 
 def setup(app: Any) -> None:
-    """Be told of each page before it is read."""
+    """Register the hooks that change pages and help texts."""
     app.connect("source-read", _name_what_is_outside)
     app.connect("source-read", _write_reference)
-    if "sphinx-click-process-envars" not in app.events.events:  # as version 6 emits it, and does not register it
+    if "sphinx-click-process-envars" not in app.events.events:  # version 6 emits this event without registering it
         app.add_event("sphinx-click-process-envars")
     for part in ("options", "arguments", "envars", "envvars"):
         app.connect(f"sphinx-click-process-{part}", _write_plainly)
@@ -47,28 +47,27 @@ def setup(app: Any) -> None:
 
 
 def _name_what_is_outside(_: Any, page: str, source: list[str]) -> None:
-    """Name folders and pages beside docs/, which are not part of the site; files can be downloaded."""
-    if "/" in page:  # in a folder of docs/, ../ is docs/ itself
-        return
+    """Replace links to folders and pages outside docs/ by their paths; other files can be downloaded."""
+    outside = "../" * (page.count("/") + 1)
 
     def named(match: re.Match[str]) -> str:
         path = ROOT / match[2]
         return f"{match[1]} (`{match[2]}` in the source)" if path.is_dir() or path.suffix == ".md" else match[0]
 
-    source[0] = OUTSIDE.sub(named, source[0])
+    source[0] = re.sub(OUTSIDE % re.escape(outside), named, source[0])
 
 
 def _write_reference(_: Any, page: str, source: list[str]) -> None:
-    """Put the keys of each kind of TOML file where the page on settings names it."""
-    if page == "settings":
+    """Insert the keys of each kind of TOML file into the settings reference."""
+    if page == "reference/settings":
         source[0] = REFERENCE.sub(lambda match: "\n".join(_tables(match[1])), source[0])
 
 
 def _tables(document: str) -> Iterator[str]:
-    from ertis_numba.toml_reference import reference  # noqa: PLC0415  the paths are set above
+    from ertis_numba.reference import reference  # noqa: PLC0415  the paths are set above
 
     for section in reference(document):
-        yield from (f"### {section.header or 'Before any table'}".replace("[", "\\["), "", section.about, "")
+        yield from (f"### {section.header or 'Top level'}".replace("[", "\\["), "", section.about, "")
         yield from ("| key | meaning | type | unit | default | example |", "| --- | --- | --- | --- | --- | --- |")
         for key in section.keys:
             code = (f"`{text}`" if text else "" for text in (key.default, key.example))
@@ -78,7 +77,7 @@ def _tables(document: str) -> Iterator[str]:
 
 
 def _write_plainly(_: Any, __: Any, lines: list[str]) -> None:
-    """Write values as they are typed, not as Python shows them: paths, texts and lists of variables."""
+    """Replace Python representations by typed values: paths, texts and lists of variables."""
     for place, line in enumerate(lines):
         plain = re.sub(r"PosixPath\('([^']*)'\)", r"\1", line)
         if plain.lstrip().startswith((".. envvar::", ".. _", "``")):
@@ -88,5 +87,5 @@ def _write_plainly(_: Any, __: Any, lines: list[str]) -> None:
 
 
 def _take_literally(_: Any, __: Any, lines: list[str]) -> None:
-    """Keep marks of reStructuredText in help texts, which are written for a terminal, from being taken for such."""
+    """Escape reStructuredText markup in help texts, which are written for a terminal."""
     lines[:] = [line if line.lstrip().startswith("..") else MARKS.sub(r"\\\g<0>", line) for line in lines]

@@ -12,14 +12,34 @@ from pathlib import Path
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-__all__ = ["DOCS", "ROOT", "commands_in", "environment", "in_background", "page", "python_in", "run", "run_here"]
+__all__ = [
+    "DOCS",
+    "GUIDE",
+    "ROOT",
+    "commands_in",
+    "environment",
+    "in_background",
+    "page",
+    "path_of",
+    "python_in",
+    "run",
+    "run_here",
+]
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+GUIDE = sorted(path for path in DOCS.rglob("*.md") if path.parent.name not in {"decisions", "upstream"})
+"""Pages of the guide, in all of its folders; their names are unique."""
+
+
+def path_of(name):
+    """Return the path of a page of the guide, whose folder the name leaves out."""
+    (path,) = (each for each in GUIDE if each.stem == name)
+    return path
 
 
 def page(name):
-    return (DOCS / f"{name}.md").read_text("utf-8")
+    return path_of(name).read_text("utf-8")
 
 
 def environment(place):

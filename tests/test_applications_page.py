@@ -1,4 +1,4 @@
-"""What docs/applications.md says runs, word by word but for ports; the emulated sensor hears two measurements only."""
+"""Commands and code of docs/how-to/applications.md; the emulated sensor replays two measurements only."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""Table of array weights in docs/beamformers.md, computed again."""
+"""Table of array weights in docs/explanation/beamformers.md, computed again."""
 
 import math
 import re

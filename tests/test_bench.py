@@ -17,6 +17,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB
 from ertis_numba.simulation.names import EFFECTS
 from tests.cases import SHORT, noise
+from tests.pages import path_of
 
 MARKED = "# Mine\n\n<!-- ertis bench {0} -->\nold\n<!-- /ertis bench {0} -->\n\nrest\n"
 
@@ -206,7 +207,7 @@ def test_published_times_have_one_entry_per_configuration():
 
 @pytest.mark.parametrize("name", ["paper", "accuracy", "scaling"])
 def test_generated_readme_has_all_tables(name):
-    text = (Path(__file__).parents[1] / "bench" / "README.md").read_text("utf-8")
+    text = path_of("benchmarks").read_text("utf-8")
     table = text.partition(f"<!-- ertis bench {name} -->")[2].partition(f"<!-- /ertis bench {name} -->")[0]
     assert "| ---: |" in table
 
@@ -256,7 +257,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert full.read_text("utf-8").count("the paper's method |") == 2
     assert "| float32, nearest sample of 2 per range, 40 dB |" in full.read_text("utf-8")
-    assert "bench/README.md has all of them" in short.read_text("utf-8")
+    assert "docs/reference/benchmarks.md has all of them" in short.read_text("utf-8")
     assert "\nold\n" not in full.read_text("utf-8") + short.read_text("utf-8")
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
 from tests.cases import noise
+from tests.pages import path_of
 from tests.test_detect import image_of
 
 N = 32
@@ -283,7 +283,7 @@ def test_bins_that_may_be_peaks_have_the_shape_of_the_image():
 
 def test_page_tells_what_theory_says():
     """The table of false alarms beside a step of 20 dB."""
-    page = (Path(__file__).parents[1] / "docs" / "plots.md").read_text("utf-8")
+    page = path_of("plots").read_text("utf-8")
     step = np.where(np.arange(N) < N // 2, 0.1, 1.0)
     for false_alarm in ("1e-2", "1e-3", "1e-4"):
         row = " | ".join(f"{exact(method, step, float(false_alarm)):.1e}".replace("e-0", "e-") for method in METHODS)

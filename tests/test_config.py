@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.pages import path_of
+
 ROOT = Path(__file__).parents[1]
 REFLECTORS = ROOT / "data" / "synthetic" / "reflectors.h5"
 
@@ -181,7 +183,7 @@ def test_what_does_not_fit_is_refused_where_it_was_typed_only(images, tmp_path):
 
 def test_the_page_says_how(tmp_path):
     """Its file and its commands, word by word."""
-    page = (ROOT / "docs" / "command-line.md").read_text("utf-8")
+    page = path_of("command-line").read_text("utf-8")
     (tmp_path / "ertis.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     (tmp_path / "reflectors.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
     counts = []
@@ -240,7 +242,7 @@ def test_completion_for_each_shell(tmp_path, shell):
 
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
 def test_zsh_completes_after_what_the_page_names(tmp_path):
-    (before,) = re.findall(r"in ~/.zshrc, after: (.*)", (ROOT / "docs" / "command-line.md").read_text())
+    (before,) = re.findall(r"in ~/.zshrc, after: (.*)", path_of("command-line").read_text("utf-8"))
     printed = tmp_path / "printed"
     printed.write_text(ertis("completion", "zsh", folder=tmp_path).stdout)
     done = subprocess.run(

@@ -22,6 +22,7 @@ from ertis_numba.simulation import Scene, load_scene
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_recording
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "data" / "synthetic"
@@ -103,7 +104,7 @@ def test_make_data_makes_the_same_words(tmp_path):
 
 # ---- the gallery -----------------------------------------------------------------------------------
 
-PAGE = (ROOT / "docs" / "gallery.md").read_text()
+PAGE = page("gallery")
 CALLED_FOR = {
     "corridor": {"walls", "occlusion", "doppler", "emitter_directivity"},
     "faulty_array": {"microphone_noise", "microphone_spread", "microphone_faults"},
@@ -122,7 +123,7 @@ def told_of(name):
 def test_gallery_shows_all_scenes():
     assert {path.stem for path in (FOLDER / "scenes").glob("*.toml")} == set(SCENES)
     assert sorted(re.findall(r"^<!-- scene (\w+) -->$", PAGE, re.MULTILINE)) == SCENES
-    pictures = set(re.findall(r"\]\((pictures/gallery/\w+\.png)\)", PAGE))
+    pictures = set(re.findall(r"\]\(\.\./(pictures/gallery/\w+\.png)\)", PAGE))
     folder = ROOT / "docs" / "pictures" / "gallery"
     assert {ROOT / "docs" / picture for picture in pictures} == set(folder.iterdir())
     assert max(path.stat().st_size for path in folder.iterdir()) <= 150_000

@@ -1,4 +1,4 @@
-"""Where reflectors are seen that an emitter beside the array has made ring, as docs/own-array.md says."""
+"""Where reflectors are seen that an emitter beside the array has made ring, as docs/how-to/own-array.md says."""
 
 import math
 

@@ -21,9 +21,10 @@ from ertis_numba.interop import FORMATS, TOPICS, export, files_of, format_of
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "export.md").read_text()
+PAGE = page("export")
 MOUNTED = {"left": ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "right": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
 
 

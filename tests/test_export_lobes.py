@@ -1,4 +1,4 @@
-"""What docs/export.md says of points that no reflector is at, with eight microphones on a ring."""
+"""What docs/how-to/export.md says of points that no reflector is at, with eight microphones on a ring."""
 
 import csv
 import math

@@ -36,7 +36,7 @@ def test_energyscapes(tmp_path, engine):
 
 
 def test_float16_is_read_by_h5netcdf(tmp_path):
-    """netCDF-C crashes on it; docs/formats.md says so."""
+    """netCDF-C crashes on it; docs/reference/formats.md says so."""
     path = write_energyscapes(tmp_path / "img.h5", [image()], dtype="float16")
     with xarray.open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
         np.testing.assert_allclose(data["amplitude"].values[0], image().amplitude, rtol=2**-10, atol=1e-7)

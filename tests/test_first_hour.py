@@ -13,9 +13,9 @@ from scipy.io import wavfile
 
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import Simulator
-from tests.pages import DOCS, ROOT, commands_in, in_background, page, run_here
+from tests.pages import GUIDE, ROOT, commands_in, in_background, page, run_here
 
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", *GUIDE]
 PCM = """
 recording.encoding = "int16"
 recording.sample_rate_hz = 192000.0

@@ -1,7 +1,6 @@
 """The page on file formats and the tables in the code say the same."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,9 @@ from ertis_numba.storage.schema import (
     STAMPS,
     TRUTH,
 )
+from tests.pages import page
 
-PAGE = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+PAGE = page("formats")
 SHARED = [*STAMPS, *(variable for variable in RECORDING if variable.name == "settings")]
 PCM = next(variable for variable in RECORDING_OF_PCM if variable.name == "pcm")
 EITHER = [each for variable in RECORDING for each in ([variable, PCM] if variable.name == "pdm" else [variable])]

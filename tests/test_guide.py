@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import fnmatch
 import pkgutil
 import re
 import subprocess
@@ -16,7 +17,7 @@ import ertis_numba
 from ertis_numba import kernels
 from ertis_numba.storage import Truth, open_recording
 from tests.files import noise
-from tests.pages import DOCS, ROOT, commands_in, environment, in_background, page, python_in, run, run_here
+from tests.pages import DOCS, GUIDE, ROOT, commands_in, environment, in_background, page, python_in, run, run_here
 from tests.publishing import Publisher, cloud
 
 RUN_BY = {
@@ -34,9 +35,8 @@ RUN_BY = {
     ("first-hour", "$"): ["test_first_hour::test_first_hour"],
     ("formats", "python"): ["test_guide::test_python_on_formats"],
     ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
+    ("gpu", "$"): ["test_guide::test_commands_on_cuda"],
     ("health", "$"): ["test_health_commands::test_page_shows_what_the_commands_print"],
-    ("index", "$"): ["test_guide::test_start"],
-    ("index", "python"): ["test_guide::test_start"],
     ("many", "$"): [
         "test_many_docs::test_commands_in_their_order",
         "test_many_cluster::test_the_line_of_the_page_runs",
@@ -49,6 +49,9 @@ RUN_BY = {
     ("plots", "$"): ["test_plot::test_commands_of_the_page"],
     ("plots", "python"): ["test_plot::test_python_of_the_page"],
     ("python", "python"): ["test_guide::test_importing_loads_nothing_but_names"],
+    ("quickstart", "$"): ["test_guide::test_start"],
+    ("quickstart", "python"): ["test_guide::test_start"],
+    ("ros", "$"): ["test_guide::test_commands_on_ros"],
     ("simulation", "$"): ["test_readme::test_page_on_simulation"],
     ("simulation", "python"): ["test_readme::test_page_on_simulation"],
     ("view", "$"): ["test_view_command::test_the_page_on_the_view"],
@@ -70,7 +73,7 @@ def place(tmp_path, monkeypatch):
 
 def test_all_that_pages_show_is_run():
     shown = set()
-    for path in DOCS.glob("*.md"):
+    for path in GUIDE:
         text = path.read_text("utf-8")
         shown |= {(path.stem, "$")} if re.search(r"^\w*\$ ", text, re.MULTILINE) else set()
         shown |= {(path.stem, "python")} if python_in(text) else set()
@@ -90,7 +93,7 @@ def test_what_is_said_to_run_a_page_does_name_it(about):
 
 
 def test_start(place):
-    text = page("index")
+    text = page("quickstart")
     with contextlib.ExitStack() as background:
         for command in commands_in(text):
             if command.endswith("&"):
@@ -139,7 +142,7 @@ def test_python_on_concepts(place):
 
 def test_commands_on_cuda():
     """What `make test` runs, as it is there."""
-    lines = re.findall(r"^\$ (.*?)\s+#", page("cuda"), re.MULTILINE)
+    lines = re.findall(r"^\$ (.*?)\s+#", page("cuda") + page("gpu"), re.MULTILINE)
     legs = [line for line in lines if not line.startswith("pip install ")]
     assert len(legs) == 2
     recipes = (ROOT / "Makefile").read_text("utf-8")
@@ -148,6 +151,13 @@ def test_commands_on_cuda():
         folder = leg.split()[-1]
         assert list((ROOT / folder).glob("test_*.py"))
         assert f"\t{variables[0]}$(PYTEST) {folder}" in recipes
+
+
+def test_commands_on_ros(place):
+    pytest.importorskip("mcap_ros2", reason="mcap comes with the extra ros")
+    for command in commands_in(page("ros")):
+        run_here(place, command)
+    assert (place / "POINTS.mcap").stat().st_size > 1000
 
 
 def test_python_on_cuda():
@@ -224,7 +234,7 @@ def test_what_python_names_is_exported():
         assert name in pkgutil.resolve_name(home).__all__, path
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDE], ids=lambda path: path.stem)
 def test_what_pages_teach_is_public(path):
     """By any path that leads to it."""
     objects = {id(pkgutil.resolve_name(each)) for each in public()}
@@ -245,6 +255,6 @@ def test_readers_have_what_the_page_says():
 
 
 def test_every_page_is_in_the_guide():
-    listed = set(" ".join(re.findall(r"```{toctree}\n(.*?)```", page("index"), re.DOTALL)).split())
-    pages = {path.stem for path in DOCS.glob("*.md")} - {"index"}
-    assert pages <= listed
+    listed = " ".join(re.findall(r"```{toctree}\n(.*?)```", page("index"), re.DOTALL)).split()
+    pages = {str(path.relative_to(DOCS).with_suffix("")) for path in GUIDE} - {"index"}
+    assert {name for name in pages if not any(fnmatch.fnmatch(name, entry) for entry in listed)} == set()

@@ -1,4 +1,4 @@
-"""Health in ``ertis info`` and ``ertis process``, and the examples and limits in docs/health.md."""
+"""Health in ``ertis info`` and ``ertis process``, and the examples and limits in docs/."""
 
 import dataclasses
 import json
@@ -20,6 +20,7 @@ from tests.health_recordings import (
     ROOT,
     real,
 )
+from tests.pages import path_of
 
 
 def run(*arguments, code=0):
@@ -109,7 +110,7 @@ def test_silence_is_no_fault_of_single_microphones(tmp_path):
 def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("data").symlink_to(ROOT / "data")
-    page = (ROOT / "docs" / "health.md").read_text()
+    page = path_of("health").read_text("utf-8")
     for block in re.findall(r"```\n(.*?)```", page, re.DOTALL):
         for part in block.split("$ ertis ")[1:]:
             command, shown = part.split("\n", 1)
@@ -118,7 +119,7 @@ def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
 
 
 def test_page_has_the_limits():
-    page = (ROOT / "docs" / "health.md").read_text()
+    page = " ".join(path_of("health-checks").read_text("utf-8").split())
     for reported in (
         f"less than {100 * limits.MIN_CHANGES:g} % of",
         f"more than {100 * limits.MAX_SATURATED:g} % of",
@@ -126,7 +127,7 @@ def test_page_has_the_limits():
         f"more than {limits.MAX_TONE_DB:g} dB out of",
         f"more than {-limits.MIN_LEVEL_DB:g} dB below",
         f"rise by {limits.MIN_RISE_DB:g} dB",
-        f"first\n{limits.MAX_SAMPLES:,} samples",
+        f"first {limits.MAX_SAMPLES:,} samples",
         f"{limits.MAX_NOISE_DB:g} dB, or five",
         f"{-limits.MAX_WHITE_DB:g} dB below white bits",
         f"{-limits.MAX_FLIPPED_DB:g} dB below white bits, up to {-limits.MAX_FLIPS_DB:g} dB",

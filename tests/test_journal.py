@@ -15,6 +15,7 @@ from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 from ertis_numba.settings import Array, Recording, Settings
 from tests.files import line
 from tests.journals import EPOCH, TINY, both, create, entries, python, same
+from tests.pages import path_of
 
 COUNTS = Path("/proc/self/io")
 
@@ -316,7 +317,7 @@ def test_taking_measurements_in_loads_no_hdf5():
 
 
 def test_tables_are_documented():
-    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    page = path_of("formats").read_text("utf-8")
     page = page[page.index("## Journal") :]
     assert f"version {VERSION}" in page
     for table, columns in TABLES.items():

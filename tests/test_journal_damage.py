@@ -3,7 +3,6 @@
 import re
 import sqlite3
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.files import line
 from tests.journals import EPOCH, crashed, create, entries, python, same
+from tests.pages import path_of
 
 SPOIL = """
 import sqlite3, sys
@@ -156,7 +156,7 @@ def test_a_page_that_sqlite_cannot_read(tmp_path, discarded):
 
 
 def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
-    """Built by hand as docs/formats.md says."""
+    """Built by hand as docs/reference/formats.md says."""
     create(tmp_path, entries(1)).close()
     reported = python(
         "import sqlite3, sys\n"
@@ -170,7 +170,7 @@ def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
     assert zlib.crc32(header) == int(reported[4])
     row = b"I\x03\0\0\0-12" + b"R\x08\0\0\0\0\0\0\0\0\0\xf8\xbf" + b"N\0\0\0\0" + b"T\x02\0\0\0\xc3\xa9"
     assert row_crc32((-12, -1.5, None, "é")) == zlib.crc32(row)
-    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    page = path_of("formats").read_text("utf-8")
     example, check = re.search(r"`([0-9a-f ]{20,})` and the CRC-32 `([0-9a-f]{8})`", page).groups()
     assert row_crc32((7, "a")) == zlib.crc32(bytes.fromhex(example)) == int(check, 16)
 

@@ -6,7 +6,6 @@ import re
 import shutil
 import signal
 import time
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -20,6 +19,7 @@ from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
 from tests.files import noise
+from tests.pages import path_of
 from tests.test_call_match import CALL, REVERSED, heard
 
 LONG = 150
@@ -116,7 +116,7 @@ def test_workers_that_are_killed_lose_nothing(scheduler, runs, tmp_path):
 
 
 def test_the_line_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
-    page = (Path(__file__).parents[1] / "docs" / "many.md").read_text("utf-8")
+    page = path_of("many").read_text("utf-8")
     (line,) = re.findall(r"\$ ertis (.* --scheduler .*)", page)
     monkeypatch.chdir(tmp_path)
     (runs / "b.h5").unlink()

@@ -1,4 +1,4 @@
-"""What docs/many.md says runs, word by word but for times; what it says of clusters, test_many_cluster.py runs."""
+"""Commands and code of docs/how-to/many.md; test_many_cluster.py runs those for clusters."""
 
 import json
 import os
@@ -14,9 +14,10 @@ from ertis_cli.main import cli
 
 from ertis_numba.campaign import Campaign
 from tests.campaigns import Here
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "many.md").read_text("utf-8")
+PAGE = page("many")
 BLOCKS = re.findall(r"```\n\$ (ertis .*?)\n(.*?)```", PAGE, re.DOTALL)
 
 

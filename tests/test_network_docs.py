@@ -1,14 +1,14 @@
-"""What docs/network.md says of the wire is what is spoken."""
+"""What docs/reference/network-protocol.md says of the wire is what is spoken."""
 
 import re
 import typing
-from pathlib import Path
 
 import msgspec
 
 from ertis_numba.network import messages
+from tests.pages import page
 
-PAGE = (Path(__file__).parents[1] / "docs" / "network.md").read_text("utf-8")
+PAGE = page("network-protocol")
 
 
 def test_the_table_of_messages_is_complete():

@@ -1,4 +1,4 @@
-"""What the README and docs/network.md say of the network runs, word by word but for ports, hosts and what is heard.
+"""Network commands of the README and of docs/how-to/network.md, with other ports, hosts and sounds.
 
 The emulated sensors hear two measurements over and over, from a recording of the scene: to render them takes longer
 than all else together.
@@ -17,10 +17,11 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.storage import open_recording, sensor_names
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
-PAGE = (ROOT / "docs" / "network.md").read_text("utf-8")
+PAGE = page("network")
 READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
 
 

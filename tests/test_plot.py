@@ -1,4 +1,4 @@
-"""``ertis plot`` draws each kind from what it is made of, and ``docs/plots.md`` shows how."""
+"""``ertis plot`` draws each kind from what it is made of, and ``docs/how-to/plots.md`` shows how."""
 
 import contextlib
 import json
@@ -16,9 +16,10 @@ from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import image, noise
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "plots.md").read_text("utf-8")
+PAGE = page("plots")
 
 
 def run(*arguments, code=0):
@@ -133,5 +134,5 @@ def test_python_of_the_page(tmp_path):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
     with contextlib.chdir(tmp_path):
         for code in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
-            exec(compile(code, "docs/plots.md", "exec"), {})
+            exec(compile(code, "docs/how-to/plots.md", "exec"), {})
     assert (tmp_path / "picture.pdf").read_bytes().startswith(b"%PDF")

@@ -12,12 +12,12 @@ from ertis_cli.main import COMMANDS
 
 from ertis_numba.storage import open_recording, write_recording
 from tests.files import SMALL, noise
-from tests.pages import commands_in, in_background, run, run_here
+from tests.pages import commands_in, in_background, page, run, run_here
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-SIMULATION = (ROOT / "docs" / "simulation.md").read_text()
-DEVICES = (ROOT / "docs" / "devices.md").read_text()
+SIMULATION = page("simulation")
+DEVICES = page("devices")
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
 ELSEWHERE = {
     *("completion", "demo", "doctor", "keys", "layout", "listen", "record", "serve", "settings", "status", "view")
@@ -49,7 +49,7 @@ def test_python_lines(place):
 
 
 def test_every_folder_is_told_of():
-    _, _, reported = README.partition("## Where things are")
+    reported = page("architecture")
     folders = {path.parent.name for path in (ROOT / "ertis_numba").glob("*/__init__.py")}
     assert {
         name for name in folders if f"`{name}/`" not in reported and f"`ertis_numba/{name}/`" not in reported
@@ -110,18 +110,20 @@ def test_page_on_simulation(place):
 
 
 def test_gallery_begins_as_the_readme():
-    gallery = (ROOT / "docs" / "gallery.md").read_text()
+    gallery = page("gallery")
     assert set(commands_in(gallery)) <= set(commands_in(README))
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_files_named_are_there(page):
-    path = ROOT / page
+@pytest.mark.parametrize("name", PAGES)
+def test_files_named_are_there(name):
+    path = ROOT / name
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/index.md", "docs/network.md", "docs/applications.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "docs/tutorial/quickstart.md", "docs/how-to/network.md", "docs/how-to/applications.md"]
+)
 def test_blocks_that_emulate_can_be_pasted_as_they_are(name):
     """Commands that follow at once find no sensor, so they wait for it."""
     blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis emulate" in block]
@@ -133,6 +135,6 @@ def test_blocks_that_emulate_can_be_pasted_as_they_are(name):
 
 
 def test_network_blocks_give_the_mounting_of_their_sensors():
-    for page in ("README.md", "docs/network.md", "docs/applications.md"):
-        (captured,) = re.findall(r"^\$ ertis capture .*--to .*$", (ROOT / page).read_text(), re.MULTILINE)
+    for path in ("README.md", "docs/how-to/network.md", "docs/how-to/applications.md"):
+        (captured,) = re.findall(r"^\$ ertis capture .*--to .*$", (ROOT / path).read_text(), re.MULTILINE)
         assert "--mounting platform.toml" in captured

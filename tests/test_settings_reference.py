@@ -17,6 +17,7 @@ from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Settings
 from ertis_numba.simulation import load_scene
 from ertis_numba.toml_reference import DOCUMENTS, reference
+from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
 READERS = {"settings": Settings.load, "scene": load_scene, "layout": load_layout, "mounting": load_scene}
@@ -83,8 +84,8 @@ def test_reference_as_json():
 
 def test_page_has_every_key():
     conf = runpy.run_path(str(ROOT / "docs" / "conf.py"))
-    source = [(ROOT / "docs" / "settings.md").read_text("utf-8")]
-    conf["_write_reference"](None, "settings", source)
+    source = [page("settings")]
+    conf["_write_reference"](None, "reference/settings", source)
     assert "<!-- keys of" not in source[0]
     for document in DOCUMENTS:
         for section in reference(document):

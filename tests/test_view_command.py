@@ -17,7 +17,7 @@ from ertis_cli.main import cli
 from ertis_numba.storage import write_energyscapes
 from ertis_numba.viewer import ViewedScene, Viewer
 from ertis_numba.viewer._recordings import MAX_BYTES
-from tests.pages import ROOT, commands_in, run, run_here
+from tests.pages import commands_in, path_of, run, run_here
 from tests.publishing import Publisher
 from tests.publishing import image as published
 from tests.views import PATIENCE_S, stamped
@@ -154,7 +154,7 @@ def test_a_live_view_without_images_is_no_success(tmp_path):
 
 def test_the_page_on_the_view(tmp_path):
     write_energyscapes(tmp_path / "IMG.h5", stamped(3))
-    text = (ROOT / "docs" / "view.md").read_text()
+    text = path_of("view").read_text("utf-8")
     commands = [command for command in commands_in(text) if command.startswith("view ")]
     assert len(commands) == 4
     assert run_here(tmp_path, commands_in(text)[0]) == ""  # copies the recording
@@ -175,7 +175,7 @@ def test_the_page_on_the_view(tmp_path):
 def test_the_limit_of_recordings_is_the_one_that_is_told():
     reported = f"at most {MAX_BYTES / 1e6:g} MB"
     assert reported in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
-    assert reported in " ".join((ROOT / "docs" / "view.md").read_text().split())
+    assert reported in " ".join(path_of("view").read_text("utf-8").split())
 
 
 class InTerminal(webbrowser.GenericBrowser):

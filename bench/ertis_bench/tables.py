@@ -186,8 +186,8 @@ def accuracy_front(report: dict[str, Any]) -> str:
         parts.append(_table([name, "error, dB", "ms (median)", "times faster"], cells))
     conditions = (
         f"Medians of {report['count']} measurements, {report['directions']} directions. Shown are plans that no other "
-        "one beats in both error and time, and the paper's method; bench/README.md has all of them and says how they "
-        "were measured."
+        "one beats in both error and time, and the paper's method; docs/reference/benchmarks.md has all of them and "
+        "says how they were measured."
     )
     return "\n\n".join([*parts, f"Measured on {sentence(report['machine'])}", conditions])
 

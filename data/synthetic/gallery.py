@@ -1,4 +1,4 @@
-"""Draw and measure the scenes of ``scenes/`` for ``docs/gallery.md``: a part of ``make data``.
+"""Draw and measure the scenes of ``scenes/`` for ``docs/how-to/gallery.md``: a part of ``make data``.
 
 Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
 ``<!-- /scene NAME -->``. All else on the page is written by hand.
@@ -21,7 +21,7 @@ from ertis_numba.simulation.plan import EffectPlan, make_plan
 
 ROOT = Path(__file__).parents[2]
 SCENES = Path(__file__).parent / "scenes"
-PAGE = ROOT / "docs" / "gallery.md"
+PAGE = ROOT / "docs" / "how-to" / "gallery.md"
 PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
@@ -75,7 +75,7 @@ def main() -> None:
             new = take(healthy, make_plan(healthy))
             draw(stems[-1], new, SHOWN[name])
             takes |= {f"{sensor}, as new": shots for sensor, shots in new.items()}
-        pictures = [f"![{stem.replace('_', ' ')}](pictures/gallery/{stem}.png)" for stem in stems]
+        pictures = [f"![{stem.replace('_', ' ')}](../pictures/gallery/{stem}.png)" for stem in stems]
         text = "\n\n".join([*pictures, effects_table(plan), errors_table(takes)])
         PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
 

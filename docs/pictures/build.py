@@ -1,4 +1,4 @@
-"""Draw the pictures of the README and of the pages on beamformers and on pictures: `make pictures`.
+"""Pictures of the README and of the pages on beamformers and plots, drawn by `make pictures`.
 
 The real measurement comes with the package rtisdev; its code is not imported.
 """
@@ -20,7 +20,7 @@ BEAMFORMERS: dict[str, dict[str, Any]] = {
     "DMAS of order 2": {"beamformer": "dmas"},
     "Capon": {"beamformer": "capon"},
 }
-"""Heading of each picture, and what to change in the settings."""
+"""Settings that each picture changes, by its heading."""
 
 
 def real() -> None:
@@ -34,7 +34,7 @@ def real() -> None:
 
 
 def beamformers() -> None:
-    """Draw the synthetic reflectors once by each beamformer, two by two."""
+    """Draw the synthetic reflectors with each beamformer, in two rows of two."""
     with ertis.open_recording(HERE.parents[1] / "data" / "synthetic" / "reflectors.h5") as recording:
         measurement = recording[0]
     parts = []
@@ -47,7 +47,7 @@ def beamformers() -> None:
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=70)
         parts.append(Image.open(file).convert("RGB"))
-    width, height = round(0.76 * parts[0].width), parts[0].height  # without the scale, which all share
+    width, height = round(0.76 * parts[0].width), parts[0].height  # without the common colour bar
     sheet = Image.new("RGB", (width + parts[0].width, 2 * height))
     for place, part in enumerate(parts):
         row, column = divmod(place, 2)
@@ -56,7 +56,7 @@ def beamformers() -> None:
 
 
 def kinds() -> None:
-    """Draw each kind of picture of the synthetic reflectors on a sheet."""
+    """Draw each kind of plot of the synthetic reflectors on one sheet."""
     takes = {}
     for name in ("reflectors", "reflectors_3d"):
         with ertis.open_recording(HERE.parents[1] / "data" / "synthetic" / f"{name}.h5") as recording:
@@ -71,7 +71,7 @@ def kinds() -> None:
     parts = []
     for figure in drawn:
         file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=1000 / figure.get_figwidth())  # all 1000 wide
+        figure.savefig(file, format="png", dpi=1000 / figure.get_figwidth())  # 1000 pixels wide
         parts.append(Image.open(file).convert("RGB"))
     heights = [max(part.height for part in parts[row : row + 2]) for row in (0, 2)]
     sheet = Image.new("RGB", (2000, sum(heights)), parts[0].getpixel((0, 0)))

@@ -1,6 +1,6 @@
-"""Draw the picture of the live view: its page in a headless browser, with the platform of the examples.
+"""Picture of the live view: its page in a headless browser, with the platform of the examples.
 
-Needs the extras view and browser, and Chromium.
+This script needs the extras view and browser, and Chromium.
 """
 
 import io
@@ -22,7 +22,7 @@ HERE = Path(__file__).parent
 ERTIS = (sys.executable, "-m", "ertis_cli.main")
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-sync")
 MOMENTS, MOMENT = 14, 12
-"""So many are simulated, and when the person is near this one is drawn."""
+"""Number of simulated measurements, and the one that is drawn, in which the person is near."""
 
 
 def view() -> None:
@@ -47,10 +47,10 @@ def view() -> None:
 
 
 def _save(page: Page) -> None:
-    """Wait until the moment is drawn, and save what is to be seen."""
+    """Wait until the measurement is drawn, and save the page."""
     page.wait_for_selector("canvas")
     line = page.locator("label", has_text="Measurement").locator("xpath=ancestor::div[.//input][1]")
-    page.get_by_role("button", name="Play", exact=True).wait_for()  # it is at the end
+    page.get_by_role("button", name="Play", exact=True).wait_for()  # the file has played to its end
     for moment in (0, MOMENT):
         box = line.locator("input:not([type=hidden])").last
         box.fill(str(moment))
@@ -59,9 +59,9 @@ def _save(page: Page) -> None:
             "() => document.querySelector('[data-name=sequence]').innerText.split(', ')"
             f".every(each => each.endsWith(' {moment}'))"
         )
-    for notice in page.locator(".mantine-Notification-closeButton").all():  # of drawing without a graphics card
+    for notice in page.locator(".mantine-Notification-closeButton").all():  # warnings about a missing graphics card
         notice.click()
-    page.wait_for_timeout(3000)  # until all is drawn, of which the page says nothing
+    page.wait_for_timeout(3000)  # the page does not report the end of drawing
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     picture.save(HERE / "view.png", optimize=True)
 

@@ -1,12 +1,12 @@
-"""Abort libzmq 4.3.5 from outside, in three ways; needs pyzmq only (with CURVE for the first).
+"""Abort libzmq 4.3.5 through its sockets, in three ways. Needs pyzmq only (with CURVE for the first).
 
 usage: python libzmq_parked_connection.py curve|heartbeat|ping
 
-curve      A message is damaged on its way to a CURVE server whose socket has a monitor.
-heartbeat  A peer goes while its messages wait at the high-water mark, and a heartbeat comes due.
-ping       As before, without heartbeats of our own: a PING stands behind the message that waits.
+curve      A message to a CURVE server whose socket has a monitor is damaged in transit.
+heartbeat  A peer disconnects while its messages wait at the high-water mark, and a heartbeat is due.
+ping       The same without heartbeats of the server: a PING follows the waiting message.
 
-With 'curve parked' there are no heartbeats and so no abort: it prints how many descriptors stay open.
+The case 'curve parked' has no heartbeats and therefore no abort. It prints the number of open descriptors.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ PING = b"\x04\x07\x04PING\x00\x00"
 
 
 def n_descriptors() -> int:
-    """Return how many descriptors this process has open."""
+    """Return the number of open descriptors of this process."""
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
@@ -92,7 +92,7 @@ def curve(heartbeat_ms: int) -> None:
 
 
 def backpressure(heartbeat_ms: int, tail: bytes) -> None:
-    """Have more messages wait than the high-water mark allows, and reset the connection."""
+    """Queue more messages than the high-water mark allows, and reset the connection."""
     server, port = router(zmq.Context(), heartbeat_ms=heartbeat_ms)
     peer = socket.create_connection(("127.0.0.1", port))
     peer.sendall(GREETING + READY)

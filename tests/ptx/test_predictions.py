@@ -1,4 +1,4 @@
-"""What docs/cuda.md says of the kernels is what the compiler makes of them."""
+"""What docs/explanation/gpu.md says of the kernels is what the compiler makes of them."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_bench import h200, instructions, ptx, tables
 from ertis_cli.main import cli
 
-DOCS = Path(__file__).parents[2] / "docs" / "cuda.md"
+DOCS = Path(__file__).parents[2] / "docs" / "explanation" / "gpu.md"
 CODE = """
 	.headerflags	@"EF_CUDA_SM90"
         /*0000*/                   LDC R1, c[0x0][0x28] ;
@@ -73,7 +73,7 @@ def test_docs_are_what_the_code_is(report):
     here = ", ".join(f"{name} {number}" for name, number in report["compiled"].items())
     if made != here:
         pytest.skip(f"other compilers make other code: the page is of {made}, and here are {here}")
-    assert published.strip() == tables.ptx(report).strip(), "run: ertis bench ptx --update docs/cuda.md"
+    assert published.strip() == tables.ptx(report).strip(), "run: ertis bench ptx --update docs/explanation/gpu.md"
 
 
 def test_loops_do_nothing_that_is_not_needed(report):
